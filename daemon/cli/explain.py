@@ -35,9 +35,9 @@ def explain(
     if as_json:
         sys.stdout.write(json.dumps({"events": [asdict(entry) for entry in found]}) + "\n")
     else:
-        table = light_table(f"{len(found)} events", ("event", "severity", "cause", "cure"), ())
+        table = light_table(f"{len(found)} events", ("event", "severity", "cause", "action"), ())
         for entry in found:
-            table.add_row(entry.name, entry.severity, entry.cause, entry.cure)
+            table.add_row(entry.name, entry.severity, entry.cause, entry.action)
         Console().print(table)
     if not found:
         raise typer.Exit(1)

@@ -1,7 +1,8 @@
-"""Laying out the service on a machine: unit, user, folders, device rules, kernel settings.
+"""Installation of the service: unit, user, folders, device rules, kernel settings.
 
-What is written is noted with its hash, so that a file edited by hand is never overwritten and
-`uninstall` removes exactly what `install` brought. Missions, configuration and the user stay.
+The manifest records the hash of each installed file. A file that was edited by hand is never
+overwritten, and `uninstall` removes only what `install` wrote. Missions, configuration and the user
+remain.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ KERNELS_TIMEOUT_S = 900.0
 
 
 class InstallationError(DaemonError):
-    """The service cannot be laid out here; the sentence says what helps."""
+    """The service cannot be installed here; the message states what to do."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +83,7 @@ class InstallationReport:
 
 
 def templates_dir() -> Path:
-    """Where the files to be laid out are: beside the checkout, or where the wheel put them."""
+    """Folder of the files to install: in the checkout, or in the data folder of the wheel."""
     checkout = Path(__file__).resolve().parents[2] / "systemd"
     installed = Path(sysconfig.get_path("data")) / "share" / "syntopic" / "systemd"
     for folder in (checkout, installed):
@@ -134,7 +135,7 @@ def contents(
 
 
 def steps(command: Path, rig: str | None) -> list[InstallationStep]:
-    """What follows the files: user, folders, kernels, and telling the running system."""
+    """Steps after the files are written: user, folders, kernels, and reloading the system."""
     first = [
         InstallationStep("make the user", ("systemd-sysusers", str(TARGETS["sysusers.conf"]))),
         InstallationStep(
@@ -174,7 +175,7 @@ def install(
         texts: text by absolute path, see `contents`.
         todo: see `steps`; a staged installation (`root` is not `/`) leaves them to the first boot.
         root: `/`, or the root of an image.
-        tell: told each step as it begins.
+        log: called with each step as it begins.
         replace: overwrite files that were edited by hand.
 
     Raises:
@@ -284,7 +285,7 @@ def _run(step: InstallationStep) -> str:
     """Run a step; returns its outcome in words.
 
     Raises:
-        InstallationError: it failed; the sentence says how.
+        InstallationError: the step failed; the message states why.
     """
     if step.needs_booted_systemd and not Path("/run/systemd/system").is_dir():
         return "left to the next boot: systemd is not running here"

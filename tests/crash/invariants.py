@@ -20,12 +20,12 @@ from daemon.onboard.flight.recovery_match import seal_from_log
 from tests.daemon.small_camera import final_record, pixels_of, small_rig, store_one
 
 ALLOWED_PROBLEMS = ("was damaged on the disk; read with care",)
-"""Of the end of a log that was never synced: read as far as it goes, and said."""
+"""Finding about the end of a log that was never synced: it is read as far as possible."""
 
 
 @dataclass
 class Acknowledged:
-    """What was said to somebody before the cut: from then on it must hold."""
+    """Acknowledgements sent before the cut; they must hold afterwards."""
 
     mission: str = ""
     stored: set[int] = field(default_factory=set)
@@ -63,10 +63,10 @@ class Outcome:
 
 
 def check_invariants(root: Path, acknowledged: Acknowledged, *, flies_on: bool) -> Outcome:
-    """Recover what lies below `root` and hold it against what was told; then fly one more.
+    """Recover the mission below `root` and compare it with the acknowledgements; then fly again.
 
     Raises:
-        AssertionError: something that was told is not so, or something that is not so is told.
+        AssertionError: an acknowledgement does not hold, or a report is wrong.
     """
     missions = sorted(p for p in root.glob("2*") if p.is_dir()) if root.is_dir() else []
     if not missions:

@@ -72,7 +72,7 @@ class CommandBench:
         self._work_folder = folder / "trial"
         self.mission = self._work_folder / "flown" / self._original.name
         self.disk = self._work_folder / "disk"
-        self.output_file = folder / "said.txt"
+        self.output_file = folder / "output.txt"
         self._run_on_original("process")
         self._run_on_original("report")
         self.captured = _captured(self._original)

@@ -39,7 +39,7 @@ BEGUN = "begun"
 """Created below the folder of a recorded run when the transfer begins."""
 
 INDEX = "mission.db"
-"""Not compared byte by byte: `verify` compares what it says."""
+"""Not compared byte by byte: `verify` compares its content."""
 
 Content = Mapping[str, str]
 """SHA-256 by file name."""

@@ -1,7 +1,7 @@
 """The writer, killed at random instants: `python -m tests.crash.kill_writer FOLDER KILLS SEED`.
 
 Each life is a fork of this process that recovers the mission and flies on until it is killed, in
-recovery as well as in flight. Whatever it told anybody is held against the disk after every tenth
+recovery as well as in flight. Every acknowledgement is compared with the disk after every tenth
 life, by recovery, hashes and chain.
 """
 
@@ -32,7 +32,7 @@ EARLY_S = 0.03
 
 @dataclass
 class Figures:
-    """What was told, and what was found."""
+    """The acknowledgements, and the findings."""
 
     kills: int = 0
     killed_in_recovery: int = 0
@@ -95,7 +95,7 @@ def _run_until_killed(mission: Mission, acknowledged: Acknowledged, rng: random.
 
 
 def _read_some(read_end: int, rng: random.Random) -> bytes:
-    """What the life says until it has said enough or a moment has passed, both by chance."""
+    """Output of the process until a random number of lines or a random time has passed."""
     received = b""
     is_early = rng.random() < SHARE_KILLED_EARLY
     wanted = 0 if is_early else rng.randrange(1, 16)

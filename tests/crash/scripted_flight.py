@@ -2,7 +2,7 @@
 
 The real writer process, recovery and products over a camera of tiny heads, in two lives: the first
 ends as by `kill -9` with an exposure stored and not sealed, the second begins with recovery and
-lands. Whatever is told to somebody goes as a line into ACKS at the moment it is told.
+lands. Every acknowledgement is written as a line to ACKS at the moment it is sent.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ from tests.daemon.small_camera import (
 )
 
 REFUSING_DISK = "disk"
-"""Flown on a disk that refuses now and then: what the log has lost is not told as logged."""
+"""Flown on a disk that sometimes refuses: lost log messages are not acknowledged."""
 
 Durability = Literal["synced", "handed over", "not all"]
 """What a log is sure to keep: what was synced (power may fail), what was handed over (the program
@@ -81,7 +81,7 @@ class _Without:
 
 
 class ScriptedService:
-    """Stands where the service stands: gives the orders, and tells on what is answered."""
+    """Takes the place of the service: sends the requests, and records the answers."""
 
     def __init__(
         self, mission: Mission, acks: int, numbers: range, *, lands: bool, durability: Durability
@@ -159,7 +159,7 @@ class ScriptedService:
         return next(a for a in reversed(self._answers) if isinstance(a, kinds))
 
     def _process(self, number: int) -> Iterator[object]:
-        """What a worker does beside it; the second exposure twice, as when it is done anew."""
+        """What a worker does in parallel; the second exposure twice, as when it is processed again."""
         for _ in range(2 if number == 2 else 1):
             pan = np.full((4, 6), number, np.uint16)
             try:

@@ -1,6 +1,6 @@
 """The onboard service with a pipeline that stands aside: `python -m tests.crash.service CONFIG`.
 
-Service, capture, writer and drivers are those that fly. The worker says at once that it is ready
+Service, capture, writer and drivers are those that fly. The worker reports at once that it is ready
 and makes no image, so that a service that is killed every other second is in the air in between.
 """
 

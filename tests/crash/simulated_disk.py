@@ -15,7 +15,7 @@ from pathlib import Path, PurePosixPath
 from tests.crash.write_log import Operation
 
 REBUILT = "-shm"
-"""SQLite builds this file anew; it is never put on a disk here."""
+"""SQLite rebuilds this file; it is never put on a disk here."""
 
 
 @dataclass
@@ -53,7 +53,7 @@ Tree = Mapping[str, bytes | None]
 
 
 class Disk:
-    """Takes operations below `root` and tells what may be left of them."""
+    """Takes operations below `root` and computes what may be left of them."""
 
     def __init__(self, root: Path) -> None:
         self._root = PurePosixPath(root)
@@ -245,7 +245,7 @@ VARIANTS: Mapping[str, Callable[[Disk], Tree]] = {
     "only the last change survives": lambda disk: disk.left(select_last, select_last),
     "all but the first survive": lambda disk: disk.left(select_all_but_first, select_all_but_first),
 }
-"""The bounded set of states tried at each cut, beside a torn write and arbitrary survivors."""
+"""The bounded set of states tried at each cut, in addition to a torn write and arbitrary survivors."""
 
 
 def variants(disk: Disk, names: Collection[str]) -> Iterator[tuple[str, Tree]]:

@@ -51,7 +51,7 @@ def folder() -> Iterator[Path]:
 
 
 def fly(folder: Path, faults: list[str], exposures: int) -> tuple[int, Acknowledged, Mission]:
-    """How many calls failed, what was told, and the mission as it landed."""
+    """How many calls failed, the acknowledgements, and the mission as it landed."""
     program = [sys.executable, "-m", "tests.crash.scripted_flight", str(folder / FLOWN)]
     command = [*program, str(folder / ACKS), str(exposures), REFUSING_DISK]
     count = run_with_faults(command, faults, folder / "trace", cwd=ROOT)

@@ -54,7 +54,7 @@ def test_a_disk_that_fills_costs_what_did_not_fit_and_flight_goes_on_when_it_is_
     print(done.stdout)
     every = set(range(1, EXPOSURES + 1))
     accepted = {number for number in every if number % 4}
-    # Every trigger ends in one record, whatever the disk said meanwhile.
+    # Every trigger ends in one record, whatever the disk returned meanwhile.
     assert set(figures["sealed"]) == every
     assert set(figures["stored"]) | set(figures["lost"]) == every
     assert figures["refused_frames"] == len(accepted - set(figures["stored"])) >= 1

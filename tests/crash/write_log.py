@@ -2,7 +2,7 @@
 
 What SQLite writes is in it as well as what we write: the layer lies below both. Changes through
 shared mappings are not; of the files of a mission only `mission.db-shm` is written that way, which
-SQLite builds anew after a crash.
+SQLite rebuilds after a crash.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class Operation:
     """One change: what, where, and with which bytes.
 
     `kind` is one of create, write, truncate, sync, mkdir, rename, exchange, unlink. `offset` is
-    None for a write at the file's own position; `size` is what a file was cut to; `is_new` tells
+    None for a write at the file's own position; `size` is what a file was cut to; `is_new` states
     whether a file that is opened for creation must not have been there.
     """
 
@@ -112,7 +112,7 @@ def run_with_faults(
             counted in each thread for itself.
         trace: the recorder's own file.
         cwd: where the program runs.
-        said: where it prints.
+        stdout: where it prints.
     """
     assert STRACE is not None
     calls = ",".join(fault.partition(":")[0] for fault in faults)

@@ -15,7 +15,7 @@ FLIGHT_WITHIN_S = 300.0
 
 @dataclass(frozen=True)
 class DemoMission:
-    """What `syntopic demo --json` said, and where its mission and truth lie."""
+    """Output of `syntopic demo --json`, and the paths of its mission and truth."""
 
     summary: dict[str, Any]
     mission: Path

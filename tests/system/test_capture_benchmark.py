@@ -1,4 +1,4 @@
-"""The benchmark of capture alone, short and small: it counts what it says, and can fail."""
+"""The benchmark of capture alone, short and small: its counts are correct, and it can fail."""
 
 from __future__ import annotations
 

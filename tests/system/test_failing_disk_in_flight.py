@@ -1,4 +1,4 @@
-"""The disk refuses and stalls under a flying service: it stays alive, loses nothing it told of."""
+"""The disk refuses and stalls under a flying service: it stays alive, and keeps everything it acknowledged."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_a_disk_that_refuses_and_stalls_costs_exposures_and_never_the_service(
     assert ended["event"] == "ended" and ended["failure"] is None
     assert ended["ledger"]["balanced"] and counts["open"] == 0
     assert counts["triggers"] == EXPOSURES
-    # What was told is so, and each trigger has its record.
+    # Every acknowledgement holds, and each trigger has its record.
     mission = Mission.open(Path(next(e["path"] for e in events if e["event"] == "mission")))
     found = {number: read_sealed(mission.level0(number)) for number in mission.numbers()}
     present = {number for number, record in found.items() if record and record.exposure.frames}

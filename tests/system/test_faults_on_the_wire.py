@@ -28,7 +28,7 @@ at_pulse = 7
 device = "SU10"
 by_s = 6.0
 
-[[fault]]  # the clock is doubted while marks are counted anew
+[[fault]]  # the clock is doubted while marks are counted again
 fault = "late"
 at_pulse = 10
 device = "receiver/navigation"

@@ -26,7 +26,7 @@ WINDOW_PX = 128
 
 
 def shift_px(truth: NDArray[np.float32], image: NDArray[np.float32]) -> tuple[float, float]:
-    """By how much an image lies beside the truth, by maximising their correlation."""
+    """Offset of an image from the truth, by maximising their correlation."""
     first, second = (np.ascontiguousarray(a / a.mean(), np.float32) for a in (truth, image))
     stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 100, 1e-7)
     warp = np.eye(2, 3, dtype=np.float32)
@@ -134,7 +134,7 @@ def test_processing_again_gives_the_same_image_and_the_same_figures(
     flown: DemoMission, tmp_path: Path
 ) -> None:
     copy = tmp_path / flown.mission.name
-    # The exposure before it says how far they overlap.
+    # The overlap follows from the exposure before it.
     ignored = shutil.ignore_patterns("L2", "00000[!45]*", "00001*")
     shutil.copytree(flown.mission, copy, ignore=ignored)
     (copy / "L2").mkdir()

@@ -53,7 +53,7 @@ MAX_DISTANCE_M = 6.0
 
 
 class Running:
-    """A service and what it says."""
+    """A service and its output."""
 
     def __init__(self, config: Path) -> None:
         self.process = subprocess.Popen(
@@ -237,7 +237,7 @@ def test_a_flight_is_flown_from_the_page(
         assert ended["ledger"]["triggers"]["lost"] == 0
         deviation_m = exposed_where_planned(Path(event_of(service, "mission")["path"]))
         record_property("away_from_place_m", [round(value, 2) for value in deviation_m])
-        print(f"exposed beside the planned places by {[round(v, 2) for v in deviation_m]} m")
+        print(f"exposed off the planned places by {[round(v, 2) for v in deviation_m]} m")
         commands = [(e["name"], e["by"]) for e in service.events if e["event"] == "command"]
         assert commands == [("exposure", "operator"), ("start", "operator"), ("land", "operator")]
 
@@ -280,7 +280,7 @@ def exposed_where_planned(mission: Path) -> list[float]:
     for number in range(1, EXPOSURES + 1):
         record = json.loads((mission / f"L0/{number:06d}/exposure.json").read_text())
         assert (record["line_id"], record["strip_id"]) == (LINE, STRIP)
-        # Set by hand from the page: every head was exposed with it, and says so itself.
+        # Set by hand from the page: every head was exposed with it, and reports it.
         assert {frame["settings"]["Gain"] for frame in record["frames"]} == {GAIN_DB}
         where = record["navigation"]
         _, along_m = plane.flat(Point(where["latitude_deg"], where["longitude_deg"]))
@@ -311,7 +311,7 @@ def test_a_mission_of_waypoints_is_exposed_and_a_head_that_goes_is_seen_and_ackn
 ) -> None:
     """An autopilot orders exposures at its waypoints, in a light that the heads follow.
 
-    Then the emulator is killed under the service: every device is lost, and is told so.
+    Then the emulator is killed under the service: every device is lost, and is reported lost.
     """
     chromium()
     arguments = simulator_arguments(

@@ -63,7 +63,7 @@ def test_a_replay_finds_one_flipped_bit_of_the_receiver(flown: DemoMission, tmp_
     done = syntopic("replay", str(mission), "--records-only", "--json")
     output = json.loads(done.stdout)
     assert done.returncode == 1
-    # The message's checksum is wrong now, so what was told then is not in the bytes any more.
+    # The message's checksum is wrong now, so the bytes no longer contain the reported value.
     assert compared(output)["records of gnss"][1] > 0
     assert output["sentences"]
 

@@ -1,4 +1,4 @@
-"""An autopilot's mission beside an emulated flight, and what must have come of it.
+"""An autopilot's mission of an emulated flight, and its expected result.
 
 The exposures are ordered over MAVLink, waypoint by waypoint; how long they are is left to the
 automatic.
@@ -121,7 +121,7 @@ def _check_brightness(
     assert light[-1] > 1.8 * light[0]
     for k in range(1, len(frames)):
         log_ratio = math.log(bright[k] / bright[0]) - math.log(light[k] / light[0])
-        assert abs(log_ratio) < 0.15, "the pixels have the light that the record tells of"
+        assert abs(log_ratio) < 0.15, "the pixels have the light of the record"
     assert abs(math.log(bright[-1] / TARGET)) < abs(math.log(bright[0] / TARGET))
     settings_events = [
         e for e in events if e["event"] == "exposure-settings" and e["by"] == "automatic"

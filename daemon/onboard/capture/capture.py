@@ -43,7 +43,7 @@ CLOSE_TIMEOUT_S = 3.0
 def main(
     link: ServiceConnection, specs: tuple[DeviceSpec, ...], rings: tuple[FrameRing, ...]
 ) -> None:
-    """Open the devices, deliver until told to stop."""
+    """Open the devices and deliver their records until a stop message arrives."""
     _Capture(link, specs, {ring.head: ring for ring in rings}).run()
 
 
@@ -109,7 +109,7 @@ class _Capture:
 
     def _deliver(self, spec: DeviceSpec, device: Device) -> None:
         try:
-            # A head that a dead controller still holds is waited out here, and says so.
+            # `bind` waits while a dead controller still holds the head, and emits an event.
             found = self.heads[spec.name].bind(self._sink) if spec.kind == "head" else device.bind()
             self.link.send(Bound(spec.kind, spec.name, dict(found)))
         except DeviceError as error:

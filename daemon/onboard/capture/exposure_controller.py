@@ -1,7 +1,8 @@
-"""Who sets the exposure of the heads: a person, or `processing.radiometry.exposure_control`.
+"""Exposure settings of the heads, set by an operator or by automatic exposure control.
 
-PAN cones are steered together, so that their images fit; every other cone by itself. A change is
-made between exposures only, and not any more on a line once it is well exposed there.
+Automatic control is `processing.radiometry.exposure_control`. All PAN cones share one setting, so
+that their images match. Every other cone has its own. Settings change between exposures only, and
+not on a line on which they have converged.
 """
 
 from __future__ import annotations
@@ -23,13 +24,13 @@ from processing.rig import Cone, Rig
 
 PAN = "pan"
 EXPOSURES_REMEMBERED = 64
-"""Of so many exposures it is known what they were made with."""
+"""Number of exposures whose settings are kept."""
 
 CHANGED_US, CHANGED_DB = 0.05, 0.005
 
 
 class FlightView(Protocol):
-    """The flight as far as it matters here; `daemon.onboard.flight.flight.Flight`."""
+    """The part of `daemon.onboard.flight.flight.Flight` that is used here."""
 
     track: Track
 
@@ -41,11 +42,11 @@ class ExposureController:
     """The exposure settings of a flight, by group: "pan", or a cone's name.
 
     Args:
-        configuration: what the heads start with, and the limits.
+        configuration: initial settings of the heads, and their limits.
         rig: the camera.
-        flight: where positions come in, and when heads are at work.
-        send: takes a message to a process, by its name.
-        tell: told of every change, by whom and why.
+        flight: source of positions; states whether heads are exposing or sending.
+        send: sends a message to a process, by its name.
+        emit: emits an event for every change, with its author.
     """
 
     def __init__(
@@ -96,14 +97,14 @@ class ExposureController:
         }
 
     def ordered(self, number: int, line_id: str) -> None:
-        """An exposure is made with what is set now."""
+        """Record that an exposure uses the present settings."""
         self._used[number] = (line_id, dict(self.settings))
         self._used.pop(number - EXPOSURES_REMEMBERED, None)
         if self._locked_line not in (None, line_id):
             self._lock_settings(None)
 
     def update_from_histograms(self, number: int, histograms: Mapping[str, Sequence[int]]) -> None:
-        """How bright an exposure became: what the next ones should be made with."""
+        """Compute the next settings from the raw histograms of an exposure."""
         if not self.is_automatic or number not in self._used or not histograms:
             return
         line_id, used = self._used[number]
@@ -122,12 +123,12 @@ class ExposureController:
             self._lock_settings(line_id)
 
     def _lock_settings(self, line_id: str | None) -> None:
-        """Nothing is changed on this line any more; None: a change is possible again."""
+        """Lock the settings on this line; None unlocks them."""
         self._locked_line = line_id
         self._emit("exposure-settings", by="automatic", **self.as_json())
 
     def apply(self) -> bool:
-        """Write what is wanted into the heads, between two exposures; True where that was done."""
+        """Send requested settings to the heads between exposures; True if they were sent."""
         if not self._is_reported:
             self._is_reported = True
             self._emit("exposure-settings", by="configuration", **self.as_json())
@@ -144,7 +145,7 @@ class ExposureController:
         return True
 
     def as_json(self) -> dict[str, Any]:
-        """Who controls, and what is set, for watchers."""
+        """Control mode and settings as plain JSON types, for the page and the API."""
         return {
             "control": "automatic" if self.is_automatic else "manual",
             "lock": self._section.lock,
@@ -153,10 +154,10 @@ class ExposureController:
         }
 
     def command(self, requested: Mapping[str, Any], by: str) -> str | None:
-        """Take a person's word; the sentence says why it cannot be done, None where it is.
+        """Apply an operator's request; return the reason if it is refused, else None.
 
-        `wanted` may hold `control`, and `exposure_time_us`, `gain_db`, `tdi_shifts` for the group
-        `of`, or for all. Settings given by hand switch the automatic off.
+        `requested` may hold `control`, and `exposure_time_us`, `gain_db`, `tdi_shifts` for the group
+        `of`, or for all groups. Manual settings switch automatic control off.
         """
         keys = ("exposure_time_us", "gain_db", "tdi_shifts")
         given = {key: requested[key] for key in keys if requested.get(key) is not None}
@@ -164,7 +165,7 @@ class ExposureController:
         if control is None and not given:
             return "exposure needs control, or exposure_time_us, gain_db, tdi_shifts"
         if control == "automatic" and given:
-            return "the automatic chooses settings itself; give control or settings, not both"
+            return "automatic control chooses the settings; give control or settings, not both"
         if group is not None and group not in self.settings:
             return f"there is no {group!r} to expose; there is {', '.join(self.settings)}"
         updated = dict(self._requested)
@@ -180,7 +181,7 @@ class ExposureController:
         return None
 
     def limits(self, group: str) -> ExposureLimits:
-        """What holds for a group now: by the last position's height and speed, else as planned."""
+        """Limits of a group from the last position's height and speed, else from the plan."""
         position = self._flight.track.last
         section, cone = self._section, self._cones[group]
         speed_mps, height_m = self._plan.ground_speed_mps, self._plan.height_above_ground_m

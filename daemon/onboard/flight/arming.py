@@ -1,7 +1,7 @@
-"""What a flight needs before it may begin, and what is missing of it, each with its cure.
+"""Prerequisites of arming: which ones are missing, and what to do about each.
 
-Pure: what is there is handed in. Who flies all the same is answered by
-`daemon.onboard.service.command_execution` and recorded (`override_message`, `overrides_content`).
+Pure functions of `Readiness`. `daemon.onboard.service.command_execution` accepts overrides; they are
+recorded by `override_message` and `overrides_content`.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from daemon.mission.log.log_records import Message, lenient_json_bytes
 TOPIC = "arming"
 _CHECK_DEVICE = "check its power and cable"
 FILE = "overrides.json"
-"""In the mission: who flew although something was missing, when, and what."""
+"""In the mission: the overrides, each with author, time and missing prerequisites."""
 
 
 @dataclass(frozen=True)
 class Readiness:
-    """What is there.
+    """State of everything that arming requires.
 
-    `absent` are devices in words; `exposures_planned` what the plan still asks for, 1 without one.
+    `absent` are the absent devices; `exposures_planned` are the planned exposures left, 1 without a plan.
     `position_age_s` is None before the first position. `probes_c` holds a reading and its age in
     seconds for each probe of the rig, None for one never read. `serials_unreported` are heads that
-    do not say which they are, though the calibration knows; `serials_mismatched` are sentences
-    about parts that are stated to be others than the calibrated ones.
+    report no serial number although the calibration has one; `serials_mismatched` are sentences
+    about parts whose stated serial number is not the calibrated one.
     """
 
     has_kernels: bool
@@ -49,7 +49,7 @@ class Readiness:
 
 @dataclass(frozen=True)
 class MissingPrerequisite:
-    """Something a flight needs and does not have; `name` is its row in the event table."""
+    """A missing prerequisite of arming; `name` is its entry in the event table."""
 
     name: str
     sentence: str
@@ -63,7 +63,7 @@ class MissingPrerequisite:
 def missing_prerequisites(
     readiness: Readiness, limits: LimitsSection
 ) -> tuple[MissingPrerequisite, ...]:
-    """What is missing of what a flight needs; nothing is, where the service may be armed."""
+    """The missing prerequisites; empty if the service may be armed."""
     found = [
         *_kernels(readiness),
         *(
@@ -77,9 +77,7 @@ def missing_prerequisites(
     if readiness.serials_unreported:
         heads = ", ".join(readiness.serials_unreported)
         cure = "compare their labels with the calibration"
-        found.append(
-            MissingPrerequisite("arming-serial", f"no serial number told by {heads}", cure)
-        )
+        found.append(MissingPrerequisite("arming-serial", f"no serial number from {heads}", cure))
     cure = "fit that part, or fly with a calibration of this one"
     found += [
         MissingPrerequisite("arming-serial", sentence, cure)
@@ -102,7 +100,7 @@ def overrides_content(
 
 
 def overrides_of(mission: Path) -> list[dict[str, Any]]:
-    """Who flew although something was missing; none where nobody did or the file is damaged."""
+    """The recorded overrides; empty if there are none or the file is damaged."""
     try:
         listed = parse_record((mission / FILE).read_bytes(), FILE).get("overrides")
     except (OSError, RecordError):
@@ -122,7 +120,7 @@ def _override(by: str, missing: Sequence[MissingPrerequisite], reason: str) -> d
 def _kernels(readiness: Readiness) -> list[MissingPrerequisite]:
     if readiness.has_kernels:
         return []
-    # Nothing compiles in flight: nobody can take that upon them.
+    # Nothing compiles in flight, so this prerequisite cannot be overridden.
     cure = "wait; where this takes minutes, run syntopic kernels on the ground"
     return [
         MissingPrerequisite(
@@ -134,7 +132,8 @@ def _kernels(readiness: Readiness) -> list[MissingPrerequisite]:
 def _disk(readiness: Readiness) -> list[MissingPrerequisite]:
     if readiness.exposures_left >= max(1, readiness.exposures_planned):
         return []
-    sentence = f"room for {readiness.exposures_left} of {readiness.exposures_planned} exposures on the disk"
+    left, planned = readiness.exposures_left, readiness.exposures_planned
+    sentence = f"the disk has space for {left} of {planned} exposures"
     return [MissingPrerequisite("arming-disk", sentence, "free the disk or change it")]
 
 
@@ -170,6 +169,7 @@ def _temperatures(readiness: Readiness, limits: LimitsSection) -> list[MissingPr
         sentence = f"no temperature of probe {', '.join(missing)}"
         found.append(MissingPrerequisite("arming-temperature", sentence, cure))
     if outdated:
-        sentence = f"temperature of probe {', '.join(outdated)} older than {limits.temperature_stale_s:g} s"
+        limit_s = limits.temperature_stale_s
+        sentence = f"temperature of probe {', '.join(outdated)} older than {limit_s:g} s"
         found.append(MissingPrerequisite("arming-temperature", sentence, cure))
     return found

@@ -1,7 +1,7 @@
-"""What the service decided and when, as messages of the flight log, so that a replay decides alike.
+"""Decisions of the service and their instants, as messages of the flight log.
 
-Which exposures are stored or sealed at an instant follows from that instant; it is recorded, since
-a loaded machine looks later. What a replay makes of it is in `daemon.postflight.replay`.
+The instant determines which exposures are stored or sealed. It is recorded because a loaded machine
+evaluates later. `daemon.postflight.replay` repeats the decisions.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Decision:
     detail: Mapping[str, Any] = field(default_factory=dict)
 
     def message(self) -> Message:
-        """It, for the flight log."""
+        """The decision as a message of the flight log."""
         content = {"kind": self.kind, "number": self.number, **self.detail}
         return Message(TOPIC, self.mono_ns, lenient_json_bytes(content))
 
@@ -47,15 +47,15 @@ def decision_of(message: Message) -> Decision | None:
     kind, number = content.pop("kind", None), content.pop("number", 0)
     if not isinstance(kind, str) or not isinstance(number, int):
         return None
-    # A word of a later version is kept as it is.
+    # A kind added by a later version is kept unchanged.
     return Decision(cast(Kind, kind), message.mono_ns, number, content)
 
 
 @dataclass(frozen=True)
 class Tick:
-    """What fell due at an instant: exposures to store, given up (number, cause), and to seal.
+    """Exposures due at an instant: to store, given up (number, cause), and to seal.
 
-    `foreseen` is the record of one that is only not sealed yet because its mark is the first.
+    `provisional` is the record of an exposure that only awaits a second mark before it is sealed.
     """
 
     to_store: tuple[PendingStore, ...]
@@ -67,7 +67,7 @@ class Tick:
 
     @property
     def detail(self) -> dict[str, Any] | None:
-        """What the log has to say of it; None where nothing fell due."""
+        """Content for the flight log; None if nothing was due."""
         content = {
             "store": [due.capture.number for due in self.to_store],
             "given_up": [number for number, _ in self.given_up],
@@ -79,7 +79,7 @@ class Tick:
 
 
 def tick(flight: Flight, mono_ns: int, *, may_seal: bool, allow_provisional: bool = True) -> Tick:
-    """What falls due now; `may_seal`: no record is on its way to the disk."""
+    """Everything that is due now; `may_seal`: the writer has no record to seal."""
     to_store = tuple(flight.due_to_store(mono_ns))
     given_up = tuple(flight.due_to_give_up(mono_ns))
     to_seal = flight.due_to_seal(mono_ns) if may_seal else None

@@ -1,6 +1,6 @@
-"""Faults that stand, or stood and nobody has acknowledged: kept until a person has seen them.
+"""Active faults, and past faults that no operator has acknowledged.
 
-Pure, but for the file that carries them over to the next start of the service.
+Pure, except for the file that carries them over to the next start of the service.
 """
 
 from __future__ import annotations
@@ -13,20 +13,20 @@ from typing import Any
 from daemon.mission.canonical_json import Fields, RecordError, canonical_bytes, parse_record
 
 FILE = "unhandled-faults.json"
-"""In the root of missions: what nobody had acknowledged when the service was last heard."""
+"""In the root of missions: the unacknowledged faults of the last run."""
 FAULTS_MAX = 200
 DELIVERING = frozenset({"opened", "recovered"})
 UNAVAILABLE = frozenset({"absent", "lost", "silent", "held-by-another"})
-"""Names of device events after which a device delivers, or does not; others are complaints of one
-that does."""
+"""Names of device events after which a device delivers, or does not. Other events report problems of
+a device that delivers."""
 SEARCHING, FIXED = "searching", "fixed"
-"""Likewise, of a receiver that is open and has no fix yet, and that has one."""
+"""The same for a receiver that is open: without a fix, and with one."""
 FILE_MAX_BYTES = 1_000_000
 
 
 @dataclass(frozen=True)
 class LatchedFault:
-    """A fault. `id` names it, `previous` says that it is of an earlier start of the service."""
+    """A fault. `id` names it; `stands` is true while it is active; `previous` marks an earlier run."""
 
     id: str
     device: str
@@ -39,7 +39,7 @@ class LatchedFault:
 
 
 class FaultLatches:
-    """Faults by their id; the oldest is forgotten beyond `KEPT`."""
+    """Faults by their id; beyond `FAULTS_MAX` the oldest is dropped."""
 
     def __init__(self) -> None:
         self._latches: dict[str, LatchedFault] = {}
@@ -47,7 +47,7 @@ class FaultLatches:
     def raise_fault(
         self, fault: str, sentence: str, device: str = "", *, sequence: int = 0
     ) -> None:
-        """A fault has come, or come again."""
+        """Record a new or repeated fault."""
         known = self._latches.pop(fault, None)
         count = known.count + 1 if known else 1
         self._latches[fault] = LatchedFault(fault, device, sentence, count=count, sequence=sequence)
@@ -55,7 +55,7 @@ class FaultLatches:
             del self._latches[next(iter(self._latches))]
 
     def clear_fault(self, fault: str) -> None:
-        """A fault is over; it stays listed until a person has acknowledged it."""
+        """Record the end of a fault; it stays listed until it is acknowledged."""
         found = self._latches.get(fault)
         if found is None:
             return
@@ -65,7 +65,7 @@ class FaultLatches:
             self._latches[fault] = replace(found, stands=False)
 
     def acknowledge(self, fault: str) -> bool:
-        """A person has seen a fault. One that has passed leaves the list; one that stands stays."""
+        """Acknowledge a fault. A past fault leaves the list; an active one stays. False if unknown."""
         found = self._latches.get(fault)
         if found is None:
             return False
@@ -76,7 +76,7 @@ class FaultLatches:
         return True
 
     def apply(self, event: Mapping[str, Any], *, sequence: int = 0) -> None:
-        """What an event of the service raises or puts an end to."""
+        """Raise or clear the faults that an event of the service implies."""
         kind, sentence = event.get("event"), str(event.get("sentence", ""))
         if kind == "device":
             self._apply_device(event, sentence, sequence)
@@ -96,7 +96,7 @@ class FaultLatches:
             self.raise_fault(fault, sentence, device, sequence=sequence)
         elif kind == "page-link":
             self.raise_fault("page link", sentence, "service", sequence=sequence)
-            self.clear_fault("page link")  # it happened; nothing stands
+            self.clear_fault("page link")  # a single occurrence, not an active fault
         elif kind == "prerequisite":
             fault = f"prerequisite {event.get('item')}"
             self.raise_fault(fault, sentence, "service", sequence=sequence)
@@ -105,10 +105,10 @@ class FaultLatches:
             description = f"Exposure {number}: {cause}"
             fault = f"exposure {number}"
             self.raise_fault(fault, description, "exposures", sequence=sequence)
-            self.clear_fault(fault)  # it happened; nothing stands
+            self.clear_fault(fault)  # a single occurrence, not an active fault
         elif kind == "ready":
             for absent in event.get("absent", []):
-                description = f"Flying without {absent}; look at it."
+                description = f"Flying without {absent}. Check it."
                 self.raise_fault(f"absent {absent}", description, str(absent), sequence=sequence)
         elif kind == "status":
             if event.get("exposures_left"):
@@ -119,7 +119,7 @@ class FaultLatches:
             self.add_previous([latch] if latch else [], sequence=sequence)
 
     def _clear_present(self, event: Mapping[str, Any]) -> None:
-        """What was absent when the service became ready, and is there now."""
+        """Clear the faults of devices that were absent at the start and are present now."""
         if isinstance(absent := event.get("absent"), list):
             still = {f"absent {one}" for one in absent}
             for fault in [f for f in self._latches if f.startswith("absent ")]:
@@ -129,7 +129,7 @@ class FaultLatches:
     def _apply_device(self, event: Mapping[str, Any], sentence: str, sequence: int) -> None:
         device, name = str(event.get("device")), event.get("name")
         if device == "clock":
-            # One device, several things that come and go by themselves.
+            # One device with several independent faults.
             fault = f"clock {name}"
             if event.get("fault"):
                 self.raise_fault(fault, sentence, device, sequence=sequence)
@@ -145,7 +145,7 @@ class FaultLatches:
                 self.clear_fault(fault)
 
     def add_previous(self, latches: Iterable[LatchedFault], *, sequence: int = 0) -> None:
-        """Faults of an earlier start: they no longer stand, and nobody has acknowledged them."""
+        """Add the unacknowledged faults of an earlier run; they are no longer active."""
         for latch in latches:
             if latch.id not in self._latches:
                 self._latches[latch.id] = replace(
@@ -157,7 +157,7 @@ class FaultLatches:
         return [asdict(latch) for latch in sorted(self._latches.values(), key=_newest_first)]
 
     def unhandled(self) -> tuple[LatchedFault, ...]:
-        """Those that nobody has acknowledged, in the order they came."""
+        """The unacknowledged faults, oldest first."""
         return tuple(latch for latch in self._latches.values() if not latch.acknowledged)
 
     def __contains__(self, fault: str) -> bool:
@@ -165,13 +165,13 @@ class FaultLatches:
 
 
 def unhandled_content(latches: Iterable[LatchedFault]) -> bytes:
-    """The content of `FILE`: the faults nobody has acknowledged, for the next start."""
+    """The content of `FILE`: the unacknowledged faults."""
     entries = [{key: getattr(latch, key) for key in _KEYS} for latch in latches]
     return canonical_bytes({"faults": entries})
 
 
 def read_unhandled(root: Path) -> tuple[LatchedFault, ...]:
-    """The faults nobody had acknowledged; none where the file is missing or damaged."""
+    """The unacknowledged faults; empty if the file is missing or damaged."""
     path = root / FILE
     try:
         if path.stat().st_size > FILE_MAX_BYTES:
@@ -188,7 +188,7 @@ def read_unhandled(root: Path) -> tuple[LatchedFault, ...]:
 
 
 def previous_faults(latches: Iterable[LatchedFault]) -> list[dict[str, Any]]:
-    """Events that tell of faults of an earlier start."""
+    """Events that report faults of an earlier run."""
     return [
         {"event": "previous-fault", **{key: getattr(latch, key) for key in _KEYS}}
         for latch in latches

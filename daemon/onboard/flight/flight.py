@@ -1,8 +1,8 @@
 """The open exposures of a flight, from the pulse to the sealed record.
 
-Pure bookkeeping on instants handed in: frames, marks, navigation and temperatures come in; what is
-due to be stored, sealed or given up comes out. Processes and disk are the business of
-`daemon.onboard.service.service`.
+Pure bookkeeping on given instants. Input: frames, marks, navigation and temperatures. Output: the
+exposures that are due to be stored, sealed or given up. `daemon.onboard.service.service` handles
+processes and disk.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ NO_FLAG = Flag(0)
 
 @dataclass(frozen=True)
 class FlightIdentity:
-    """What every record of a flight repeats."""
+    """Values that every record of a flight contains."""
 
     boot_id: str
     line_id: str
@@ -56,7 +56,7 @@ class FlightIdentity:
 
 @dataclass(frozen=True)
 class PendingStore:
-    """An exposure whose frames are all here, or will not come: to be made durable."""
+    """An exposure to be stored: its frames have arrived or timed out."""
 
     capture: CaptureRecord
     slots: Mapping[str, int]
@@ -71,7 +71,7 @@ class _OpenExposure:
     flags: Flag = NO_FLAG
     causes: dict[str, str] = field(default_factory=dict)
     ambiguous: dict[str, str] = field(default_factory=dict)
-    """Heads of which a frame came that may be this exposure's, and what is to be said of it."""
+    """Cause by head, for frames that arrived and may belong to this exposure."""
     line_id: str = ""
     strip_id: str = ""
     being_stored: CaptureRecord | None = None
@@ -82,12 +82,12 @@ class _OpenExposure:
 
     @property
     def reported_flags(self) -> Flag:
-        """The flags, and whether a missing frame may have come all the same."""
+        """The flags, with FRAME_AMBIGUOUS if a missing frame may have arrived unattributed."""
         has_ambiguous_frame = self.ambiguous.keys() - self.frames.keys() - self.causes.keys()
         return self.flags | (Flag.FRAME_AMBIGUOUS if has_ambiguous_frame else NO_FLAG)
 
     def missing_cause(self, head: str) -> str:
-        """What is to be said of a frame that is not there."""
+        """Why the frame of a head is missing."""
         return self.causes.get(head) or self.ambiguous.get(head, "no frame came")
 
 
@@ -95,9 +95,9 @@ class Flight:
     """Exposures between trigger and seal.
 
     Every method that takes an instant takes `mono_ns`. Slots of frames that are not used are
-    collected in `idle_slots`, to be handed back to the heads; marks whose fate became final after
-    they had come, in `resolved_marks`. Heads in `absent_heads` are known to be lost; their frames
-    are not waited for. While `disk_is_low` what is ordered is flagged so.
+    collected in `idle_slots`, to be returned to the heads. Marks that became final after their arrival
+    are in `resolved_marks`. Heads in `absent_heads` are known to be lost; their frames are not awaited.
+    While `disk_is_low` is set, ordered exposures get the flag DISK_LOW.
     """
 
     def __init__(
@@ -139,7 +139,7 @@ class Flight:
         return any(not e.lost and e.being_stored is None for e in self._open.values())
 
     def order(self, mono_ns: int, line_id: str | None = None, strip_id: str = "") -> int:
-        """A trigger is being ordered: its exposure is open from now on. Returns its number.
+        """Open the exposure of a trigger that is being ordered; return its number.
 
         `line_id` is that of the planned line being flown, None where nothing is planned.
         """
@@ -155,7 +155,7 @@ class Flight:
         return number
 
     def order_details(self, number: int) -> dict[str, Any]:
-        """What an open exposure was ordered with."""
+        """Line, strip and flags with which an open exposure was ordered."""
         exposure = self._open[number]
         return {
             "line_id": exposure.line_id,
@@ -190,7 +190,7 @@ class Flight:
         return cause
 
     def has_pulse_of(self, frame: Frame) -> bool:
-        """Whether the pulse of a frame is known, so that one given just now cannot be its own."""
+        """Whether the pulse of a frame is already known."""
         return self._matcher.has_pulse_of(frame)
 
     def _read_latch(self, frame: Frame) -> None:
@@ -216,7 +216,7 @@ class Flight:
         self.device_clocks.read(reading)
 
     def clock_events(self, mono_ns: int) -> list[ClockEvent]:
-        """What is to be told of the clocks since the last time of asking."""
+        """Events of the clocks since the last call."""
         events = self.clock.events(mono_ns)
         for device, steps in self.device_clocks.steps().items():
             if steps > self._steps_reported.get(device, 0):
@@ -225,14 +225,14 @@ class Flight:
                     ClockEvent(
                         "device-clock-stepped",
                         True,
-                        f"the clock of {device} stepped or started again; it is learned anew; "
-                        "check its power if it happens again",
+                        f"the clock of {device} stepped or restarted; it is estimated again; "
+                        "check its power supply if this repeats",
                     )
                 )
         return events
 
     def land(self) -> None:
-        """No more marks will come: what is still held belongs nowhere."""
+        """End the flight: pending marks become spurious."""
         self._give_up_marks(2**63)
 
     def navigation(self, sample: NavSample) -> None:
@@ -247,7 +247,7 @@ class Flight:
         self.temperatures.add(sample)
 
     def due_to_store(self, mono_ns: int) -> list[PendingStore]:
-        """Exposures whose frames are complete, or whose time is up; each is returned once."""
+        """Exposures whose frames are complete or timed out; each is returned once."""
         due = []
         for exposure in self._open.values():
             if exposure.being_stored is not None or exposure.lost or not exposure.frames:
@@ -265,10 +265,10 @@ class Flight:
         return exposure.frames.keys() >= self.serial_of_head.keys() - self.absent_heads
 
     def _must_release_slots(self, exposure: _OpenExposure) -> bool:
-        """Whether an exposure so much newer has as many frames that its slots are needed now.
+        """Whether a newer exposure needs the slots of this one.
 
-        A silent head must not starve the others of memory: heads deliver in order, and one that is
-        as many exposures behind as there are slots is not waited for.
+        A silent head must not exhaust the memory of the others. Heads deliver in order: a head that
+        is as many exposures behind as there are slots is not awaited.
         """
         first = exposure.number + self.limits.exposures_in_memory - 1
         return any(
@@ -277,7 +277,7 @@ class Flight:
         )
 
     def due_to_give_up(self, mono_ns: int) -> list[tuple[int, str]]:
-        """Exposures of which nothing came in time: now lost, with the cause; returned once."""
+        """Exposures without any frame in time: now lost, with the cause; returned once."""
         lost = []
         for exposure in self._open.values():
             waited_ns = mono_ns - exposure.ordered_mono_ns
@@ -289,7 +289,7 @@ class Flight:
         return lost
 
     def not_fired(self, number: int, sentence: str) -> None:
-        """The trigger unit gave no pulse, or nobody knows: the exposure is lost."""
+        """The trigger unit gave no pulse or did not answer: the exposure is lost."""
         exposure = self._open.get(number)
         if exposure is not None and not exposure.frames:
             self._mark_lost(exposure, sentence)
@@ -331,9 +331,9 @@ class Flight:
         return self._seal(exposure, exposure.stored)
 
     def due_provisionally(self) -> Exposure | None:
-        """The oldest open exposure where nothing but a second mark is awaited; returned once.
+        """The oldest open exposure that only awaits a second mark; returned once.
 
-        It is sealed with this very record unless that mark makes its own another's.
+        It is sealed with this record unless the second mark reassigns its own mark.
         """
         exposure = next(iter(self._open.values()), None)
         if exposure is None or exposure.stored is None or exposure.lost or exposure.provisional:
@@ -355,7 +355,7 @@ class Flight:
         self.ledger.sealed(number)
 
     def not_sealed(self, number: int, state: RecordState) -> None:
-        """The disk will not have the record: closed here, and sealed by recovery one day."""
+        """The disk refused the record: the exposure is closed, and recovery seals it later."""
         self._close(number, state)
 
     def _close(self, number: int, state: RecordState) -> None:
@@ -462,7 +462,7 @@ _FRAME_FLAGS = {
     Cause.SPURIOUS: NO_FLAG,
 }
 _AMBIGUITIES = {
-    Cause.CORRUPT: "may be a corrupt frame that came, which may be of another exposure",
-    Cause.SPURIOUS: "may be a frame that came and could not be told from others",
+    Cause.CORRUPT: "may be a corrupt frame that arrived; it may belong to another exposure",
+    Cause.SPURIOUS: "may be a frame that arrived and could not be attributed",
 }
 """Of a frame that may be of several exposures, or of none."""

@@ -1,8 +1,7 @@
-"""The ledger: every trigger, frame and event mark is accounted for, at every moment.
+"""The ledger: every trigger, frame and event mark is accounted for.
 
-Pure counting, without clock, disk or threads. Two books are kept: what arrived, and what became of
-it; `imbalances` compares them. What an exposure may become is in
-`daemon.onboard.flight.transitions`.
+Pure counting, without clock, disk or threads. One account counts what arrived, the other its causes;
+`imbalances` compares them. The states of an exposure are in `daemon.onboard.flight.transitions`.
 
     triggers              = open + complete + degraded + lost
     received (each head)  = pending + used + late + duplicate + corrupt + spurious
@@ -36,7 +35,7 @@ __all__ = ["CAUSES", "MARK", "Ledger", "LedgerError", "LedgerSheet", "Receipts"]
 CAUSES = ("used", "late", "duplicate", "corrupt", "spurious")
 PENDING = "pending"
 MARK = "mark"
-"""The name under which a missing event mark stands among the causes of an exposure."""
+"""Key of a missing event mark among the causes of an exposure."""
 
 Causes = Mapping[str, str] | Iterable[tuple[str, str]]
 
@@ -51,7 +50,7 @@ _TRANSITION_TO = {
 class Receipts:
     """What became of all that was received from one head, or of all event marks.
 
-    `missing` counts settled exposures that lack it; it is no part of `received`.
+    `missing` counts finalized exposures without it; it is not part of `received`.
     """
 
     name: str
@@ -215,14 +214,14 @@ class Ledger:
         self._marks.enter(cause)
 
     def set_state(self, number: int, state: str | ExposureState, causes: Causes = ()) -> None:
-        """Judge an exposure; until it is sealed, a later judgement may only be worse.
+        """Set the final state of an exposure; until it is sealed, the state may only get worse.
 
         Args:
             number: the exposure.
             state: "complete", "degraded" or "lost".
-            causes: what it lacks and why: heads whose frame is not part of it, "mark", or what
-                else went wrong. None for a complete one, at least one for the others. A head that
-                sent a duplicate beside its good frame lacks nothing and is not named.
+            causes: what is missing and why: heads without a frame, "mark", or another problem. None
+                for a complete exposure, at least one otherwise. A head that sent a duplicate in
+                addition to its good frame is not named.
         """
         try:
             new_state = ExposureState(state)
@@ -230,11 +229,13 @@ class Ledger:
             new_state = ExposureState.OPEN
         named = dict(causes)
         if new_state not in _TRANSITION_TO:
-            raise LedgerError(f"exposure {number}: settled means complete, degraded or lost")
+            raise LedgerError(f"exposure {number}: the final state is complete, degraded or lost")
         if new_state is ExposureState.COMPLETE and named:
-            raise LedgerError(f"exposure {number}: is complete but lacks {', '.join(named)}")
+            raise LedgerError(f"exposure {number}: is complete, but missing: {', '.join(named)}")
         if new_state is not ExposureState.COMPLETE and not named:
-            raise LedgerError(f"exposure {number}: is {new_state.value}; say what it lacks and why")
+            raise LedgerError(
+                f"exposure {number}: is {new_state.value}; state what is missing and why"
+            )
         entry = self._entry(number)
         self._step(number, _TRANSITION_TO[new_state])
         self._missing.subtract(entry.missing)
@@ -250,11 +251,11 @@ class Ledger:
         self._step(number, Transition.SEAL)
 
     def status(self, number: int) -> ExposureStatus:
-        """How an exposure stands."""
+        """State and storage of an exposure."""
         return self._entry(number).status
 
     def open_numbers(self) -> list[int]:
-        """Exposures that are not judged yet, ascending."""
+        """Exposures without a final state, ascending."""
         return sorted(n for n, e in self._entries.items() if e.status.state is ExposureState.OPEN)
 
     def unsealed_numbers(self) -> list[int]:
@@ -269,8 +270,8 @@ class Ledger:
         """One sentence for everything that does not add up; empty when the books balance.
 
         Args:
-            delivered: by head, frames its driver says it delivered; compared where given.
-            has_landed: nothing more will come, so that nothing may be open or pending any more.
+            delivered: frames delivered according to the driver, by head; compared if given.
+            has_landed: the flight has ended; nothing may be open or pending.
         """
         found = self._trigger_imbalances()
         if has_landed:

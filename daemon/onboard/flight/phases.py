@@ -1,6 +1,6 @@
-"""Where a service and its mission stand: idle, ready, armed, flying, landed or in fault.
+"""Phases of a flight: idle, ready, armed, flying, landed and fault.
 
-Pure: facts in, one step at a time out; no phase is skipped. What arming needs is in
+A pure state machine without skipped phases. The prerequisites of arming are in
 `daemon.onboard.flight.arming`.
 """
 
@@ -16,20 +16,20 @@ class Phase(enum.StrEnum):
     IDLE = "idle"
     """Devices open and kernels load."""
     READY = "ready"
-    """Nothing opens any more; something that a flight needs is missing, or nobody has armed."""
+    """Opening has ended; a prerequisite is missing, or the service is not armed."""
     ARMED = "armed"
-    """Somebody armed, and all that a flight needs is there or accepted as missing."""
+    """Armed: every prerequisite is met or overridden."""
     FLYING = "flying"
     """The line runs."""
     LANDED = "landed"
-    """The planned exposures are made, or somebody ended the flight."""
+    """The planned exposures are made, or the flight was ended by command."""
     FAULT = "fault"
-    """The service ends, and is started again into the same mission."""
+    """The service ends; its restart resumes the same mission."""
 
 
 @dataclass(frozen=True)
 class PhaseInputs:
-    """What the phase depends on."""
+    """Inputs of the state machine."""
 
     is_prepared: bool = False
     is_armed: bool = False
@@ -46,18 +46,18 @@ ALLOWED_NEXT: Final[Mapping[Phase, tuple[Phase, ...]]] = {
     Phase.LANDED: (Phase.FAULT,),
     Phase.FAULT: (),
 }
-"""What may follow. A fault is left by starting anew alone; what is lost in the air disarms nobody:
-the line goes on without it until it is stopped."""
+"""Allowed successors of each phase. Only a restart leaves FAULT. A device lost in flight does not
+disarm: the line continues without it until it is stopped."""
 
 
 class PhaseMachine:
-    """The phase, and the way there."""
+    """The present phase and its transitions."""
 
     def __init__(self) -> None:
         self.phase = Phase.IDLE
 
     def advance(self, facts: PhaseInputs) -> list[Phase]:
-        """Go where the facts lead; the phases entered on the way, in their order."""
+        """Advance as far as the inputs allow; return the phases entered, in order."""
         entered: list[Phase] = []
         while (phase := _next(self.phase, facts)) is not None:
             assert phase in ALLOWED_NEXT[self.phase]

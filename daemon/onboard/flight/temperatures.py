@@ -1,6 +1,6 @@
-"""What the probes read over the last minutes, and what they read when an exposure was made.
+"""Probe readings of the last minutes, and the readings at an exposure.
 
-A sensor that follows its probe with a lag gets a reading of its own beside it: the probe's history
+A sensor with a thermal lag gets its own reading in addition to that of its probe: the probe's history
 through a first-order lag.
 """
 

@@ -1,6 +1,6 @@
-"""What may become of an exposure: its states, and the only steps between them.
+"""States of an exposure and the allowed transitions between them.
 
-Pure and complete: every step not listed is refused. The counting is in
+Pure; every transition not listed is refused. The counting is in
 `daemon.onboard.flight.ledger`.
 """
 
@@ -13,11 +13,11 @@ from daemon.errors import DaemonError
 
 
 class LedgerError(DaemonError):
-    """A step that an exposure cannot take, or a count that cannot be."""
+    """A transition that is not allowed, or an inconsistent count."""
 
 
 class ExposureState(enum.Enum):
-    """How an exposure stands. OPEN: triggered, not judged yet; the others say how it ended."""
+    """State of an exposure. OPEN: triggered, not finalized. The others are final states."""
 
     OPEN = "open"
     COMPLETE = "complete"
@@ -26,7 +26,7 @@ class ExposureState(enum.Enum):
 
 
 class StorageState(enum.Enum):
-    """How safe it is. STORED: pixels durable. SEALED: the record is final and durable."""
+    """Durability of an exposure. STORED: pixels durable. SEALED: the record is final and durable."""
 
     VOLATILE = "volatile"
     STORED = "stored"
@@ -34,11 +34,11 @@ class StorageState(enum.Enum):
 
 
 class Transition(enum.Enum):
-    """What happens to an exposure."""
+    """Transitions of an exposure."""
 
-    SET_COMPLETE = "settled complete"
-    SET_DEGRADED = "settled degraded"
-    SET_LOST = "settled lost"
+    SET_COMPLETE = "set to complete"
+    SET_DEGRADED = "set to degraded"
+    SET_LOST = "set to lost"
     STORE = "stored"
     SEAL = "sealed"
 
@@ -70,12 +70,12 @@ def _table() -> dict[tuple[ExposureStatus, Transition], ExposureStatus]:
     ) -> None:
         table[ExposureStatus(state, storage), step] = ExposureStatus(new_state, new_storage)
 
-    # Judged once; later it may only turn out worse, until it is sealed.
+    # A final state may only get worse until the exposure is sealed.
     for storage in (volatile, stored):
         allow(open_, storage, Transition.SET_COMPLETE, complete, storage)
         for state in (open_, complete, degraded):
             allow(state, storage, Transition.SET_DEGRADED, degraded, storage)
-    # What is stored cannot be lost any more.
+    # A stored exposure cannot be lost.
     for state in (open_, complete, degraded):
         allow(state, volatile, Transition.SET_LOST, lost, volatile)
         allow(state, volatile, Transition.STORE, state, stored)
@@ -89,7 +89,7 @@ TRANSITIONS = _table()
 
 
 def next_status(status: ExposureStatus, step: Transition) -> ExposureStatus:
-    """How an exposure stands after a step.
+    """State and storage of an exposure after a transition.
 
     Raises:
         LedgerError: the step is not allowed from there.

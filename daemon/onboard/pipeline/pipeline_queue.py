@@ -1,6 +1,7 @@
-"""Sealed exposures on their way through the pipeline, and the frames kept in memory for it.
+"""Queue of sealed exposures for the pipeline, and their frames in memory.
 
-The pipeline never holds up capture: what it is too slow for is read from disk later, and says so.
+The pipeline never delays capture. An exposure that has to wait is read from disk later and gets the
+flag PROCESSING_BEHIND.
 """
 
 from __future__ import annotations
@@ -38,14 +39,14 @@ class _QueuedExposure:
 
 
 class PipelineQueue(MessageDispatcher):
-    """Hands exposures to the worker, so many at a time.
+    """Passes exposures to the worker, a limited number at a time.
 
     Args:
-        lanes: exposures in work at a time.
-        send: sends a message to a process of ours, by its name.
-        tell: told of what became of an exposure.
-        decided: told of when an exposure is processed, and from where.
-        seen: told how bright an exposure became, counts of DN by sensor.
+        parallel_exposures: exposures processed at a time.
+        send: sends a message to a process, by its name.
+        emit: emits the event of each result.
+        on_decision: called when an exposure is processed, with its source.
+        on_histograms: called with the raw histograms of an exposure, counts of DN by sensor.
     """
 
     def __init__(
@@ -73,7 +74,7 @@ class PipelineQueue(MessageDispatcher):
         return len(self._waiting) + len(self._in_progress)
 
     def retain(self, number: int, slots: Mapping[str, int]) -> None:
-        """The frames of an exposure lie in these slots; they are not filled again yet."""
+        """Retain the slots of an exposure's frames; they are not reused yet."""
         self._in_memory[number] = slots
 
     def stored(self, number: int) -> None:
@@ -83,11 +84,11 @@ class PipelineQueue(MessageDispatcher):
             self.recycle(self._in_memory.pop(number))
 
     def not_stored(self, number: int) -> None:
-        """The disk refused the frames; the flight hands back their slots."""
+        """The disk refused the frames; the flight returns their slots."""
         self._in_memory.pop(number, None)
 
     def provisional(self, exposure: Exposure) -> None:
-        """An exposure may be begun; its record is as good as certain, and `sealed` will follow."""
+        """Enqueue an exposure with a provisional record; `sealed` or `not_sealed` follows."""
         self._unsealed.add(exposure.number)
         self._enqueue(exposure, is_sealed=False)
 
@@ -99,7 +100,7 @@ class PipelineQueue(MessageDispatcher):
             self._enqueue(exposure, is_sealed=True)
 
     def not_sealed(self, number: int) -> None:
-        """The disk has no record of it: what was begun comes to nothing."""
+        """The disk has no record of it: drop its products."""
         if number in self._unsealed and not self._remove_waiting(number):
             self._send("worker", RecordFinalized(number, None))
         self._finish(number)
@@ -110,7 +111,7 @@ class PipelineQueue(MessageDispatcher):
         self._dispatch_waiting()
 
     def _remove_waiting(self, number: int) -> bool:
-        """An unsealed exposure is one no longer; whether it was still waiting, and does not now."""
+        """Remove an unsealed exposure from the queue; True if it was still waiting."""
         self._unsealed.discard(number)
         waiting = [task for task in self._waiting if task.exposure.number != number]
         was_waiting = len(waiting) < len(self._waiting)
@@ -118,7 +119,7 @@ class PipelineQueue(MessageDispatcher):
         return was_waiting
 
     def recycle(self, slots: Mapping[str, int]) -> None:
-        """These slots, by head, may be filled again."""
+        """Return these slots, by head, to capture."""
         self._send("capture", Recycle(slots))
 
     def _on_worker_ready(self, ready: WorkerReady) -> None:

@@ -1,7 +1,7 @@
 """The pipeline worker: Level-0 in, Level-2 products and a verdict out.
 
-It reads an exposure from shared memory while it is still there, else from disk; it never makes the
-capture wait. A few exposures are in work at a time (`daemon.onboard.pipeline.pipeline_pool`).
+It reads an exposure from shared memory if its frames are still there, else from disk. It never delays
+capture. Several exposures are processed at a time (`daemon.onboard.pipeline.pipeline_pool`).
 """
 
 from __future__ import annotations
@@ -57,11 +57,11 @@ from processing.rig import Rig, find_rig
 SWITCH_INTERVAL_S = 0.001
 """How long one thread may hold the interpreter while another waits to enter a kernel."""
 FINALIZE_TIMEOUT_S = 3600.0
-"""A disk that refuses a record is asked again and again; its products wait as long as that."""
+"""How long products wait for a record that the disk refuses; the writer retries it."""
 
 
 def main(link: ServiceConnection, settings: WorkerSettings, rings: tuple[FrameRing, ...]) -> None:
-    """Process until told to stop."""
+    """Process exposures until a stop message arrives."""
     started = time.monotonic()
     configure_threads()
     try:
@@ -90,7 +90,7 @@ def main(link: ServiceConnection, settings: WorkerSettings, rings: tuple[FrameRi
         if isinstance(message, Ping):
             link.send(Pong({}))
         elif isinstance(message, Process):
-            # Here and not in a lane: the overlaps of one exposure follow from those before it.
+            # Not in a thread of the pool: overlaps depend on the preceding exposures.
             overlap_shares = context.overlap_shares_of(message.exposure)
             context.begin(message)
             in_progress.add(pool.submit(partial(context.process, message, overlap_shares)))
@@ -101,7 +101,7 @@ def main(link: ServiceConnection, settings: WorkerSettings, rings: tuple[FrameRi
         done = {future for future in in_progress if future.done()}
         in_progress -= done
         for future in done:
-            future.result()  # a fault of our own ends the process, and the service says so
+            future.result()  # an internal error ends the process; the service reports it
     context.abandon_pending()
     pool.end()
 
@@ -110,14 +110,14 @@ def build(settings: WorkerSettings) -> Processor:
     """The pipeline of a configuration, with its calibrations.
 
     Raises:
-        OSError, ValueError, DaemonError: it cannot be built; the sentence says why.
+        OSError, ValueError, DaemonError: it cannot be built; the message states why.
     """
     rig = find_rig(settings.rig)
     return build_processor(rig, settings.processing, settings.radiometry, settings.plan_file)
 
 
 def _wait_for_begin(link: ServiceConnection) -> BeginProcessing | None:
-    """The order to begin; None where the service ends before."""
+    """The message to begin; None if the service ends first."""
     while not isinstance(message := link.receive(timeout_s=1.0), Stop):
         if isinstance(message, BeginProcessing):
             return message
@@ -129,7 +129,7 @@ def _wait_for_begin(link: ServiceConnection) -> BeginProcessing | None:
 def configure_threads() -> None:
     """Let threads take turns, and sleep where they wait; call it before the first kernel runs.
 
-    OpenMP's threads spin by default, which takes the core from the exposure beside them.
+    OpenMP's threads spin by default, which takes the core from the exposures processed in parallel.
     """
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     sys.setswitchinterval(SWITCH_INTERVAL_S)
@@ -182,9 +182,9 @@ def report_unprocessed(rig: Rig, exposure: Exposure, flags: Flag) -> dict[str, A
 
 @dataclass
 class WorkerContext:
-    """What every exposure needs on its way through a lane.
+    """Shared state of the exposures in the pipeline.
 
-    `mission` changes where another disk leads; each exposure asks for it when it reads or writes.
+    `mission` changes when another disk becomes the leading one; it is looked up at each read and write.
     """
 
     link: ServiceConnection
@@ -200,19 +200,19 @@ class WorkerContext:
     )
 
     def begin(self, message: Process) -> None:
-        """An exposure goes into a lane; one that is not sealed yet will be heard of again."""
+        """Begin an exposure; for an unsealed one a `RecordFinalized` follows."""
         if not message.is_sealed:
             self.provisional_records[message.exposure.number] = SimpleQueue()
 
     def finalize(self, finalized: RecordFinalized) -> None:
-        """The record of an exposure in work is final, or will never be."""
+        """Pass on the final record of an exposure in progress, or None if there is none."""
         if (outcome := self.provisional_records.get(finalized.number)) is None:
-            return  # it could not be processed, and said so
+            return  # it could not be processed, which was reported
         record = finalized.exposure
         outcome.put(None if record is None else (record, self.overlap_shares_of(record)))
 
     def abandon_pending(self) -> None:
-        """The end: what is not sealed by now is not waited for."""
+        """At the end: do not wait for records that are not sealed."""
         for outcome in list(self.provisional_records.values()):
             outcome.put(None)
 
@@ -224,7 +224,7 @@ class WorkerContext:
     def process(
         self, message: Process, overlap_shares: OverlapShares, processor: Processor
     ) -> None:
-        """Process one exposure and say what became of it."""
+        """Process one exposure and send the result."""
         started = time.monotonic()
         exposure = message.exposure
         flags = Flag(0)
@@ -247,7 +247,7 @@ class WorkerContext:
                 if finalized is None:
                     return
                 if finalized[0] != exposure:
-                    # Its mark was another's: what was told is told anew.
+                    # Its mark was reassigned: compute and report the products again.
                     exposure = finalized[0]
                     frames = store.load_level0(self.mission.level0(exposure.number), self.rig)[0]
                     products = self._compute_products(
@@ -276,7 +276,7 @@ class WorkerContext:
         overlap_shares: OverlapShares,
         processor: Processor,
     ) -> ProductFiles:
-        """The products of an exposure; its verdict is told before they are written."""
+        """The products of an exposure; the verdict is sent before they are written."""
         conditions = conditions_of(
             exposure, self.rig, self.plan, flags, overlap_shares, ground=self.ground
         )

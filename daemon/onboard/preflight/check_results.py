@@ -1,6 +1,6 @@
-"""What was found of each thing a flight needs: the results of `syntopic check`, and of a start.
+"""Results of the checks of `syntopic check` and of the start of the service.
 
-`syntopic run` and `syntopic check` look with the same functions; here is only what they return.
+`syntopic run` and `syntopic check` use the same check functions.
 """
 
 from __future__ import annotations
@@ -12,23 +12,23 @@ from typing import Any, Final
 
 
 class CheckOutcome(enum.StrEnum):
-    """What was found of one item."""
+    """Outcome of the check of one item."""
 
     PASS = "pass"
     WAITING = "waiting"
-    """Nothing is wrong; it is not there yet, such as a receiver that searches."""
+    """Not a fault: data are still awaited, for example from a receiver that searches."""
     FAIL = "fail"
     NOT_TRIED = "not tried"
-    """It could not be looked at without doing more than was asked for; it decides nothing."""
+    """Not checked, because that requires an option; it does not affect the result."""
 
 
 @dataclass(frozen=True)
 class CheckResult:
     """One item: its kind and name, the outcome, and a sentence where it is not a plain pass.
 
-    `prevents`: `syntopic run` refuses to start because of it, with the same sentence. Any other
-    failure is reported as an event with the same sentence, and the service flies without.
-    `found` is what the item said of itself (model, serial, ...).
+    `is_blocking`: `syntopic run` refuses to start, with the same sentence. Any other failure is emitted
+    as an event with the same sentence, and the service flies without the item.
+    `found` are the properties that the item reported (model, serial, ...).
     """
 
     kind: str
@@ -71,5 +71,5 @@ def passed(kind: str, name: str, sentence: str = "", **found: str) -> CheckResul
 
 
 def failed(kind: str, name: str, sentence: str, *, is_blocking: bool = False) -> CheckResult:
-    """An item that is not in order; the sentence ends with the cure."""
+    """An item that is not in order; the sentence ends with the action."""
     return CheckResult(kind, name, CheckOutcome.FAIL, sentence, is_blocking=is_blocking)

@@ -1,7 +1,7 @@
-"""The phase of a running service: what is there for a flight, and who takes upon them what is not.
+"""Phase of a running service: its prerequisites, arming and overrides.
 
-What a flight needs is said in `daemon.onboard.flight.arming`, what follows what in
-`daemon.onboard.flight.phases`; here the service is looked at.
+The prerequisites are defined in `daemon.onboard.flight.arming`, the phases in
+`daemon.onboard.flight.phases`. This module collects the state of the service.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from daemon.onboard.service.record_ingest import RecordIngest
 from processing.rig import Rig
 
 IMMEDIATE_START = 'the configuration (trigger.start = "immediate")'
-"""Who takes upon them what is missing where nobody is asked."""
+"""Author of the override when the line starts without a command."""
 
 
 class Preflight:
-    """Looks at a service.
+    """Evaluates the prerequisites of a service.
 
-    `accepted` are the names of what somebody flies without.
+    `accepted` are the names of the overridden prerequisites.
     """
 
     def __init__(
@@ -50,24 +50,24 @@ class Preflight:
         self.on_override: Callable[[str, Sequence[MissingPrerequisite], str], None] = lambda *_: (
             None
         )
-        """Told of who flies without what."""
+        """Called with author, missing prerequisites and reason of each override."""
 
     @property
     def phase(self) -> Phase:
         return self._machine.phase
 
     def missing_prerequisites(self) -> tuple[MissingPrerequisite, ...]:
-        """What is missing that nobody has accepted yet."""
+        """The missing prerequisites that are not overridden."""
         readiness = self._readiness(time.monotonic_ns())
         missing = missing_prerequisites(readiness, self._configuration.limits)
         return tuple(item for item in missing if item.name not in self.accepted)
 
     def arm(self) -> None:
-        """Somebody armed, by a command; it holds while nothing is missing."""
+        """Arm by command; the service stays armed while no prerequisite is missing."""
         self._is_armed = True
 
     def override(self, by: str, missing: Sequence[MissingPrerequisite], reason: str = "") -> None:
-        """Somebody flies without."""
+        """Override missing prerequisites."""
         self.accepted |= {item.name for item in missing if item.may_be_overridden}
         self.on_override(by, missing, reason)
 
@@ -78,7 +78,7 @@ class Preflight:
         has_landed: bool,
         has_failed: bool,
     ) -> list[Phase]:
-        """The phases entered since the last time of asking."""
+        """The phases entered since the last call."""
         if self._line.is_running:
             self._is_armed = True  # by the configuration, or by the command that started it
         facts = PhaseInputs(

@@ -1,7 +1,7 @@
 """From the start of the service to its mission: prerequisites, the worker, and the mission itself.
 
-What is refused here is refused before a new mission exists. `syntopic check` looks at the same
-prerequisites and builds the same worker (`daemon.onboard.preflight.system_check`).
+A start is refused before a new mission exists. `syntopic check` checks the same prerequisites and
+builds the same worker (`daemon.onboard.preflight.system_check`).
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ from processing.rig import Rig
 
 
 class Preparation(MessageDispatcher):
-    """What happens before there is a mission.
+    """Preparation of the mission.
 
-    `rig` is the one that flies: the mission's own where one is resumed. `interrupted` is the
-    mission that is resumed, `disks` are those of a mirrored one, `is_built` says whether the worker
-    has its pipeline.
+    `rig` is the rig in use: that of the mission if one is resumed. `interrupted` is the mission to
+    resume. `disks` are those of a mirrored mission. `is_built` is true once the worker has its
+    pipeline.
 
     Args:
-        configuration: the one in force.
-        rig: the one that it names.
+        configuration: the active configuration.
+        rig: the rig that it names.
         config_path: its file.
-        tell: told of what is worth knowing.
-        fail: told why the service cannot start.
+        emit: emits events.
+        fail: called with the reason if the service cannot start.
     """
 
     def __init__(
@@ -58,7 +58,7 @@ class Preparation(MessageDispatcher):
         self.is_built = False
 
     async def check(self) -> bool:
-        """Look at what a flight needs, and for a mission to be resumed; False where it fails.
+        """Check the prerequisites and look for a mission to resume; False if the start is refused.
 
         Raises:
             MissionError: the marker of the mission being flown is damaged.

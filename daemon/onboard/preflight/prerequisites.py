@@ -1,7 +1,7 @@
-"""What a flight needs before any device is opened: looked at by `run` at its start, and by `check`.
+"""Prerequisites that are checked before any device is opened, by `run` at its start and by `check`.
 
-Both go through `prerequisites`, so that they cannot disagree. What devices say is judged by
-`daemon.onboard.capture.devices`, what is missing for arming by `daemon.onboard.flight.arming`.
+Both call `prerequisites`, so that their results agree. `daemon.onboard.capture.devices` evaluates the
+properties of devices, `daemon.onboard.flight.arming` the prerequisites of arming.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ Check: TypeAlias = Callable[[Configuration, Rig], Iterator[CheckResult]]
 PACE_NBYTES_MIN: Final = 16_000_000
 PACE_NBYTES_MAX: Final = 512_000_000
 PACE_TRIES: Final = 3
-"""Other programs write, too: the best of so many tries counts."""
+"""Number of measurements; the fastest counts, since other programs write as well."""
 _BLOCK_NBYTES: Final = 4_000_000
 
 
 def prerequisites(
     configuration: Configuration, rig: Rig, checks: Sequence[Check] | None = None
 ) -> list[CheckResult]:
-    """Every item that can be looked at without a device, in the order of `LOOKS`.
+    """Every item that can be checked without a device, in the order of `CHECKS`.
 
-    An item that prevents the flight ends the looking: what follows may need it.
+    A blocking failure ends the checks: later ones may depend on it.
     """
     results: list[CheckResult] = []
     for check in CHECKS if checks is None else checks:
@@ -119,7 +119,7 @@ def storage(configuration: Configuration, _rig: Rig) -> Iterator[CheckResult]:
         yield passed(
             "disk",
             "mirror",
-            f"caution: {mirror} lies on the same file system as {root}; one fault takes both: "
+            f"caution: {mirror} is on the same file system as {root}; one fault affects both: "
             "mount another disk there",
         )
 
@@ -148,7 +148,7 @@ def _writable(key: str, root: Path, *, is_blocking: bool = False) -> CheckResult
 
 
 def disk_health(configuration: Configuration, _rig: Rig) -> Iterator[CheckResult]:
-    """What the disks state of themselves, where the helper reads it."""
+    """Health reported by the disks, if the helper service reads it."""
     mission = configuration.mission
     for key, root in (("root", mission.root), ("mirror", mission.mirror)):
         if root is None:
@@ -157,7 +157,7 @@ def disk_health(configuration: Configuration, _rig: Rig) -> Iterator[CheckResult
         try:
             found = read_health(root)
         except OSError:
-            continue  # `storage` says what is wrong with it
+            continue  # `storage` reports the error
         if found is None:
             sentence = "not read; run: sudo systemctl enable --now syntopic-disk-health.timer"
             yield CheckResult("disk", name, CheckOutcome.NOT_TRIED, sentence)
@@ -170,7 +170,7 @@ def disk_health(configuration: Configuration, _rig: Rig) -> Iterator[CheckResult
 
 
 def memory(configuration: Configuration, rig: Rig) -> Iterator[CheckResult]:
-    """Memory for the frames of the exposures that are held at a time."""
+    """Memory for the frames of the exposures held in memory."""
     depth = configuration.limits.exposures_in_memory
     needed = depth * exposure_nbytes(configuration, rig)
     available = available_memory_nbytes()
@@ -228,7 +228,7 @@ CHECKS: Final[Sequence[Check]] = (
     head_network,
     pace,
 )
-"""Every prerequisite, in the order they are looked at."""
+"""Every prerequisite, in the order of the checks."""
 CHECKS_AFTER_RESTART: Final[Sequence[Check]] = (
     libraries,
     calibration,
@@ -236,7 +236,7 @@ CHECKS_AFTER_RESTART: Final[Sequence[Check]] = (
     memory,
     head_network,
 )
-"""Those of a flight that is resumed: nothing is measured while exposures are waited for."""
+"""Those of a resumed flight: the disk is not measured, to save time."""
 
 
 def exposure_nbytes(configuration: Configuration, rig: Rig) -> int:
@@ -254,7 +254,7 @@ def exposure_interval_s(configuration: Configuration, rig: Rig) -> float:
 
 
 def available_memory_nbytes() -> int | None:
-    """What the kernel says can be used without swapping; None where it says nothing."""
+    """Memory that is available without swapping (MemAvailable); None if it cannot be read."""
     try:
         lines = Path("/proc/meminfo").read_text().splitlines()
     except OSError:

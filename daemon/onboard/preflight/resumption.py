@@ -1,5 +1,4 @@
-"""A mission that was interrupted and is flown on: by which rig, and how that differs from the one
-that is configured now.
+"""Resumption of an interrupted mission: its rig, and the differences from the configured rig.
 
 The exposures of a mission are chained to its own copy of the rig; another rig needs a new mission.
 """
@@ -82,7 +81,7 @@ def resume(
 def resumption_result(
     mission: Mission, configuration: Configuration, configured: Rig, config_path: Path
 ) -> tuple[CheckResult, Rig]:
-    """What `check` says of a mission that `run` would resume, and the rig it would fly with."""
+    """Result of `check` for a mission that `run` would resume, and the rig in use."""
     resumption = resume(mission, configuration, configured, config_path)
     if resumption.refusal:
         return failed("mission", mission.id, resumption.refusal, is_blocking=True), configured
@@ -121,12 +120,12 @@ def rig_file(configuration: Configuration) -> Path:
 def rig_differences(flown: Path, configured: Path) -> list[str]:
     """Keys whose values differ between two rig files: `key (flown, configured)`.
 
-    Comments, order and form do not count. A file that is no TOML differs as a whole.
+    Comments, order and form do not count. A file that is not TOML differs completely.
     """
     try:
         old, new = (_leaves(parse_toml(path.read_bytes())) for path in (flown, configured))
     except (OSError, ValueError) as error:
-        return [f"the whole file ({error})"]
+        return [f"the complete file ({error})"]
     keys = sorted(key for key in old.keys() | new.keys() if old.get(key) != new.get(key))
     return [
         f"{key} ({_value_text(old, key)} in the mission, {_value_text(new, key)} now)"

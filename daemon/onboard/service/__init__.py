@@ -1,1 +1,1 @@
-"""The running service: its processes, what they say to each other, and its one loop."""
+"""The running service: its processes, their messages, and its event loop."""

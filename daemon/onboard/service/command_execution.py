@@ -1,6 +1,6 @@
-"""What a person may tell a flying service to do, and when it may not be done.
+"""Execution of operator commands, and the conditions under which they are refused.
 
-Each command answers with a sentence, and each is written into the flight log with who gave it.
+Each command returns an answer. Command, author and answer are written to the flight log.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ AUDIT_TOPIC = "audit"
 
 
 class LineControl(Protocol):
-    """The line commands act on; `daemon.onboard.service.flight_line.Line`."""
+    """The flight line; `daemon.onboard.service.flight_line.FlightLine`."""
 
     is_running: bool
 
@@ -29,7 +29,7 @@ class LineControl(Protocol):
 
 
 class ArmingControl(Protocol):
-    """What a flight needs; `daemon.onboard.preflight.preflight.Preflight`."""
+    """Prerequisites and arming; `daemon.onboard.preflight.preflight.Preflight`."""
 
     def missing_prerequisites(self) -> Sequence[MissingPrerequisite]: ...
     def arm(self) -> None: ...
@@ -39,7 +39,7 @@ class ArmingControl(Protocol):
 
 
 class ExposureCommands(Protocol):
-    """Who sets the heads; `daemon.onboard.capture.exposure_controller.ExposureControl`."""
+    """Exposure settings; `daemon.onboard.capture.exposure_controller.ExposureController`."""
 
     def command(self, requested: Mapping[str, Any], by: str) -> str | None: ...
 
@@ -69,7 +69,7 @@ class CommandTarget(Protocol):
 
 
 def execute(command: ServiceCommand, flight: CommandTarget) -> Answer:
-    """Do what is asked, or say why not."""
+    """Execute a command, or return the reason for its refusal."""
     handler = _COMMANDS.get(command.name)
     if handler is None:
         return _rejected(command, f"there is no command {command.name}")
@@ -144,8 +144,8 @@ def invalid_event(invalid: InvalidMessages) -> dict[str, Any]:
     """The event that reports them."""
     sentence = (
         f"{invalid.count} messages of the page's process to the service were invalid "
-        f"({invalid.sentence}) and dropped. Somebody may control that process: keep strangers off "
-        "its network and restart the service"
+        f"({invalid.sentence}) and dropped. That process may be compromised. Isolate its network "
+        "and restart the service"
     )
     return {"event": "page-link", "fault": True, "sentence": sentence}
 
@@ -169,7 +169,7 @@ def _stop(command: ServiceCommand, flight: CommandTarget) -> Answer:
     if not flight.line.is_running:
         return _rejected(command, "the line does not run")
     flight.line.is_running = False
-    return _accepted(command, "the line is stopped; what was triggered is finished")
+    return _accepted(command, "the line is stopped; triggered exposures are completed")
 
 
 def _trigger(command: ServiceCommand, flight: CommandTarget) -> Answer:
@@ -204,7 +204,7 @@ def _distance(command: ServiceCommand, flight: CommandTarget) -> Answer:
 
 def _land(command: ServiceCommand, flight: CommandTarget) -> Answer:
     flight.land()
-    return _accepted(command, "no more exposures; what is open is sealed, then the service ends")
+    return _accepted(command, "no more exposures; open ones are sealed, then the service ends")
 
 
 def _new_mission(command: ServiceCommand, flight: CommandTarget) -> Answer:
@@ -235,7 +235,9 @@ def _release_disk(command: ServiceCommand, flight: CommandTarget) -> Answer:
     refusal = flight.mirror.release(label)
     if refusal is not None:
         return _rejected(command, refusal)
-    return _accepted(command, f"disk {label} is being released; unmount it when the events say so")
+    return _accepted(
+        command, f"disk {label} is being released; unmount it after the event disk-released"
+    )
 
 
 def _accept_disk(command: ServiceCommand, flight: CommandTarget) -> Answer:
@@ -243,13 +245,11 @@ def _accept_disk(command: ServiceCommand, flight: CommandTarget) -> Answer:
     refusal = flight.mirror.accept(label)
     if refusal is not None:
         return _rejected(command, refusal)
-    return _accepted(
-        command, f"the disk that is at the place of {label} is brought up to date and used"
-    )
+    return _accepted(command, f"the disk mounted as {label} is synchronized and then used")
 
 
 def _arm_or_reject(command: ServiceCommand, flight: CommandTarget) -> Answer | None:
-    """The refusal, where the camera is not ready to fly and nobody takes that upon them."""
+    """Arm; return the refusal if a prerequisite is missing and not overridden."""
     if flight.line.is_flown:
         return _rejected(command, "the planned number of exposures is flown")
     if not flight.is_ready:

@@ -29,16 +29,16 @@ from processing.rig import Rig
 
 NS = 1_000_000_000
 CORRIDOR_SHARE = 0.25
-"""How far beside a planned line it is still flown, as a share of the image's width."""
+"""Largest distance from a planned line, as a fraction of the image width."""
 
 PREDICTION_INTERVAL_S = 0.05
-"""How often a due time is predicted anew; the last bit is slept through exactly."""
+"""Interval between predictions of the due time; the last wait is exact."""
 DISK_RETRY_S = 1.0
 
 
 @dataclass(frozen=True)
 class Order:
-    """An exposure that is ordered: what capture is told, and what matching needs."""
+    """An ordered exposure: the settings for capture and for matching."""
 
     number: int
     mono_ns: int
@@ -169,7 +169,7 @@ class FlightLine:
         return max(0.0, min(PREDICTION_INTERVAL_S, remaining_s))
 
     def absent(self, active: Callable[[str], bool], *, has_trigger: bool) -> list[str]:
-        """What is not there yet, in words."""
+        """Absent devices and data, as text."""
         configuration, flight = self._configuration, self._flight
         absent = [f"head {h.sensor}" for h in configuration.head if not active(h.sensor)]
         if not has_trigger:

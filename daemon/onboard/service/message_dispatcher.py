@@ -1,4 +1,4 @@
-"""What the parts of the service have in common: each takes in the messages that it knows."""
+"""Base class of the parts of the service that handle messages."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from typing import Any, ClassVar
 
 
 class MessageDispatcher:
-    """Messages of the service's processes, each to its handler."""
+    """Dispatches messages of the service's processes to handlers by type."""
 
     handlers: ClassVar[Mapping[type, Callable[[Any, Any], None]]]
 
     def dispatch(self, message: object) -> bool:
-        """Take in a message; False where it is none of this desk's."""
+        """Handle a message; False if this dispatcher has no handler for it."""
         handler = self.handlers.get(type(message))
         if handler is None:
             return False

@@ -1,7 +1,7 @@
-"""What the service and its child processes say to each other: small frozen dataclasses.
+"""Messages between the service and its child processes: small frozen dataclasses.
 
-Pixels never travel; where frames are meant, the slot of each head's shared memory is named. This
-module imports nothing heavy, so that every process may.
+Pixels are never sent; a frame is identified by its slot in the shared memory of its head. This module
+has only light imports, so that every process can load it.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from processing.radiometry.exposure_control import ExposureSettings
 
 @dataclass(frozen=True)
 class Stop:
-    """Let go of everything and end."""
+    """Release all resources and end."""
 
 
 @dataclass(frozen=True)
 class Ping:
-    """Say that you are alive."""
+    """Liveness request."""
 
 
 # From any child
@@ -36,7 +36,7 @@ class Ping:
 
 @dataclass(frozen=True)
 class Pong:
-    """Alive; and the statistics of what is inside, by name."""
+    """Answer to `Ping`, with statistics by device."""
 
     statistics: Mapping[str, Mapping[str, int]]
 
@@ -53,7 +53,7 @@ class ServiceEvent:
 
 @dataclass(frozen=True)
 class ServiceCommand:
-    """Somebody wants something of the service; `by` is who, as the token says."""
+    """A command to the service; `by` is its author according to the token."""
 
     number: int
     name: str
@@ -80,7 +80,7 @@ class CommandRefused:
 
 @dataclass(frozen=True)
 class InvalidMessages:
-    """What came from the page's process and was no message: how many, and what is wrong."""
+    """Invalid data from the page's process: count and problem."""
 
     count: int
     sentence: str
@@ -88,7 +88,7 @@ class InvalidMessages:
 
 @dataclass(frozen=True)
 class Answer:
-    """What became of a command, in a sentence."""
+    """Result of a command."""
 
     number: int
     done: bool
@@ -122,14 +122,14 @@ class Fire:
 
 @dataclass(frozen=True)
 class ApplyExposureSettings:
-    """Expose with this from the next pulse on, by head."""
+    """Settings from the next pulse on, by head."""
 
     settings: Mapping[str, ExposureSettings]
 
 
 @dataclass(frozen=True)
 class Recycle:
-    """These slots, by head, may be filled again."""
+    """Slots that may be reused, by head."""
 
     slots: Mapping[str, int]
 
@@ -139,7 +139,7 @@ class Recycle:
 
 @dataclass(frozen=True)
 class Bound:
-    """A device answered; `found` is what it said of itself (model, serial, ...)."""
+    """A device answered; `found` are the properties it reported (model, serial, ...)."""
 
     kind: str
     name: str
@@ -148,7 +148,7 @@ class Bound:
 
 @dataclass(frozen=True)
 class BindFailed:
-    """A device did not answer at first; it goes on being looked for."""
+    """A device did not answer; opening it is retried."""
 
     kind: str
     name: str
@@ -209,12 +209,12 @@ class WriteSmallFile:
 
 @dataclass(frozen=True)
 class EndMission:
-    """Nobody is to go on with the mission after `Stop`."""
+    """The mission is complete: it is not resumed after `Stop`."""
 
 
 @dataclass(frozen=True)
 class DropDisk:
-    """Drop this disk where another is in use, and say why."""
+    """Drop this disk if another is in use; `why` is the reason."""
 
     disk: str
     why: str
@@ -283,7 +283,7 @@ class Sealed:
 class WriteFailed:
     """The disk refused; the exposure is not stored or not sealed.
 
-    `is_transient`: the demand was right and may be made again when the disk has come to itself.
+    `is_transient`: the request is valid and may be retried when the disk has recovered.
     """
 
     number: int
@@ -298,7 +298,7 @@ class WriteFailed:
 class WorkerSettings:
     """What a pipeline worker needs to know before there is a mission.
 
-    `plan_file` is the flight plan whose requirements exposures are judged by.
+    `plan_file` is the flight plan whose requirements exposures are evaluated against.
     """
 
     rig: str
@@ -317,7 +317,7 @@ class BeginProcessing:
 
 @dataclass(frozen=True)
 class UseMission:
-    """Read and write the mission in this folder from now on: another disk leads."""
+    """Read and write the mission in this folder from now on: another disk is the leading one."""
 
     mission: Path
 
@@ -326,7 +326,7 @@ class UseMission:
 class Process:
     """Process this exposure; `slots` by head, or None to read Level-0.
 
-    While it is not sealed its verdict may be told, but nothing is written: `Settled` follows.
+    While it is not sealed, its verdict may be sent, but no product is written; `RecordFinalized` follows.
     """
 
     exposure: Exposure
@@ -336,7 +336,7 @@ class Process:
 
 @dataclass(frozen=True)
 class RecordFinalized:
-    """What became of an exposure that was begun unsealed: its record, or None for none."""
+    """Final record of an exposure that was begun unsealed; None if there is none."""
 
     number: int
     exposure: Exposure | None
@@ -347,12 +347,12 @@ class RecordFinalized:
 
 @dataclass(frozen=True)
 class WorkerBuilt:
-    """The pipeline of this rig is built, its calibrations are read; `Begin` is waited for."""
+    """The pipeline of this rig is built, its calibrations are read; it waits for `BeginProcessing`."""
 
 
 @dataclass(frozen=True)
 class WorkerRefused:
-    """No pipeline can be built; the sentence says why, and the cure. The process ends."""
+    """No pipeline can be built; the sentence states cause and action. The process ends."""
 
     sentence: str
 
@@ -366,7 +366,7 @@ class WorkerReady:
 
 @dataclass(frozen=True)
 class FramesRead:
-    """The frames of this exposure are no longer needed in memory; it is still in work."""
+    """The frames of this exposure are no longer needed in memory; it is still being processed."""
 
     number: int
 
@@ -395,7 +395,7 @@ class Processed:
 
 @dataclass(frozen=True)
 class ProcessFailed:
-    """This exposure has no product; the sentence says why, and the cure.
+    """This exposure has no product; the sentence states cause and action.
 
     `report` is a quality report all the same, with the flag NOT_PROCESSED.
     """

@@ -1,6 +1,6 @@
-"""The service's side of watching: what is told, and a watch process that may die without harm.
+"""The service's side of monitoring: events to the watch process, which may die without harm.
 
-Telling holds back, and at last drops, rather than waits. What watchers see and how commands come in
+Events are buffered and finally dropped; the service never waits. What watchers see and how commands come in
 is in `daemon.onboard.monitoring`.
 """
 
@@ -30,10 +30,10 @@ BACKLOG_MAX = 1000
 
 
 class MonitoringLink:
-    """Tells the watch process, where there is one.
+    """Sends events to the watch process, if there is one.
 
-    Events that do not fit into the line are held, and told before the next one, at the latest with
-    the status of every second. `dropped` counts those that were never told.
+    Events that do not fit into the socket are buffered and sent before the next one, at the latest
+    with the status of every second. `dropped` counts those that were never sent.
     """
 
     def __init__(self, supervisor: Supervisor, plan: ProcessPlan | None) -> None:
@@ -41,7 +41,7 @@ class MonitoringLink:
         self._plan = plan
         self._persistent: dict[str, Mapping[str, Any]] = {}
         self.faults: Callable[[], Sequence[Mapping[str, Any]]] = tuple
-        """Events that tell a process started anew of the faults it has not heard of."""
+        """Events that report previous faults to a restarted process."""
         self._backlog: deque[ServiceEvent] = deque()
         self.dropped = 0
         self.restarts = 0
@@ -55,8 +55,8 @@ class MonitoringLink:
                 self.emit(event)
 
     def emit(self, event: Mapping[str, Any]) -> None:
-        """Tell of an event. What holds until it is told otherwise is told again to a process
-        started anew: the mission, devices, how the heads expose."""
+        """Send an event. Persistent events (mission, devices, exposure settings) are sent again to
+        a restarted process."""
         key = _persistent_key(event)
         if key is not None:
             self._persistent[key] = event
@@ -81,18 +81,18 @@ class MonitoringLink:
         self._supervisor.try_send(NAME, answer)
 
     def died(self) -> None:
-        """Start it again after a while; the flight goes on."""
+        """Restart the process after `RESTART_S`; the flight continues."""
         self.restarts += 1
         self._backlog.clear()
         asyncio.get_running_loop().call_later(RESTART_S, self.start)
 
 
 _STATES = DELIVERING | UNAVAILABLE | {SEARCHING, FIXED}
-"""Device events that say in which state it is from now on."""
+"""Device events that state a new state of the device."""
 
 
 def _persistent_key(event: Mapping[str, Any]) -> str | None:
-    """What an event says that stays true; its successor has the same name."""
+    """Key of a persistent event, None for others; a later event of the same key replaces it."""
     kind = event.get("event")
     if kind in ("mission", "exposure-settings"):
         return str(kind)
@@ -115,14 +115,14 @@ def status_event(
     disks: Sequence[Mapping[str, Any]] = (),
     absent: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """What a watcher must not have wrong for longer than a second, as plain JSON types.
+    """The state of the flight that is sent every second, as plain JSON types.
 
     Args:
-        time_now: GPS time at this moment, or None before anything told it.
+        time_now: GPS time at this moment, or None before it is known.
         queue: exposures waiting for the pipeline.
-        missing: what a flight needs and does not have, with its cure.
+        missing: the missing prerequisites, with their actions.
         disks: those of a mirrored mission.
-        absent: devices and data that are not there, in words.
+        absent: absent devices and data, as text.
     """
     now_ns = time.monotonic_ns()
     where = None
@@ -165,7 +165,7 @@ def present_temperatures_c(
 
 
 def summary(exposure: Exposure) -> dict[str, Any]:
-    """What is told of a sealed exposure, as plain JSON types."""
+    """Content of the event of a sealed exposure, as plain JSON types."""
     navigation = exposure.navigation
     return {
         "number": exposure.number,

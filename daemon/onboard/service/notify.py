@@ -1,4 +1,4 @@
-"""Telling systemd how the service is doing (sd_notify), where systemd asked to be told."""
+"""State of the service for systemd (sd_notify), if NOTIFY_SOCKET is set."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import socket
 
 
 class Notifier:
-    """Sends READY, STATUS, WATCHDOG and STOPPING; silent where nobody listens.
+    """Sends READY, STATUS, WATCHDOG and STOPPING; sends nothing without NOTIFY_SOCKET.
 
     Source: sd_notify(3).
     """

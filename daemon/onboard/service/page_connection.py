@@ -1,8 +1,8 @@
 """The connection between the service and the page's process: packets, never pickled objects.
 
-The page's process is reached by strangers, so that the service trusts nothing it sends. The kernel
-keeps the bounds of packets (SOCK_SEQPACKET, unix(7)): one that is invalid, cut off or too large is
-dropped, and the next one is understood. The service never waits for the page's process.
+Unknown senders can reach the page's process, so the service trusts nothing it sends. The kernel
+preserves packet boundaries (SOCK_SEQPACKET, unix(7)): a packet that is invalid, truncated or too
+large is dropped, and the next one is read. The service never waits for the page's process.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from daemon.onboard.service.processes import ChildProcess, ServiceDisconnectedEr
 MESSAGES_PER_TURN = 20
 """Messages received before the other processes have their turn."""
 BURST, RATE_PER_S = 200.0, 50.0
-"""Messages of the page's process; more wait in the socket, and then in that process."""
+"""Limits for messages of the page's process; more wait in the socket, then in that process."""
 REPORT_EVERY_S = 10.0
 """Invalid messages are reported in one event."""
 
@@ -39,7 +39,7 @@ class PacketReader:
     """Packets of one end of the connection, and how many of them were no message.
 
     Args:
-        most: size of the largest message in bytes.
+        limit_bytes: size of the largest message in bytes.
     """
 
     def __init__(self, connection: socket.socket, limit_bytes: int) -> None:
@@ -125,7 +125,7 @@ class PageConnection:
                 if (report := self._received.report()) is not None:
                     sentence = (
                         f"{report[0]} messages of the service to the page's process were invalid "
-                        f"({report[1]}) and dropped; the page may lack them. Report this"
+                        f"({report[1]}) and dropped; they may be missing on the page. Report this"
                     )
                     self.send(
                         ServiceEvent({"event": "page-link", "fault": True, "sentence": sentence})
@@ -151,7 +151,7 @@ class PageProcess(ChildProcess):
         return self._received.invalid
 
     def receive(self) -> Iterator[object]:
-        """Some messages that have come; `pause_s` says when to ask for more.
+        """Some messages that have come; `pause_s` is the wait before the next call.
 
         Raises:
             EOFError, ConnectionError: the process is gone.
@@ -177,7 +177,7 @@ class PageProcess(ChildProcess):
             yield InvalidMessages(*report)
 
     def send(self, message: object) -> None:
-        """As `tell`; what does not fit is not sent."""
+        """As `try_send`; a message that does not fit is dropped."""
         self.try_send(message)
 
     def try_send(self, message: object) -> bool:

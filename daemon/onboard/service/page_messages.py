@@ -1,4 +1,4 @@
-"""What the service and the page's process say to each other, as bytes: msgpack, typed and bounded.
+"""Messages between the service and the page's process as bytes: msgpack, typed and bounded.
 
 A message is an array of two: its kind, and a map of its fields. Only the kinds of `_FROM_PAGE` and
 `_TO_PAGE` exist; each field has a type and a limit, none may be missing, added or given twice.
@@ -38,7 +38,7 @@ PAGE_DEVICES: Final = frozenset(
 
 
 class InvalidMessageError(ValueError):
-    """Bytes that are no message; the sentence says what is wrong and quotes nothing of them."""
+    """Bytes that are not a message; the error states the problem without quoting them."""
 
 
 def pack_from_page(message: object) -> bytes:
@@ -51,7 +51,7 @@ def pack_from_page(message: object) -> bytes:
         case Pong():
             return _packed("pong", {})
         case ServiceEvent(event):
-            return _packed("told", _truncated(event))
+            return _packed("event", _truncated(event))
         case ServiceCommand(arguments=arguments):
             fields = {key: getattr(message, key) for key in _FROM_PAGE["command"]}
             return _packed("command", _truncated(fields) | {"arguments": _truncated(arguments)})
@@ -68,7 +68,7 @@ def unpack_from_page(data: bytes) -> Pong | ServiceEvent | ServiceCommand | Comm
         InvalidMessageError: it is none.
     """
     kind, fields = _unpacked(data, FROM_PAGE_MAX_BYTES, array_max=2, text_max=4 * TEXT_MAX)
-    if kind == "told":
+    if kind == "event":
         name = fields.get("event")
         schema = _PAGE_EVENTS.get(name) if isinstance(name, str) else None
         if schema is None:
@@ -97,11 +97,11 @@ def pack_to_page(message: object) -> bytes:
             fields = {"number": number, "done": done, "sentence": sentence}
             data = _packed("answer", _truncated(fields))
         case ServiceEvent(event):
-            data = _packed("told", {"event": event})
+            data = _packed("event", {"event": event})
         case _:
             raise TypeError(f"no message for the page's process: {type(message).__name__}")
     if len(data) > TO_PAGE_MAX_BYTES:
-        raise ValueError(f"a message of {len(data)} bytes; {TO_PAGE_MAX_BYTES} may be told")
+        raise ValueError(f"a message of {len(data)} bytes; the limit is {TO_PAGE_MAX_BYTES}")
     return data
 
 
@@ -115,7 +115,7 @@ def unpack_to_page(data: bytes) -> Ping | Stop | Answer | ServiceEvent:
     if kind not in _TO_PAGE:
         raise InvalidMessageError("a kind of message that the service does not have")
     checked = _checked(fields, _TO_PAGE[kind])
-    if kind == "told":
+    if kind == "event":
         return ServiceEvent(checked["event"])
     if kind == "answer":
         return Answer(**checked)
@@ -203,7 +203,7 @@ _TO_PAGE: Mapping[str, Mapping[str, Check]] = {
         "done": _flag,
         "sentence": _text(TEXT_MAX),
     },
-    "told": {"event": _event},
+    "event": {"event": _event},
 }
 
 

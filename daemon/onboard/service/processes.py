@@ -1,6 +1,6 @@
 """Child processes of the service: spawned, never forked, and dead when the service is.
 
-A child is a function "module:name" that gets a `Link` and its own arguments. It is named, not
+A child is a function "module:name" that gets a `ServiceConnection` and its own arguments. It is named, not
 imported, so that what a child needs is never loaded into the service.
 """
 
@@ -26,11 +26,11 @@ _SPAWN = multiprocessing.get_context("spawn")
 
 
 class ServiceDisconnectedError(Exception):
-    """The other end of a child's line is closed: nothing is left to be told."""
+    """The other end of a child's connection is closed."""
 
 
 class ServiceConnection:
-    """The child's end of the line to the service; `send` may be called from any thread.
+    """The child's end of the connection to the service; `send` may be called from any thread.
 
     Both ways raise ServiceDisconnectedError once the service is gone.
     """
@@ -95,7 +95,7 @@ class ChildProcess:
         child_end.close()
 
     def _ends(self) -> tuple[Any, Any]:
-        """Both ends of a new connection; a class that is not `Child` may use another kind."""
+        """Both ends of a new connection; a subclass may use another kind."""
         return _SPAWN.Pipe(duplex=True)
 
     def receive(self) -> Iterator[object]:
@@ -122,7 +122,7 @@ class ChildProcess:
             return False
         data = ForkingPickler.dumps(message)
         if len(data) > TRY_SEND_MAX_BYTES:
-            raise ValueError(f"a message of {len(data)} bytes; {TRY_SEND_MAX_BYTES} may be told")
+            raise ValueError(f"a message of {len(data)} bytes; the limit is {TRY_SEND_MAX_BYTES}")
         self.connection.send_bytes(data)
         return True
 
@@ -167,7 +167,7 @@ def _child_main(
 
 
 def _end_without_service(failed: threading.ExceptHookArgs) -> None:
-    """A thread that finds the service gone ends the process without a word."""
+    """A thread that finds the service gone ends the process silently."""
     if isinstance(failed.exc_value, ServiceDisconnectedError):
         os._exit(1)
     threading.__excepthook__(failed)

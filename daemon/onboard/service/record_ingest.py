@@ -1,7 +1,7 @@
-"""What the devices of a flight say: it goes into the flight and into the log, and news are told.
+"""Ingest of device records: into the flight and the log, with events for changes.
 
-What follows from it is decided elsewhere: `daemon.onboard.flight.flight` matches,
-`daemon.onboard.service.flight_line` orders.
+`daemon.onboard.flight.flight` matches the records, `daemon.onboard.service.flight_line` orders
+exposures.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _NOT_AWAITED = frozenset({"lost", "absent"})
 
 
 class EmitEvent(Protocol):
-    """Says something to whoever watches: what kind of event it is, and its content."""
+    """Emits an event: its kind and its content."""
 
     def __call__(self, event: str, **content: Any) -> None: ...
 
@@ -45,14 +45,14 @@ class EmitEvent(Protocol):
 class RecordIngest(MessageDispatcher):
     """Takes in what `daemon.onboard.capture.capture` passes on.
 
-    `active` are the devices that deliver, `serials` what heads said they are ("" for nothing), and
-    `orders` the exposures whose pulse has no answer yet.
+    `active` are the devices that deliver, `serials` the serial numbers of heads ("" for none), and
+    `orders` the exposures whose pulse is not answered yet.
 
     Args:
-        flight: what the records are matched in.
-        log: puts a record into the flight log.
-        tell: told of what is worth knowing.
-        decided: told of what is decided here.
+        flight: matches the records.
+        log: writes a record to the flight log.
+        emit: emits events.
+        on_decision: called with each decision.
     """
 
     def __init__(
@@ -74,7 +74,7 @@ class RecordIngest(MessageDispatcher):
         self._early: list[Frame] = []
 
     def emit_time_events(self, now_ns: int) -> None:
-        """What became of marks, and of the clocks, since the last time of asking."""
+        """Emit events of marks and clocks since the last call."""
         if self._early and now_ns - self._early[0].mono_ns > EARLY_FRAME_LIMIT_NS:
             self._match_early_frames()
         for mark, cause in self._flight.resolved_marks:

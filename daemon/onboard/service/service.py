@@ -1,6 +1,6 @@
-"""The service: one asyncio loop that hears every process and keeps the deadlines.
+"""The service: one asyncio loop that receives from every process and checks the deadlines.
 
-It decides nothing about matching (`daemon.onboard.flight.flight`), when to expose
+It contains no logic of matching (`daemon.onboard.flight.flight`), when to expose
 (`daemon.onboard.service.flight_line`), what goes to disk
 (`daemon.onboard.storage.storage_coordinator`) or pixels (`daemon.onboard.pipeline.worker`), and
 imports none of what those need.
@@ -96,10 +96,10 @@ class Service(MessageDispatcher):
     """One run of the onboard service over one mission.
 
     Args:
-        configuration: what to do.
+        configuration: the active configuration.
         rig: the camera.
-        config_path: the file the configuration came from; its bytes go into the mission.
-        events: told of everything a person or a program may want to know, as plain JSON types.
+        config_path: the configuration file; it is copied into the mission.
+        events: called with every event, as plain JSON types.
     """
 
     def __init__(
@@ -126,7 +126,7 @@ class Service(MessageDispatcher):
         self.dispatchers: tuple[MessageDispatcher, ...] = (self, self.preparation)
 
     async def run(self) -> int:
-        """Fly until told to stop, or until the planned exposures are done.
+        """Fly until a stop is requested, or until the planned exposures are done.
 
         Returns:
             The exit status: 0 after an orderly end, 1 after a fault that needs a person or a
@@ -158,7 +158,7 @@ class Service(MessageDispatcher):
             await self._save_unhandled()
             self.flight.land()
             if imbalances := self.flight.ledger.imbalances(has_landed=True):
-                self._event("ledger", fault=True, sentence=f"not settled: {'; '.join(imbalances)}")
+                self._event("ledger", fault=True, sentence=f"not balanced: {'; '.join(imbalances)}")
         if self.failure is None and not self.mirror.is_on:
             mission.close()
         self._event("ended", failure=self.failure, ledger=self.flight.ledger.sheet().as_json())
@@ -176,11 +176,10 @@ class Service(MessageDispatcher):
         self.rings = frame_rings(self.configuration, self.rig)
         self.supervisor.spawn(*worker_process(self.configuration, interrupted, self.rings))
         if interrupted is None:
-            # A mission that no image can be made of is not begun.
-            is_built = self._until(
+            # No mission is created before the pipeline is built.
+            await self._until(
                 lambda: self.preparation.is_built or self.stopping.is_set(), NO_TIMEOUT_S
             )
-            await is_built
         return None if self.stopping.is_set() else self.preparation.mission()
 
     def _start(self, mission: Mission) -> None:
@@ -250,21 +249,21 @@ class Service(MessageDispatcher):
         )
 
     def _use_mission(self, mission: Mission) -> None:
-        """Products go into this folder from now on, and watchers read it: its disk leads."""
+        """Use this folder for products and monitoring: its disk is the leading one."""
         if mission != self.mission:
             self.mission = mission
             self.supervisor.send("worker", UseMission(mission.path))
         self._event("mission", id=mission.id, path=str(mission.path), **self.mission_details)
 
-    # What the processes say
+    # Messages of the processes
 
     def _dispatch(self, message: object) -> None:
         if not any(dispatcher.dispatch(message) for dispatcher in self.dispatchers):
-            raise TypeError(f"a process said {type(message).__name__}, which nobody expects")
+            raise TypeError(f"a process sent {type(message).__name__}, which has no handler")
         self.changed.set()
 
     def _emit_previous_faults(self, mission: Mission) -> None:
-        """What an earlier start of the service left for a person to see."""
+        """Emit the unacknowledged faults of an earlier run."""
         self.unhandled = read_unhandled(mission.root)
         for event in previous_faults(self.unhandled):
             self._event(**event)
@@ -274,8 +273,8 @@ class Service(MessageDispatcher):
         self, by: str, missing: Sequence[MissingPrerequisite], reason: str
     ) -> None:
         self.supervisor.send("writer", AppendToLog(override_message(by, missing, reason)))
-        message = "; ".join(map(str, missing)) + (f". Why: {reason}" if reason else "")
-        self._event("override", by=by, sentence=f"{by} flies all the same: {message}")
+        message = "; ".join(map(str, missing)) + (f". Reason: {reason}" if reason else "")
+        self._event("override", by=by, sentence=f"{by} overrides: {message}")
         try:
             note = overrides_content(self.mission.path, by, missing, reason=reason)
             self.mirror.save_now(f"{self.mission.id}/{OVERRIDES}", note)
@@ -300,13 +299,13 @@ class Service(MessageDispatcher):
             self._fail(problem)
 
     def _on_service_event(self, message: ServiceEvent) -> None:
-        """What the watch process and the writer have to say of themselves."""
+        """Events of the watch process and the writer."""
         self._event(**message.event)
 
     def _on_command(self, command: ServiceCommand) -> None:
         problem = violation(command)
         if problem is not None:
-            # The page's process lets none of these pass: this one is no longer itself.
+            # The page's process rejects these commands: it may be compromised.
             self.monitoring.answer(Answer(command.number, False, problem))
             self._on_command_refused(refused_command(command, problem))
             return
@@ -384,7 +383,7 @@ class Service(MessageDispatcher):
     async def _fly(self) -> None:
         limit_s = self.configuration.limits.ready_timeout_s
         await self._until(lambda: not self.absent(), limit_s)
-        # Devices may be missing and said to be; kernels may not: nothing compiles in flight.
+        # Devices may be absent, which is reported; kernels may not: nothing compiles in flight.
         await self._until(lambda: self.pipeline.is_ready, NO_TIMEOUT_S)
         absent = self.absent()
         self.is_ready = True
@@ -399,20 +398,20 @@ class Service(MessageDispatcher):
         if self.configuration.mission.end_when_done:
             self.stopping.set()
 
-    # What may be commanded (`daemon.onboard.service.command_execution`)
+    # Commands (`daemon.onboard.service.command_execution`)
 
     def absent(self) -> list[str]:
-        """What is not there yet, in words."""
+        """Absent devices and data, as text."""
         return self.line.absent(
             self.ingest.active.__contains__, has_trigger=self.ingest.has_trigger
         )
 
     def acknowledge(self, fault: str) -> bool:
-        """A person has seen a fault."""
+        """Acknowledge a fault."""
         return self.latches.acknowledge(fault)
 
     def land(self, *, new_mission: bool = False) -> None:
-        """End in good order: what is open is sealed first. `again`: a new mission follows."""
+        """End in good order: open exposures are sealed first. `new_mission`: another one follows."""
         self.continues = new_mission
         self.stopping.set()
 
@@ -446,10 +445,10 @@ class Service(MessageDispatcher):
             self.latches.apply(status)
 
     async def _save_unhandled(self) -> None:
-        """What nobody has acknowledged is there when the service starts next."""
+        """Save the unacknowledged faults for the next start."""
         if (unhandled := self.latches.unhandled()) != self.unhandled:
             self.unhandled = unhandled
-            # A disk that refuses has told so itself.
+            # The error of the disk is reported elsewhere.
             with suppress(OSError):
                 await self.mirror.save(UNHANDLED, unhandled_content(unhandled))
 
@@ -465,7 +464,7 @@ class Service(MessageDispatcher):
         self._event("disk", fault=True, sentence=sentence)
 
     async def _until(self, condition: Callable[[], bool], limit_s: float) -> bool:
-        """Wait for something that messages bring about; False when the time is over first."""
+        """Wait for a condition that messages change; False after the time-out."""
         deadline = time.monotonic() + limit_s
         while not condition():
             remaining_s = deadline - time.monotonic()
@@ -494,9 +493,9 @@ class Service(MessageDispatcher):
         await self.supervisor.end(("capture", "worker", "writer"))
 
     def _power_fails(self) -> None:
-        """The supply said that it will be gone in seconds.
+        """Handle the power-fail signal: the supply ends within seconds.
 
-        What is on its way has half of them to arrive; after that no time-out is waited for.
+        Data in transit have half of that time to arrive; then all time-outs expire.
         """
         limits = self.configuration.limits
         self.is_power_failing = True
@@ -525,14 +524,14 @@ class Service(MessageDispatcher):
             self._on_internal_error({"exception": error})
 
     def _on_internal_error(self, context: Mapping[str, Any]) -> None:
-        """A fault of our own: end with its trace, and be started again into the same flight."""
+        """Handle an internal error: print its trace and end; the restart resumes the flight."""
         error = context.get("exception")
         if isinstance(error, BaseException):
             traceback.print_exception(error)
         message = f"{type(error).__name__}: {error}" if error else context.get("message")
         self._fail(f"the service itself failed ({message}); report this. {self.notifier.restart}")
 
-    # Telling
+    # Output
 
     def _log(self, record: Record | LoggedTrigger) -> None:
         self.supervisor.send("writer", AppendToLog(message_of(record)))

@@ -1,6 +1,6 @@
-"""Before a flight: its mission folder, what its records repeat, and its processes.
+"""Startup of a flight: its mission folder, its identity, and its processes.
 
-Nothing here waits or decides; `daemon.onboard.service.service` starts what is laid out.
+These functions only describe; `daemon.onboard.service.service` starts the processes.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def create_mission(
 
 
 def identity(configuration: Configuration, rig: Rig, mission: Mission) -> FlightIdentity:
-    """What every record of this flight repeats."""
+    """Values that every record of this flight contains."""
     return FlightIdentity(
         boot_id=Path("/proc/sys/kernel/random/boot_id").read_text().strip(),
         line_id=configuration.plan.line,
@@ -107,7 +107,7 @@ def worker_process(
 ) -> ProcessPlan:
     """The pipeline worker, with rig and plan of the mission, or as configured before there is one.
 
-    It says whether the pipeline can be built, and waits for `Begin`.
+    It reports whether the pipeline can be built, and waits for `BeginProcessing`.
     """
     plan_file = configuration.plan.file if mission is None else mission.plan_path
     worker = WorkerSettings(
@@ -140,7 +140,7 @@ def writer_process(
 
 
 def watch_process(configuration: Configuration) -> ProcessPlan | None:
-    """The process that serves watchers, where the configuration wants one."""
+    """The process that serves page and API, if it is configured."""
     if configuration.watch is None:
         return None
     one = thread_counts(1)
@@ -153,9 +153,9 @@ def watch_process(configuration: Configuration) -> ProcessPlan | None:
 
 
 def thread_counts(threads: int) -> dict[str, str]:
-    """What a process finds in its environment.
+    """Environment variables of a process that limit its threads.
 
-    Compiled kernels share the cores; small matrices do not, and nobody spins while waiting.
+    Compiled kernels use several cores, small matrices one; waiting threads do not spin.
     """
     names = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS")
     fixed = {"OPENBLAS_NUM_THREADS": "1", "OMP_WAIT_POLICY": "passive"}

@@ -1,5 +1,6 @@
-"""The processes of the service, seen from its event loop: started, listened to, asked for a sign of
-life, and ended. What messages mean is not known here.
+"""Supervision of the service's processes from its event loop: start, receive, liveness, end.
+
+The meaning of messages is not known here.
 """
 
 from __future__ import annotations
@@ -28,8 +29,8 @@ class Supervisor:
     """Child processes by name.
 
     Args:
-        hear: called with every message a child sends.
-        died: called with the name of a child that ended without being told to.
+        on_message: called with every message of a child.
+        on_death: called with the name of a child that ended without a stop message.
     """
 
     def __init__(
@@ -53,9 +54,9 @@ class Supervisor:
         asyncio.get_running_loop().add_reader(child.connection.fileno(), self._receive, child)
 
     def send(self, name: str, message: object) -> None:
-        """Tell a child something. One that is gone is noticed by its silence, not here.
+        """Send a message to a child. The end of a child is detected on receiving, not here.
 
-        One that was ended hears nothing any more: others may still talk while they are seen off.
+        Nothing is sent to a child that was ended; others may still send while they end.
         """
         child = self._children.get(name)
         if child is None:
@@ -63,18 +64,18 @@ class Supervisor:
         try:
             child.send(message)
         except OSError:
-            self._receive(child)  # what it said before it ended, and then that it did
+            self._receive(child)  # its last messages, and then its end
 
     def try_send(self, name: str, message: object) -> bool:
-        """Tell a child something unless that would take time; False where it was dropped."""
+        """Send a message unless that would block; False if it was dropped."""
         child = self._children.get(name)
         try:
             return child is not None and child.try_send(message)
         except OSError:
-            return False  # its end is noticed by the loop
+            return False  # the loop detects its end
 
     def ping(self) -> list[str]:
-        """Ask every child for a sign of life, and end those that are silent and not needed.
+        """Ping every child, and end silent ones that no exposure depends on.
 
         Returns:
             The names of those that a flight depends on and that have been silent for too long.
@@ -90,7 +91,7 @@ class Supervisor:
         return [name for name in watched if now - self._last_answer_s[name] > ANSWER_LIMIT_S[name]]
 
     async def end(self, names: tuple[str, ...]) -> None:
-        """Tell children to stop, in this order, and see them off."""
+        """Send a stop message to children, in this order, and wait for their end."""
         loop = asyncio.get_running_loop()
         for name in names:
             child = self._children.pop(name, None)
@@ -102,7 +103,7 @@ class Supervisor:
             await asyncio.to_thread(child.end, END_TIMEOUT_S)
 
     def _receive(self, child: ChildProcess) -> None:
-        """Everything a child has to say right now."""
+        """Receive all pending messages of a child."""
         try:
             for message in child.receive():
                 if not isinstance(message, InvalidMessages):
@@ -130,7 +131,7 @@ class Supervisor:
 def _made(
     name: str, target: str, arguments: tuple[Any, ...], environment: Mapping[str, str]
 ) -> ChildProcess:
-    """The page's process speaks another language than the others: strangers can reach it."""
+    """The page's process uses a restricted protocol, because unknown senders can reach it."""
     if name != PAGE:
         return ChildProcess(name, target, arguments, environment)
     from daemon.onboard.service.page_connection import (

@@ -1,7 +1,7 @@
-"""The disks of a mirrored mission, as the service sees them: which are in use, and which one leads.
+"""The disks of a mirrored mission in the service: which are in use, and which is the leading one.
 
-What is written, and when a disk is dropped, is decided in the writer process
-(`daemon.mission.mirror.mirrored`). Where the mission has one disk, nothing here is active.
+The writer process writes to the disks and drops them (`daemon.mission.mirror.mirrored`). With one
+disk nothing here is active.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from processing.rig import Rig
 
 HEALTH_EVERY_S = 10.0
 SPARE_EXPOSURES = 10
-"""A disk that returns has room for so many more."""
+"""Space that a returning disk must have, in exposures."""
 
 
 class Mirror(MessageDispatcher):
@@ -50,11 +50,11 @@ class Mirror(MessageDispatcher):
     Args:
         found: the disks, None where the mission has one.
         mission: the mission on the leading disk.
-        configuration: says when a disk is full, and when it stalls.
+        configuration: limits for a full and for a stalled disk.
         rig: the camera; its frames fill the disks.
-        send: sends a message to a process of ours, by its name.
-        tell: called with what became of a disk.
-        moved: called with the mission where another disk leads.
+        send: sends a message to a process, by its name.
+        emit: emits an event for every change of a disk.
+        on_leading_changed: called with the mission when another disk becomes the leading one.
     """
 
     def __init__(
@@ -98,7 +98,7 @@ class Mirror(MessageDispatcher):
     @property
     def status(self) -> Sequence[Mapping[str, Any]]:
         """The disks as the page shows them, plain JSON types; none where there is one disk."""
-        # A disk that was dropped is not asked: it may hang.
+        # A dropped disk is not queried: it may hang.
         left = {disk.label: self._left(_free_nbytes(disk.root)) for disk in self._in_use}
         listed = self._status
         if not self._disks and "root" in self._health:
@@ -125,7 +125,7 @@ class Mirror(MessageDispatcher):
         self._drop_full()
 
     def _check_health(self) -> None:
-        """Say of each disk in use when it is no longer well, or well again."""
+        """Emit an event when a disk in use reports problems, or is healthy again."""
         if time.monotonic() < self._next_health_check_s:
             return
         self._next_health_check_s = time.monotonic() + HEALTH_EVERY_S
@@ -134,7 +134,7 @@ class Mirror(MessageDispatcher):
             try:
                 found = read_health(root)
             except OSError:
-                continue  # the disk itself is gone, which is said elsewhere
+                continue  # the disk itself is gone, which is reported elsewhere
             before = self._health.pop(label, DiskHealth())
             if found is not None:
                 self._health[label] = found
@@ -144,16 +144,16 @@ class Mirror(MessageDispatcher):
                 sentence = f"disk {label} ({root}): {problem_text}"
                 self._emit("disk-health", fault=True, disk=label, sentence=sentence)
             elif before.problems and not problems:
-                sentence = f"disk {label} ({root}) is well again"
+                sentence = f"disk {label} ({root}) is healthy again"
                 self._emit("disk-health", fault=False, disk=label, sentence=sentence)
 
     def _drop_full(self) -> None:
-        """Drop a disk that has no room for the next exposure where another has."""
+        """Drop a disk without space for the next exposure if another has space."""
         left = {disk.label: self._left(_free_nbytes(disk.root)) for disk in self._in_use}
         full = {label for label, count in left.items() if count == 0}
         if full and any(left.values()):
             for label in full - self._full:
-                self._send("writer", DropDisk(label, "it has no room for another exposure"))
+                self._send("writer", DropDisk(label, "it has no space for another exposure"))
         self._full = full
 
     @property
@@ -162,19 +162,19 @@ class Mirror(MessageDispatcher):
         return () if self._found is None else self._found.done
 
     def emit_disk_problems(self) -> None:
-        """Say which disks cannot be used, or protect nothing."""
+        """Emit an event for each disk that is unusable or gives no redundancy."""
         findings = [] if self._found is None else list(self._found.findings)
         for disk in self._disks[1:]:
             if same_file_system(disk.root, self._disks[0].root):
                 findings.append(
-                    f"disk {disk} lies on the same file system as {self._disks[0]}: one fault "
-                    "takes both; mount another disk there"
+                    f"disk {disk} is on the same file system as {self._disks[0]}: one fault "
+                    "affects both; mount another disk there"
                 )
         for finding in findings:
             self._emit("mirror", fault=True, sentence=finding)
 
     def naming_disks(self, complete: Complete) -> Complete:
-        """What recovery seals says which disks hold the frames."""
+        """Add the disks that hold the frames to the records that recovery seals."""
         found = self._found
         if found is None:
             return complete
@@ -243,7 +243,7 @@ class Mirror(MessageDispatcher):
         return None if label in labels else f"there is no disk {label!r}: {', '.join(labels)}"
 
     def _left(self, free_nbytes: int | None) -> int:
-        """Exposures that fit above the reserve; one disk that cannot be asked counts as roomy."""
+        """Exposures that fit above the reserve; 1 for a disk that cannot be queried."""
         if free_nbytes is None:
             return 1
         return max(0, (free_nbytes - self._limits.disk_reserve_bytes) // self._needed_nbytes)

@@ -1,7 +1,7 @@
-"""What the writer process writes to: one disk, or several that hold the same.
+"""Storage of the writer process: one disk, or several with the same content.
 
-What a mission on several disks needs to be told is in `MirrorPlan`; how they are kept alike is in
-`daemon.mission.mirror.mirrored`.
+`MirrorPlan` describes a mission on several disks; `daemon.mission.mirror.mirrored` keeps them
+identical.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Exposures on their way to disk: frames to be stored, records to be sealed, and what came of it.
+"""Coordination of storing frames and sealing records, and of the results.
 
 One record is with the writer at a time, so that the chain of hashes has one order.
 """
@@ -22,18 +22,18 @@ from daemon.onboard.service.monitoring_link import summary
 from daemon.onboard.service.record_ingest import EmitEvent
 
 SEAL_RETRY_NS = 1_000_000_000
-"""A disk that refused a record is asked again so much later."""
+"""Delay before a refused record is retried."""
 
 
 class StorageCoordinator(MessageDispatcher):
-    """Hands exposures to the writer, and tells flight and pipeline what the disk has of them.
+    """Passes exposures to the writer, and reports to flight and pipeline what is on disk.
 
     Args:
-        flight: what is open, and what must balance.
-        pipeline: waits for what is stored and sealed.
-        send: sends a message to a process of ours, by its name.
-        tell: told of what became of an exposure.
-        decided: told of when the disk had it.
+        flight: the open exposures and the ledger.
+        pipeline: receives stored and sealed exposures.
+        send: sends a message to a process, by its name.
+        emit: emits the event of each result.
+        on_decision: called when an exposure is stored or sealed.
     """
 
     def __init__(

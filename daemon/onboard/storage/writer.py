@@ -40,7 +40,7 @@ from daemon.onboard.service.processes import ServiceConnection
 from daemon.onboard.storage.storage import MirrorPlan, OneDisk, Storage, mirrored
 
 CHECKS_PER_STALL = 8
-"""How often a disk is looked at within the time after which it is dropped."""
+"""Checks of a disk within the time after which it is dropped."""
 
 LOG_SYNC_INTERVAL_S = 1.0
 """The flight log is on disk at most this much later than it was handed over (and the writer's
@@ -53,7 +53,7 @@ def main(
     rings: tuple[FrameRing, ...],
     mirror: MirrorPlan | None = None,
 ) -> None:
-    """Write until told to stop."""
+    """Write until a stop message arrives."""
     mission = Mission.open(mission_path)
     memory = {ring.head: ring for ring in rings}
     if mirror is None:
@@ -66,7 +66,7 @@ def main(
 
 
 class _Writer:
-    """Does what the service orders, one order after another."""
+    """Executes the requests of the service in order."""
 
     def __init__(
         self, link: ServiceConnection, storage: Storage, memory: Mapping[str, FrameRing]
@@ -77,7 +77,7 @@ class _Writer:
         self._backlog = 0
 
     def run(self, wait_s: float) -> None:
-        """Work until told to stop, waiting so long for an order at a time."""
+        """Handle requests until a stop message arrives; `wait_s` is the time-out of each wait."""
         synced = time.monotonic()
         while not isinstance(request := self.link.receive(wait_s), Stop):
             self.handle(request)
@@ -91,7 +91,7 @@ class _Writer:
         self.storage.close()
 
     def handle(self, request: object) -> None:
-        """Do what one order says, and answer it."""
+        """Execute one request and answer it."""
         if isinstance(request, Store):
             self.link.send(_store(self.storage, self._memory, request))
         elif isinstance(request, Seal):
@@ -109,7 +109,7 @@ class _Writer:
 
 
 class _MirroredWriter(_Writer):
-    """The same on two disks, and what concerns the disks themselves."""
+    """The writer of two disks, with their own requests."""
 
     storage: MirroredStorage
 
@@ -138,10 +138,9 @@ def _changed(event: DiskEvent) -> DiskChanged:
 
 def _index_event(backlog: int) -> ServiceEvent:
     sentence = (
-        f"index or chain.jsonl refused {backlog} changes; what they tell of is safe, and they are "
-        "tried again; look at the disk"
+        f"index or chain.jsonl refused {backlog} changes; the data are safe. Check the disk. Retrying"
         if backlog
-        else "index and chain.jsonl have taken what they had refused"
+        else "index and chain.jsonl are up to date again"
     )
     return ServiceEvent(
         {"event": "index", "fault": backlog > 0, "behind": backlog, "sentence": sentence}
@@ -161,7 +160,7 @@ def _store(
     try:
         frames, disks = storage.write(request.capture, pixels)
     except (OSError, DaemonError) as error:
-        sentence = f"exposure {request.capture.number} is not stored: {error}; look at the disk"
+        sentence = f"exposure {request.capture.number} is not stored: {error}; check the disk"
         return WriteFailed(request.capture.number, sentence)
     return Stored(request.capture.number, frames, time.monotonic() - started, disks)
 
@@ -170,5 +169,5 @@ def _seal(storage: Storage, exposure: Exposure) -> Sealed | WriteFailed:
     try:
         return Sealed(exposure.number, storage.seal(exposure))
     except (OSError, DaemonError) as error:
-        sentence = f"exposure {exposure.number} is not sealed: {error}; look at the disk"
+        sentence = f"exposure {exposure.number} is not sealed: {error}; check the disk"
         return WriteFailed(exposure.number, sentence, is_transient=isinstance(error, OSError))

@@ -1,1 +1,1 @@
-"""Instants: clocks told by one another, and which frame and mark belong to which pulse."""
+"""Clock models, and the assignment of frames and marks to pulses."""

@@ -1,8 +1,7 @@
-"""One clock told by another: offset, rate and their uncertainty from pairs of readings.
+"""One clock modelled by another: offset, rate and their uncertainty from pairs of readings.
 
-The clock that is asked is an oscillator whose rate wanders; how much it wanders, and how well the
-readings deserve the sigma they came with, is learned from the pairs themselves. Nothing here knows
-what the pairs were made of.
+The clock that is read is an oscillator whose rate wanders. The amount of wander, and the scale of the
+stated sigmas, are estimated from the pairs. The model is independent of the source of the pairs.
 
 Source: docs/mathematics/time.md#clock-model; Rasmussen and Williams (2006), section 2.7.
 """
@@ -46,7 +45,7 @@ SCALE_SPREAD: Final = math.log(2.0)
 OUTLIER: Final = 4.0
 """A pair so many sigmas off the others loses weight, or is held back as it comes."""
 GATE_SHARE: Final = 4
-"""The fit that new pairs are held against is made anew after so large a share of new ones."""
+"""The fit that new pairs are compared with is repeated after this fraction of new pairs."""
 STEP_PAIRS: Final = 3
 """So many pairs held back that agree with each other are no outliers: the clock has stepped."""
 ITERATIONS_MAX: Final = 3
@@ -65,7 +64,7 @@ GRID_PRIOR: Final[Array] = (
 
 @dataclass(frozen=True)
 class Pair:
-    """The same instant on the clock that is asked and on the one that is told, with its sigma.
+    """The same instant on the clock that is read and on the reference clock, with its sigma.
 
     `key` lets a pair be taken back.
     """

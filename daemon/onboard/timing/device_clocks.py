@@ -1,7 +1,7 @@
 """The clocks of devices on the host's monotonic clock, from readings over round trips.
 
 Heads are latched, autopilots asked by TIMESYNC: both answer within a round trip of unknown halves.
-The shortest round trips tell most, so that only they are used.
+The shortest round trips are the most accurate, so only they are used.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from daemon.onboard.timing.gps_clock import RoundTrips
 from drivers.contract import ClockReading
 
 GROUP: Final = 4
-"""Of so many readings in succession the one with the shortest round trip is kept."""
+"""Of this many successive readings the one with the shortest round trip is kept."""
 BACKWARDS_NS: Final = 1_000_000_000
-"""A device whose clock reads so much less than before has been started again."""
+"""A device clock that decreases by more than this was restarted."""
 LATCH_GRID_NS: Final = 1_000
-"""A latch is at best as fine as this, whatever its round trip says."""
+"""Smallest sigma of a latch, whatever its round trip."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class DeviceClockEstimator:
         return self._model.steps + self.restarts
 
     def read(self, reading: ClockReading) -> None:
-        """Note a reading; one that is the same as the last tells nothing new."""
+        """Note a reading; a repetition of the last one is ignored."""
         newest_ns = self._newest_ns
         if newest_ns is not None:
             if reading.device_ns == newest_ns or reading.mono_ns <= self._newest_mono_ns:

@@ -1,9 +1,9 @@
-"""GPS time on the host's monotonic clock, and how well it is known at every moment.
+"""GPS time on the host's monotonic clock, and its uncertainty at every instant.
 
-Three witnesses: edges of a pulse per second (exact, but nameless), event marks of pulses the host
-gave (exact, named, as good as the pulse's host time), and navigation messages, which come up to
-700 ms late and only name the second. What a model of two clocks is stands in
-`daemon.onboard.timing.clock_model`.
+There are three sources. Edges of a pulse per second are exact, but their second is unknown. Event
+marks of pulses that the host gave are as accurate as the pulse's host time. Navigation messages come
+up to 700 ms late and only resolve the second. `daemon.onboard.timing.clock_model` is the model of two
+clocks.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from daemon.onboard.timing.clock_model import ClockModel, Estimate, Pair
 
 SECOND_NS: Final = 1_000_000_000
 ARRIVAL_MIN_NS: Final = 0
-"""An autopilot on the network tells its position within a millisecond, a serial line after 10."""
+"""An autopilot on the network sends its position within a millisecond, a serial line after 10."""
 ARRIVAL_MAX_NS: Final = 700_000_000
 COARSE_SIGMA_NS: Final = round((ARRIVAL_MAX_NS - ARRIVAL_MIN_NS) / math.sqrt(12))
 """Of an instant that lies anywhere between both."""
@@ -51,7 +51,7 @@ Source = Literal["pps", "marks", "messages"]
 class GpsEstimate:
     """A GPS time with its standard deviation, and what it rests on.
 
-    `is_coarse` where only messages were heard so far. `coasting_ns` is how long ago the last
+    `is_coarse` if only messages were received so far. `coasting_ns` is how long ago the last
     edge or mark was; where that is longer than usual, `in_holdover`.
     """
 
@@ -65,7 +65,7 @@ class GpsEstimate:
 
 @dataclass(frozen=True)
 class ClockEvent:
-    """Something to tell of the clock: a stable word, whether it is a fault, and the cure."""
+    """An event of the clock: its stable name, whether it is a fault, and a sentence with the action."""
 
     name: str
     is_fault: bool
@@ -164,7 +164,7 @@ class GpsClock:
         self._events: list[ClockEvent] = []
         self._steps_reported = 0
 
-    # What is heard
+    # Input
 
     def message_arrived(self, gps_ns: int, mono_ns: int) -> None:
         """Note a navigation message: it left at `gps_ns` and arrived, late, at `mono_ns`."""
@@ -244,11 +244,11 @@ class GpsClock:
         self.is_suspect = False
         self._last_mark_ns = None
 
-    # What is asked
+    # Queries
 
     @property
     def is_coarse(self) -> bool:
-        """Whether no better time is known than what messages tell."""
+        """Whether navigation messages are the only source of time."""
         return not len(self._marks) and (self._second is None or not len(self._pps))
 
     def messages_allow(self, shift_ns: int) -> bool:
@@ -312,7 +312,7 @@ class GpsClock:
         return None if estimate is None else estimate.gps_ns - gps_ns
 
     def events(self, mono_ns: int) -> list[ClockEvent]:
-        """What is to be told since the last time of asking."""
+        """Events since the last call."""
         events, self._events = self._events, []
         events += self._alarm(
             "pps-holdover",
@@ -358,7 +358,7 @@ class GpsClock:
             )
         return events
 
-    # How it is done
+    # Implementation
 
     def _as_gps_estimate(
         self, estimate: Estimate, sigma_ns: float, source: Source, mono_ns: int
@@ -394,7 +394,7 @@ class GpsClock:
         return Estimate(resolved_ns, estimate.sigma_ns, estimate.gap_ns)
 
     def _resolve_second(self) -> None:
-        """Which second the edges are, where messages leave no choice and no mark has said it."""
+        """Resolve the second of the edges from messages, if they are unambiguous and no mark did."""
         if self._second is not None or len(self._messages) < MESSAGES_TO_RESOLVE_SECOND:
             return
         offsets_ns = []
@@ -403,7 +403,7 @@ class GpsClock:
             if edge is None:
                 return
             offsets_ns.append(gps_ns - edge.to_ns)
-        # The least late message counts: the name lies up to 700 ms beyond what it says.
+        # The message with the least delay counts: the edge is up to 700 ms later than its time.
         second = math.ceil((max(offsets_ns) + ARRIVAL_MIN_NS) / SECOND_NS)
         if second * SECOND_NS <= max(offsets_ns) + ARRIVAL_MAX_NS:
             self._second = second
@@ -418,7 +418,7 @@ class GpsClock:
             self._second = second
 
     def _check_message(self, gps_ns: int, mono_ns: int) -> None:
-        """Whether a message fits what is known; a receiver whose time stepped is believed anew."""
+        """Check a message against the clock; after a step of the receiver's time, restart."""
         expected = self.gps_at(mono_ns)
         if expected is None or expected.is_coarse:
             self.is_suspect = False
@@ -440,7 +440,7 @@ class GpsClock:
                     "receiver-stepped",
                     True,
                     f"the receiver's time is {-lateness_ns * 1e-9:.3f} s ahead of what it was; its "
-                    "clock is learned anew; check its firmware and week number",
+                    "clock is estimated again; check its firmware and week number",
                 )
             )
 

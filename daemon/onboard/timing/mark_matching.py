@@ -20,7 +20,7 @@ from daemon.onboard.timing.pulses import Cause, FiredPulse, MatchResult
 from drivers.contract import EventMark
 
 WINDOW_NS: Final = 2_000_000
-"""How far a mark may lie from its pulse beside what the clock is unsure of."""
+"""Largest distance of a mark from its pulse, in addition to the clock's uncertainty."""
 SIGMAS: Final = 5
 COARSE_WINDOW_NS: Final = 355_000_000
 """Half of what messages leave open, and a little."""
@@ -50,7 +50,7 @@ class _PendingMark:
 class _Channel:
     """What is known of one input of one receiver.
 
-    Its count less the pulses' is believed once two marks have said the same of it.
+    The offset of its count from the pulses' is confirmed once two marks agree on it.
     """
 
     last_offset: int | None = None
@@ -193,7 +193,7 @@ class MarkMatcher:
             return None
         pulse = free[0]
         if is_coarse:
-            # Two marks for one pulse, or two pulses for one mark: nothing tells them apart yet.
+            # Two marks for one pulse, or two pulses for one mark: still ambiguous.
             rivals = [h for h in self._pending if h is not pending and pulse in self._candidates(h)]
             pending.is_ambiguous = bool(rivals) or len(candidates) > 1
             if pending.is_ambiguous and by_count is not pulse:
@@ -262,7 +262,7 @@ class MarkMatcher:
         return found
 
     def _pulse_by_count(self, mark: EventMark) -> FiredPulse | None:
-        """The pulse a mark is of by its count; None where it has none, or that tells nothing."""
+        """The pulse a mark is of by its count; None if it has none, or if that is ambiguous."""
         channel = self._channels[(mark.receiver, mark.channel)]
         if not mark.count_bits or channel.offset is None:
             return None

@@ -29,12 +29,12 @@ ARRIVAL_TOLERANCE_NS: Final = 400_000_000
 """A frame that arrives so much off the usual is no witness of when it was exposed."""
 ARRIVALS_MAX: Final = 16
 STARTS_MIN: Final = 5
-"""So many frames tell how far a head's starts usually lie from their pulses."""
+"""Number of frames that define the usual distance of a head's starts from their pulses."""
 STARTS_MAX: Final = 16
 START_TOLERANCE_NS: Final = 500_000
 LATCH_DRIFT: Final = 1e-4
-"""How far from there a start may lie, beside what pulse, latch and time since the latch leave
-open."""
+"""Largest distance from there, in addition to the uncertainty of pulse, latch and time since the
+latch."""
 STARTS_TO_RELEARN: Final = 3
 """So many unusual starts in succession that agree are the new usual."""
 SPURIOUS_MAX: Final = 3
@@ -62,8 +62,8 @@ class _HeadHistory:
     def is_usual_start(self, offset_ns: int, tolerance_ns: int) -> bool:
         """Whether an exposure that began so much later than by its pulse is like those before.
 
-        What is usual is learned anew where unusual ones agree: a head that was given another delay
-        must not be disbelieved for ever.
+        The usual start is estimated again when unusual ones agree: the delay of a head may have
+        changed.
         """
         if len(self.starts_ns) >= STARTS_MIN:
             median_ns = statistics.median(self.starts_ns)
@@ -90,9 +90,9 @@ class _HeadHistory:
 
 
 class Matcher:
-    """Matches against the pulses it was told of, until they are forgotten.
+    """Matches frames and marks with the recorded pulses, until these are dropped.
 
-    A mark's match may be revised until its exposure is sealed (`mark_of` says the present one); a
+    A mark's match may be revised until its exposure is sealed (`mark_of` is the present one); a
     frame's is final, since its pixels are stored under the exposure's number.
     """
 
@@ -145,7 +145,7 @@ class Matcher:
         return MatchResult(number, Cause.USED)
 
     def has_pulse_of(self, frame: Frame) -> bool:
-        """Whether the frame's own time says which pulse it is of."""
+        """Whether the frame's own time identifies its pulse."""
         if start_of_exposure_mono_ns(frame) is None:
             return False
         return self._pulse_of(frame)[0] is not None
@@ -162,7 +162,7 @@ class Matcher:
             pulse = near[0]
             differs = by_count is not None and by_count is not pulse
             if differs and by_count is not None and self._supports(frame, by_count):
-                # The head's clock says one pulse, its count and perhaps the arrival another.
+                # The head's clock indicates one pulse, its count and perhaps its arrival another.
                 is_supported = self._supports(frame, pulse)
                 return (pulse.number, ()) if is_supported else (None, _numbers([pulse, by_count]))
             return pulse.number, ()
@@ -202,7 +202,7 @@ class Matcher:
         return abs(self._start_ns(frame, pulse) - start_ns) <= window_ns
 
     def _pulse_by_count(self, frame: Frame, possible: list[FiredPulse]) -> FiredPulse | None:
-        """The pulse a frame is of by its count; None where that tells nothing."""
+        """The pulse a frame is of by its count; None if that is ambiguous."""
         offset = self._heads[frame.head].offset
         if offset is None or frame.counter is None:
             return None

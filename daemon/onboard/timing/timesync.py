@@ -45,14 +45,14 @@ class TimesyncRequester:
         port.subscribe_timesync(self.on_answer)
 
     def run(self) -> None:
-        """Ask until told to stop, from a thread of the caller's."""
+        """Send requests until `stop` is called; runs in a thread of the caller."""
         while not self._stop.wait(INTERVAL_S):
             self.request()
 
     def request(self) -> bool:
         """Send one request; False where the line is not open."""
         ts1_ns = self._mono_ns()
-        # Before it is sent: the answer may be heard before this goes on.
+        # Before sending: the answer may arrive before `send` returns.
         self._outstanding = {
             sent_ns for sent_ns in self._outstanding if ts1_ns - sent_ns <= ANSWER_MAX_NS
         } | {ts1_ns}

@@ -164,7 +164,7 @@ def test_the_unit_and_its_companions_are_valid(tmp_path: Path) -> None:
             timeout=60,
             check=False,
         )
-        # Creating may lack rights or the user; what must not be is a line that is not understood.
+        # Creation may fail without permissions or user; an invalid line must not occur.
         assert not re.search(r"Invalid|Unknown|Failed to parse|syntax", parsed.stderr), (
             parsed.stderr
         )

@@ -42,7 +42,7 @@ folder = "none"
 @contextmanager
 def started(folder: Path, *program: str) -> Iterator[tuple[subprocess.Popen[str], int, Path]]:
     """A process that starts a program; with the program's pid and what it prints."""
-    output_file = folder / "said"
+    output_file = folder / "output"
     with output_file.open("w") as out:
         starter = subprocess.Popen(
             [sys.executable, "-c", STARTER, *program],

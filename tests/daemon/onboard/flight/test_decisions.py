@@ -1,4 +1,4 @@
-"""What falls due at an instant, and what the flight log has to say of it."""
+"""What is due at an instant, and what the flight log records of it."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ NOTHING = Tick((), (), None, None, asked_to_seal=True, resolved=0)
 
 
 def due(to_seal: object = None) -> Any:
-    """A flight with a record to foresee, and perhaps one to seal."""
+    """A flight with a provisional record, and perhaps one to seal."""
     return SimpleNamespace(
         due_to_store=lambda _: [],
         due_to_give_up=lambda _: [],
         due_to_seal=lambda _: to_seal,
-        due_provisionally=lambda: "foreseen",
+        due_provisionally=lambda: "provisional",
         resolved_marks=[],
     )
 
@@ -26,14 +26,14 @@ def due(to_seal: object = None) -> Any:
 @pytest.mark.parametrize(
     ("may_seal", "allow_provisional", "to_seal", "provisional"),
     [
-        (True, True, None, "foreseen"),
+        (True, True, None, "provisional"),
         (True, False, None, None),
         (False, True, None, None),
         (False, False, None, None),
         (True, True, "sealed", None),
     ],
 )
-def test_a_record_is_foreseen_only_while_none_is_sealed(
+def test_a_record_is_provisional_only_while_none_is_sealed(
     may_seal: bool, allow_provisional: bool, to_seal: object, provisional: object
 ) -> None:
     found = tick(due(to_seal), 7, may_seal=may_seal, allow_provisional=allow_provisional)
@@ -41,7 +41,7 @@ def test_a_record_is_foreseen_only_while_none_is_sealed(
     assert found.asked_to_seal is may_seal
 
 
-def test_the_log_is_told_only_where_something_fell_due() -> None:
+def test_a_tick_is_logged_only_if_something_was_due() -> None:
     assert NOTHING.detail is None
     given_up = Tick((), ((3, "no head sent a frame"),), None, None, asked_to_seal=True, resolved=0)
     assert given_up.detail == {

@@ -1,4 +1,4 @@
-"""Every event that the code tells is in the table, with a cause and a cure, and in the docs."""
+"""Every event that the code emits is in the table, with a cause and a cure, and in the docs."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from typing import get_args
 from daemon.onboard.flight.event_table import TABLE, Severity, as_markdown, entry_of
 
 ROOT = Path(__file__).parents[4]
-TELLERS = {
+EMITTERS = {
     "_event": "",
-    "_tell": "",
+    "_emit": "",
     "emit": "device/",
     "emit_throttled": "device/",
     "_alarm": "device/",
@@ -45,11 +45,11 @@ def _event_of(node: ast.AST, *, is_driver: bool) -> str | None:
         return f"device/{first.value!s}"
     if called == "DeviceEvent" and len(node.args) > 1 and isinstance(node.args[1], ast.Constant):
         return f"device/{node.args[1].value!s}"
-    if called not in TELLERS or not isinstance(first, ast.Constant):
+    if called not in EMITTERS or not isinstance(first, ast.Constant):
         return None
     if called in ("emit", "emit_throttled") and not is_driver:
         return None
-    return f"{TELLERS[called]}{first.value!s}"
+    return f"{EMITTERS[called]}{first.value!s}"
 
 
 def test_every_event_in_the_sources_is_in_the_table() -> None:
@@ -60,19 +60,19 @@ def test_every_event_in_the_sources_is_in_the_table() -> None:
     assert unknown == {}
 
 
-def test_nothing_in_the_table_is_never_told() -> None:
+def test_every_event_in_the_table_is_emitted() -> None:
     found = dict(emitted()) | {"device/absent": "", "phase": ""}
     never = {e.name for e in TABLE if e.name not in found and not e.name.startswith("arming-")}
     assert never == set()
 
 
-def test_every_entry_says_what_helps_in_whole_sentences() -> None:
+def test_every_entry_has_cause_and_action_in_complete_sentences() -> None:
     assert len({entry.name for entry in TABLE}) == len(TABLE)
     for entry in TABLE:
         assert entry.severity in get_args(Severity), entry
         assert entry.cause.endswith("."), entry
-        assert entry.cure.endswith("."), entry
-        assert entry.severity == "info" or entry.cure != "Nothing to do.", entry
+        assert entry.action.endswith("."), entry
+        assert entry.severity == "info" or entry.action != "None.", entry
 
 
 def test_the_page_of_the_docs_is_current() -> None:

@@ -29,7 +29,7 @@ def latches_of(*events: dict[str, Any]) -> FaultLatches:
     return latches
 
 
-def test_what_nobody_acknowledged_is_told_again_after_a_restart(tmp_path: Path) -> None:
+def test_an_unacknowledged_fault_is_reported_again_after_a_restart(tmp_path: Path) -> None:
     before = latches_of(device("lost"), {"event": "disk", "sentence": "full"})
     assert before.acknowledge("disk")
     (tmp_path / FILE).write_bytes(unhandled_content(before.unhandled()))

@@ -173,7 +173,7 @@ def test_a_missing_frame_is_waited_for_and_then_the_exposure_is_degraded() -> No
 
 
 def in_two_that_wait(flying: Flight, status: FrameStatus) -> tuple[FiredPulse, FiredPulse]:
-    """Two exposures wait for G, of which a frame comes that says nothing of when it was made."""
+    """Two exposures wait for G, of which a frame arrives without a time stamp."""
     first, second = (fly_one(flying, number, 1.35 * number, HEADS[:2]) for number in (1, 2))
     unknown = {"device_ns": None, "counter": None, "status": status}
     came = replace(frame("G", second, slot=5), **unknown)
@@ -188,7 +188,7 @@ def missing_of(flying: Flight) -> dict[int, tuple[str, Flag]]:
     return {c.number: (dict(c.missing).get("G", ""), Flag(c.flags)) for c in due}
 
 
-def test_a_damaged_frame_that_may_be_of_two_exposures_is_told_at_both() -> None:
+def test_a_corrupt_frame_that_may_belong_to_two_exposures_is_reported_at_both() -> None:
     flying = flight()
     in_two_that_wait(flying, FrameStatus.INCOMPLETE)
     sentence = "may be a corrupt frame that came, which may be of another exposure"
@@ -196,10 +196,10 @@ def test_a_damaged_frame_that_may_be_of_two_exposures_is_told_at_both() -> None:
     assert missing_of(flying) == dict.fromkeys((1, 2), (sentence, flags))
 
 
-def test_a_whole_frame_that_may_be_of_two_exposures_is_told_at_both() -> None:
+def test_a_complete_frame_that_may_belong_to_two_exposures_is_reported_at_both() -> None:
     flying = flight()
     in_two_that_wait(flying, FrameStatus.COMPLETE)
-    sentence = "may be a frame that came and could not be told from others"
+    sentence = "may be a frame that arrived and could not be attributed"
     flags = Flag.FRAME_MISSING | Flag.FRAME_AMBIGUOUS
     assert missing_of(flying) == dict.fromkeys((1, 2), (sentence, flags))
 
@@ -213,7 +213,7 @@ def test_an_exposure_that_has_its_frame_is_not_accused_of_the_damaged_one() -> N
     assert found[1][0].startswith("may be") and found[1][1] & Flag.FRAME_AMBIGUOUS
 
 
-def test_a_damaged_frame_that_comes_when_two_are_stored_is_told_in_both_records() -> None:
+def test_a_corrupt_frame_that_arrives_when_two_are_stored_is_reported_in_both_records() -> None:
     flying = flight()
     first, second = (fly_one(flying, number, 1.35 * number, HEADS[:2]) for number in (1, 2))
     for due in flying.due_to_store(12 * NS):
@@ -246,7 +246,7 @@ def test_a_silent_head_does_not_starve_the_others_of_memory() -> None:
     assert due.capture.number == 1
 
 
-def test_a_lost_mark_is_interpolated_through_the_clock_and_says_so() -> None:
+def test_a_lost_mark_is_interpolated_through_the_clock_and_flagged() -> None:
     flying = flight(has_pps=False)
     for number in (1, 2):
         given = fly_one(flying, number, 3.0 * number)
@@ -266,7 +266,9 @@ def test_a_lost_mark_is_interpolated_through_the_clock_and_says_so() -> None:
     assert Flag(exposure.flags) & Flag.MARK_MISSING
 
 
-def test_with_a_pulse_per_second_a_lost_mark_is_timed_by_it_and_the_budget_says_by_what() -> None:
+def test_with_a_pulse_per_second_a_lost_mark_is_timed_by_it_and_the_budget_names_the_source() -> (
+    None
+):
     flying = flight()
     given = fly_one(flying, 1, 0.0)
     flying.stored(1, stored_frames(flying, 1, NS))
@@ -369,7 +371,7 @@ def test_recovery_makes_the_same_record_from_the_log_as_the_flight_did(*, has_ma
     assert recovered == seal(flying, 9 * NS)
 
 
-def test_a_head_whose_clock_starts_again_is_told_of_once() -> None:
+def test_a_head_whose_clock_restarts_is_reported_once() -> None:
     flying = flight()
     given = [fly_one(flying, number, 2.0 * number) for number in range(1, 8)]
     flying.clock_events(14 * NS)
@@ -390,7 +392,7 @@ def test_a_head_whose_clock_starts_again_is_told_of_once() -> None:
     assert flying.clock_events(16 * NS) == []
 
 
-def test_holdover_is_told_with_cause_and_cure_and_flagged_and_ends() -> None:
+def test_holdover_is_reported_with_cause_and_action_and_flagged_and_ends() -> None:
     flying = flight()
     given = fly_one(flying, 1, 20.0)
     (reported,) = flying.clock_events(21 * NS)
@@ -408,7 +410,7 @@ def test_holdover_is_told_with_cause_and_cure_and_flagged_and_ends() -> None:
     assert back.name == "pps-holdover" and not back.is_fault
 
 
-def test_an_exposure_that_only_waits_for_a_second_mark_is_foreseen_as_it_is_sealed() -> None:
+def test_the_provisional_record_of_an_exposure_awaiting_a_second_mark_is_the_sealed_one() -> None:
     flying = flight(has_pps=False)
     first, second = fly_one(flying, 1, 0.0), fly_one(flying, 2, 2.0)
     flying.stored(1, flying.due_to_store(NS)[0].capture.frames)
@@ -418,14 +420,14 @@ def test_an_exposure_that_only_waits_for_a_second_mark_is_foreseen_as_it_is_seal
     flying.navigation(nav(0.2))
     provisional = flying.due_provisionally()
     assert provisional is not None and provisional.mark_source == "event-mark"
-    assert flying.due_provisionally() is None, "it is told once"
+    assert flying.due_provisionally() is None, "it is returned once"
     assert flying.due_to_seal(NS) is None, "and not sealed yet"
     flying.temperature(TemperatureSample("cone", 44.0, NS))
     flying.mark(mark(second))
     assert seal(flying, 3 * NS) is provisional, "what is learned later does not make it another"
 
 
-def test_what_was_foreseen_with_a_mark_that_was_noise_is_sealed_without_it() -> None:
+def test_a_provisional_record_with_a_mark_that_was_noise_is_sealed_without_it() -> None:
     flying = flight(has_pps=False)
     given = [fly_one(flying, number, 2.0 * (number - 1)) for number in (1, 2, 3)]
     flying.stored(1, flying.due_to_store(NS)[0].capture.frames)

@@ -292,11 +292,11 @@ def test_an_exposure_judged_worse_names_its_last_causes_alone():
 @pytest.mark.parametrize(
     ("state", "causes", "message"),
     [
-        ("complete", {"SU00": "late"}, "is complete but lacks SU00"),
-        ("degraded", {}, "is degraded; say what it lacks"),
-        ("lost", {}, "is lost; say what it lacks"),
-        ("open", {}, "settled means complete, degraded or lost"),
-        ("gone", {}, "settled means complete, degraded or lost"),
+        ("complete", {"SU00": "late"}, "is complete, but missing: SU00"),
+        ("degraded", {}, "is degraded; state what is missing"),
+        ("lost", {}, "is lost; state what is missing"),
+        ("open", {}, "the final state is complete, degraded or lost"),
+        ("gone", {}, "the final state is complete, degraded or lost"),
     ],
 )
 def test_a_judgement_and_its_causes_fit_each_other(state, causes, message):

@@ -61,7 +61,7 @@ def test_heading_is_interpolated_across_north() -> None:
     assert record.roll_rad == pytest.approx(math.radians(1.0), abs=1e-4)
 
 
-def test_shortly_after_the_last_sample_it_is_extrapolated_and_says_so() -> None:
+def test_shortly_after_the_last_sample_it_is_extrapolated_and_marked_so() -> None:
     track = Track()
     track.add(sample(0.0))
     assert not track.covers(GPS_NS + NS)
@@ -69,7 +69,7 @@ def test_shortly_after_the_last_sample_it_is_extrapolated_and_says_so() -> None:
     assert record is not None and record.method == "extrapolated" and record.gap_ns == NS
 
 
-def test_long_after_the_last_sample_nothing_is_told() -> None:
+def test_long_after_the_last_sample_there_is_no_position() -> None:
     track = Track()
     track.add(sample(0.0))
     assert track.at(GPS_NS + 3 * NS) is None
@@ -100,7 +100,7 @@ def test_between_two_times_of_one_receiver_there_is_no_position() -> None:
     assert flown_m == pytest.approx(50.0 * 0.7 + 0.7**2, abs=0.01)
 
 
-def test_one_position_beside_the_track_is_passed_over() -> None:
+def test_one_position_off_the_track_is_ignored() -> None:
     track = Track()
     for tenth in (0, 2, 4):
         track.add(sample(tenth / 10))
@@ -146,7 +146,7 @@ def test_a_height_that_was_not_received_is_taken_from_samples_that_have_one() ->
 
 
 @pytest.mark.trust
-def test_without_any_height_the_record_has_none_and_says_2d() -> None:
+def test_without_any_height_the_record_has_none_and_the_fix_is_2d() -> None:
     track = Track()
     for tenth in range(0, 20, 2):
         track.add(flat(tenth / 10))

@@ -219,7 +219,7 @@ def _state(_gps_ns: int) -> ReceiverState:
 
 
 class ThreadChild:
-    """In the place of `daemon.onboard.service.processes.Child`: the same target, in a thread."""
+    """In the place of `daemon.onboard.service.processes.ChildProcess`: the same target, in a thread."""
 
     pause_s = 0.0
 
@@ -248,7 +248,7 @@ class ThreadChild:
     def send(self, message: object) -> None:
         self.connection.send(message)
 
-    def tell(self, message: object) -> bool:
+    def try_send(self, message: object) -> bool:
         self.connection.send(message)
         return True
 
@@ -259,7 +259,7 @@ class ThreadChild:
 
 @dataclass
 class Reported:
-    """What one of the two commands said: its exit status and every sentence."""
+    """Output of one of the two commands: its exit status and every sentence."""
 
     status: int
     failing: frozenset[str] = frozenset()
@@ -303,7 +303,7 @@ def check(planted: Planted, *, fire: bool = False) -> Reported:
 
 
 def run(planted: Planted, agreed: Callable[[Reported], bool]) -> Reported:
-    """What `syntopic run` says until it ends, or until it has said what is waited for."""
+    """Output of `syntopic run` until it ends, or until the awaited output."""
     try:
         configuration, rig = load(planted.config)
     except ConfigurationError as error:

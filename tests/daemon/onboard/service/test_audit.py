@@ -32,7 +32,7 @@ class Flight(FakeService):
         self.answers: list[Answer] = []
         self.events: list[dict[str, Any]] = []
         self.supervisor = SimpleNamespace(send=lambda *sent: self.sent.append(sent))
-        self.watching = SimpleNamespace(answer=self.answers.append)
+        self.monitoring = SimpleNamespace(answer=self.answers.append)
 
     def _event(self, event: str, **content: Any) -> None:
         self.events.append({"event": event, **content})

@@ -38,7 +38,7 @@ WATCH = "[watch]\nport = 0\nannounce = false\n"
 AFTER = 'loop = true\n\n[[head]]\nsensor = "SUB"'
 
 
-CONSEQUENCES = ("the disk is ", "not settled: ")
+CONSEQUENCES = ("the disk is ", "not balanced: ")
 """Sentences of the flight about what follows from a fault."""
 
 
@@ -118,7 +118,7 @@ def no_permission(planted: Planted) -> None:
 
 
 def spoken(driver: str, data: Callable[[int], bytes]) -> Callable[[Planted], object]:
-    """A receiver's line on which something else is said."""
+    """A receiver's line with other data."""
     return lambda planted: planted.add(NAVIGATOR.format(driver, planted.line(data)))
 
 
@@ -319,4 +319,4 @@ AGREED: dict[str, Callable[[Reported, Reported], bool]] = {
     ),
     "passes": lambda checked, flown: flown.has_flown and not flown.failing,
 }
-"""Whether what `run` said is what `check` said."""
+"""Whether `run` and `check` report the same."""

@@ -1,4 +1,4 @@
-"""A command is done, or refused in a sentence that says why; nothing in between."""
+"""A command is executed, or refused with a reason."""
 
 from __future__ import annotations
 

@@ -27,20 +27,20 @@ def configured(**head: object) -> tuple[Configuration, Rig]:
 def test_a_head_with_another_serial_number_than_the_calibration_is_refused_with_both() -> None:
     rig = find_rig("ultracam-x-mini")
     assert serial_problem(rig, "SU00", {"serial": "M-SU00"}) is None
-    assert serial_problem(rig, "SU00", {}) is None, "a head that does not tell is not accused"
+    assert serial_problem(rig, "SU00", {}) is None, "a head without a serial number is no problem"
     sentence = serial_problem(rig, "SU00", {"serial": "M-SU01"})
     assert sentence is not None
     assert "M-SU00" in sentence and "M-SU01" in sentence and "connect" in sentence
 
 
-def test_a_lens_or_probe_stated_to_be_another_than_the_calibrated_one_is_told_with_both() -> None:
+def test_a_lens_or_probe_other_than_the_calibrated_one_is_reported_with_both_serials() -> None:
     content = copy.deepcopy(GOOD)
     content["serials"] = {"lens": {"0": "L-2"}, "probe": {"0": "PT-17", "1": "PT-19"}}
     configuration, rig = from_mapping(content, Path("service.toml"))
     cone = rig.cone("0")
     lens = replace(cone.lens, serial="L-1")
     cones = tuple(replace(c, lens=lens) if c is cone else c for c in rig.cones)
-    # Of probe 1 the calibration says nothing.
+    # The calibration has no serial number of probe 1.
     made = replace(rig, cones=cones, probe_serials={"0": "PT-17"})
     (sentence,) = stated_serial_problems(configuration, made)
     assert "lens 0" in sentence and "'L-2'" in sentence and "'L-1'" in sentence

@@ -22,7 +22,7 @@ HEADS = ("SU00", "SU01", "SU10", "G")
 
 @dataclass
 class Bench:
-    """A control with a flight that says where it is, and what it sent and told."""
+    """A controller with a flight of known position; records what it sends and emits."""
 
     control: ExposureController
     flight: Any
@@ -59,7 +59,7 @@ def bench(tmp_path: Path, **section: Any) -> Bench:
     return Bench(control, flight, sent, emitted)
 
 
-def test_pan_heads_are_changed_together_and_all_of_it_is_told(tmp_path: Path) -> None:
+def test_pan_heads_are_changed_together_and_every_change_is_emitted(tmp_path: Path) -> None:
     flown = bench(tmp_path, control="automatic")
     flown.fly(1, 0.31)
     (adjust,) = flown.sent
@@ -109,7 +109,7 @@ def test_a_line_that_is_well_is_locked_and_the_next_one_is_not(tmp_path: Path) -
     assert flown.emitted[-1]["locked_on"] == "A"
     flown.fly(4, 0.31, line="B")
     assert len(flown.sent) == 2
-    # Who looks is told of the lock and of its end.
+    # The lock and its end are emitted.
     assert [one["locked_on"] for one in flown.emitted] == [None, None, "A", None, None]
     free = bench(tmp_path, control="automatic", lock="never")
     free.fly(1, 0.6)

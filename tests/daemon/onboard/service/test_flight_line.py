@@ -59,7 +59,7 @@ def test_a_resumed_line_flies_only_what_is_left(tmp_path: Path) -> None:
     assert [order.number for order in orders] == [3]
 
 
-def test_a_full_disk_orders_nothing_and_says_what_to_do(tmp_path: Path) -> None:
+def test_a_full_disk_orders_nothing_and_states_the_action(tmp_path: Path) -> None:
     orders, complaints = fly(make_line(tmp_path, count=2, reserve=1 << 60))
     assert not orders
     assert "free" in complaints[0]
@@ -85,7 +85,7 @@ def test_exposures_carry_the_ids_of_the_planned_line_and_its_strip(tmp_path: Pat
         assert (opened.line_id, opened.strip_id) == expected
 
 
-def test_what_is_absent_is_said_in_words(tmp_path: Path) -> None:
+def test_absent_devices_are_named(tmp_path: Path) -> None:
     absent = make_line(tmp_path, count=1).absent(lambda _: False, has_trigger=False)
     assert absent[:2] == ["head SU00", "trigger"]
     assert "temperature of 0" in absent
@@ -98,7 +98,7 @@ def test_a_position_counts_for_its_own_instant_once_the_clock_knows_it(tmp_path:
     line._flight.navigation(sample)
     placed = line._position()
     assert placed is not None
-    # Messages alone do not tell how late they are.
+    # Messages alone do not reveal their delay.
     assert placed.mono_ns == sample.mono_ns
     clock = line._flight.clock
     for second in range(-3, 1):

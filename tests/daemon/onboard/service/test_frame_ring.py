@@ -34,7 +34,7 @@ def start(ring: FrameRing) -> ChildProcess:
 
 
 def message_of(child: ChildProcess) -> object:
-    assert child.connection.poll(WAIT_S), "the child said nothing in time"
+    assert child.connection.poll(WAIT_S), "the child sent nothing in time"
     return child.connection.recv()
 
 
@@ -75,12 +75,12 @@ def test_a_child_dies_with_its_parent(tmp_path: Path) -> None:
 
     code = (
         "from daemon.onboard.capture.frame_ring import FrameRing\n"
-        "from tests.daemon.onboard.service.test_frame_ring import start, said\n"
+        "from tests.daemon.onboard.service.test_frame_ring import start, message_of\n"
         "from daemon.onboard.service.messages import Ping\n"
         "import signal\n"
         "if __name__ == '__main__':\n"
         "    child = start(FrameRing.create('SU00', 2, 64))\n"
-        "    said(child)\n"
+        "    message_of(child)\n"
         "    print(child.process.pid, flush=True)\n"
         "    signal.pause()\n"
     )

@@ -69,7 +69,7 @@ def planted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Planted
     yield made
 
 
-def test_check_says_so_and_the_flight_is_not_refused(
+def test_check_reports_it_and_the_flight_is_not_refused(
     planted: Planted, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name, text in (("ROUTES", ROUTES), ("NEIGHBOURS", HEADER)):

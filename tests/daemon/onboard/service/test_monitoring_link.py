@@ -1,4 +1,4 @@
-"""What a busy watch process could not be told at once it is told later, in order; nothing waits."""
+"""Events for a busy watch process are sent later, in order; nothing waits."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def link() -> tuple[MonitoringLink, Line]:
     return MonitoringLink(cast(Supervisor, line), PLAN), line
 
 
-def test_events_that_did_not_fit_are_told_before_the_next_one() -> None:
+def test_events_that_did_not_fit_are_sent_before_the_next_one() -> None:
     seen, line = link()
     line.is_full = True
     for number in (1, 2, 3):
@@ -66,7 +66,7 @@ def test_what_is_held_is_bounded_and_one_that_never_fits_holds_up_nothing() -> N
     assert seen.dropped == 7
 
 
-def test_a_process_started_anew_is_told_what_still_holds() -> None:
+def test_a_restarted_process_receives_the_persistent_events() -> None:
     seen, line = link()
     seen.emit({"event": "mission", "number": 1})
     seen.emit({"event": "bound", "device": "SU02", "number": 2})
@@ -80,7 +80,7 @@ def test_a_process_started_anew_is_told_what_still_holds() -> None:
 
 
 @pytest.mark.trust
-def test_a_temperature_that_is_old_is_not_told_as_the_present_one() -> None:
+def test_an_old_temperature_is_not_reported_as_the_present_one() -> None:
     readings = [
         TemperatureRecord("0", 21.5, 9_000_000_000),
         TemperatureRecord("1", 22.5, 11 * 10**9),

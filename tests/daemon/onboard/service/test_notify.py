@@ -1,4 +1,4 @@
-"""systemd is told the truth, and silence where nobody listens costs nothing."""
+"""Messages to systemd are correct, and without NOTIFY_SOCKET nothing is sent."""
 
 from __future__ import annotations
 

@@ -120,8 +120,8 @@ def hostile() -> dict[str, bytes]:
         "a timestamp": msgpack.packb(["pong", {"a": msgpack.Timestamp(1)}]),
         "bytes": command(by=b"anna"),
         "no utf-8": b"\x92\xa4pong\x81\xa1\xff\x01",
-        "a lone surrogate": msgpack.packb(
-            ["told", {"event": "signing-state", "sentence": "\ud800"}],
+        "a single surrogate": msgpack.packb(
+            ["event", {"event": "signing-state", "sentence": "\ud800"}],
             unicode_errors="surrogatepass",
         ),
         "a key twice": b"\x92\xa4pong\x82\xa1a\x01\xa1a\x02",
@@ -137,7 +137,9 @@ def hostile() -> dict[str, bytes]:
         "a name that is a list": command(name=["arm"]),
         "a role that is nothing": command(role=None),
         "a name of 201": command(by="a" * (NAME_MAX + 1)),
-        "a sentence of 4,001": packed("told", event="signing-state", sentence="a" * (TEXT_MAX + 1)),
+        "a sentence of 4,001": packed(
+            "event", event="signing-state", sentence="a" * (TEXT_MAX + 1)
+        ),
         "arguments that are a list": command(arguments=[1]),
         "an argument that is a map": command(arguments={"count": {"a": 1}}),
         "an argument NaN": command(arguments={"interval_s": float("nan")}),
@@ -148,17 +150,17 @@ def hostile() -> dict[str, bytes]:
         "a count of 0": packed(
             "refused", name="a", by="a", role="a", address="a", sentence="a", count=0
         ),
-        "an event of the service": packed("told", event="ready", absent=[]),
-        "an event without a name": packed("told", sentence="x"),
-        "an event whose name is a number": packed("told", event=1),
+        "an event of the service": packed("event", event="ready", absent=[]),
+        "an event without a name": packed("event", sentence="x"),
+        "an event whose name is a number": packed("event", event=1),
         "a head that is absent": packed(
-            "told", event="device", device="SU00", name="absent", fault=True, sentence="x"
+            "event", event="device", device="SU00", name="absent", fault=True, sentence="x"
         ),
         "a device that is found": packed(
-            "told", event="device", device="tokens", name="opened", fault=True, sentence="x"
+            "event", event="device", device="tokens", name="opened", fault=True, sentence="x"
         ),
-        "an instant of its own": packed("told", event="signing-state", sentence="x", mono_ns="1"),
-        "a port of 65,536": packed("told", event="watching", host="::", port=65_536, tls=True),
+        "an instant of its own": packed("event", event="signing-state", sentence="x", mono_ns="1"),
+        "a port of 65,536": packed("event", event="watching", host="::", port=65_536, tls=True),
     }
 
 
@@ -184,12 +186,12 @@ def received(ours: PageProcess) -> list[object]:
 
 
 @pytest.mark.parametrize("message", FROM_PAGE, ids=lambda one: type(one).__name__)
-def test_what_the_pages_process_says_arrives_as_it_was(message: object) -> None:
+def test_messages_of_the_pages_process_arrive_unchanged(message: object) -> None:
     assert unpack_from_page(pack_from_page(message)) == message
 
 
 @pytest.mark.parametrize("message", TO_PAGE, ids=lambda one: type(one).__name__)
-def test_what_the_service_says_arrives_as_it_was(message: object) -> None:
+def test_messages_of_the_service_arrive_unchanged(message: object) -> None:
     assert unpack_to_page(pack_to_page(message)) == message
 
 
@@ -200,7 +202,7 @@ def test_a_text_that_is_too_long_or_cannot_be_packed_is_cut_before_it_is_sent() 
     assert (len(sent.by), len(sent.sentence), sent.address) == (NAME_MAX, TEXT_MAX, "\\ud800")
 
 
-def test_what_cannot_be_told_is_an_error_and_is_never_sent() -> None:
+def test_an_invalid_message_is_an_error_and_is_never_sent() -> None:
     with link() as (ours, theirs):
         for event in ({"a": object()}, {"a": 2**70}, {"a": "x" * TO_PAGE_MAX_BYTES}):
             with pytest.raises(ValueError, match=r".+"):
@@ -330,7 +332,7 @@ def hostile_page(link: PageConnection) -> None:
 
 @pytest.mark.trust
 @pytest.mark.attack
-def test_the_supervisor_outlives_a_hostile_page_process_and_hears_its_valid_messages() -> None:
+def test_the_supervisor_survives_a_hostile_page_process_and_receives_its_valid_messages() -> None:
     messages: list[object] = []
     died: list[str] = []
 

@@ -72,7 +72,7 @@ def test_two_tasks_never_share_a_pipeline(pipeline: Pipeline) -> None:
     assert len(used) == 2
 
 
-def test_a_task_that_fails_says_so_and_frees_its_lane(pipeline: Pipeline) -> None:
+def test_a_task_that_fails_raises_and_frees_its_pipeline(pipeline: Pipeline) -> None:
     pool = PipelinePool(pipeline, 1)
 
     def fail(processor: Pipeline) -> None:
@@ -84,7 +84,7 @@ def test_a_task_that_fails_says_so_and_frees_its_lane(pipeline: Pipeline) -> Non
     pool.end()
 
 
-def test_a_thread_pool_that_two_may_not_enter_gets_one_lane(
+def test_a_threading_layer_for_one_thread_gets_one_pipeline(
     pipeline: Pipeline, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     only_numbas_own = SimpleNamespace(threading_layer=lambda: "workqueue")

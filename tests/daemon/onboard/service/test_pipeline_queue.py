@@ -38,7 +38,7 @@ def exposure(number: int) -> Any:
     return SimpleNamespace(number=number)
 
 
-def test_an_exposure_that_is_foreseen_is_begun_once_and_settled_when_sealed() -> None:
+def test_a_provisional_exposure_is_begun_once_and_finalized_when_sealed() -> None:
     bench = Bench()
     bench.queue.dispatch(WorkerReady(0.0))
     bench.queue.retain(1, {"SU00": 2})
@@ -59,7 +59,7 @@ def test_one_that_was_still_waiting_when_it_was_sealed_is_begun_as_sealed() -> N
     assert bench.worker == [Process(first, None, is_sealed=True)]
 
 
-def test_one_that_is_never_sealed_leaves_its_lane_and_its_memory() -> None:
+def test_an_exposure_that_is_never_sealed_frees_its_pipeline_and_memory() -> None:
     bench = Bench()
     bench.queue.dispatch(WorkerReady(0.0))
     bench.queue.retain(1, {"SU00": 0})

@@ -111,6 +111,6 @@ def test_differences_name_what_was_added_and_taken_away(tmp_path: Path) -> None:
     ]
 
 
-def test_nobody_is_said_to_start_the_service_again_where_nobody_does() -> None:
+def test_no_automatic_restart_is_announced_without_systemd() -> None:
     assert "systemd" not in Notifier("").restart and "syntopic run" in Notifier("").restart
     assert "systemd starts" in Notifier("/run/systemd/notify").restart

@@ -1,4 +1,4 @@
-"""What a process said before it ended is taken in, whoever notices its end first."""
+"""Messages sent before a process ended are received, whoever detects its end first."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.daemon.onboard.service.flight_parts import ThreadChild
 
 
 def refusing(link: ServiceConnection, *_: Any) -> None:
-    """A process that says two things and ends."""
+    """A process that sends two messages and ends."""
     link.send(WorkerBuilt())
     link.send(WorkerRefused("no calibration"))
 

@@ -1,4 +1,4 @@
-"""The worker tells a verdict early, and writes only what is sealed and as it is sealed."""
+"""The worker sends a verdict early, and writes products of sealed records only."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ OTHERWISE = Exposure(number=1, mark_source="interpolated")
 
 
 class Bench:
-    """A desk whose products are the source of an exposure's time; what it said and wrote."""
+    """A worker context whose products are the source of an exposure's time; records its output."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.sent: list[Any] = []
@@ -49,7 +49,7 @@ class Bench:
         return {}
 
     def work(self, finalized: RecordFinalized | None) -> None:
-        """One unsealed exposure, of which this is heard, or nothing before the end."""
+        """One unsealed exposure that is finalized so, or not before the end."""
         order = Process(PROVISIONAL, None, is_sealed=False)
         self.context.begin(order)
         if finalized is not None:
@@ -73,13 +73,13 @@ def bench(monkeypatch: pytest.MonkeyPatch) -> Bench:
     return Bench(monkeypatch)
 
 
-def test_what_is_sealed_as_it_was_foreseen_is_written_as_it_was_made(bench: Bench) -> None:
+def test_products_of_a_confirmed_provisional_record_are_written(bench: Bench) -> None:
     bench.work(RecordFinalized(1, PROVISIONAL))
     assert bench.verdicts == ["event-mark"] and bench.written == ["event-mark"]
     assert isinstance(bench.sent[-1], Processed)
 
 
-def test_what_is_sealed_otherwise_is_made_and_told_anew(bench: Bench) -> None:
+def test_products_of_a_changed_record_are_computed_and_reported_again(bench: Bench) -> None:
     bench.work(RecordFinalized(1, OTHERWISE))
     assert bench.verdicts == ["event-mark", "interpolated"] and bench.written == ["interpolated"]
 

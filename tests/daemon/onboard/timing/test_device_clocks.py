@@ -1,4 +1,4 @@
-"""A device's clock from round trips: the shortest tell most, and the sigma is true."""
+"""A device's clock from round trips: the shortest are used, and the sigma is correct."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_errors_of_a_hundred_device_clocks_lie_inside_their_sigmas(grid_ns: int)
     assert np.median(stated) < 60_000, "a tenth of what one round trip leaves open"
 
 
-def test_a_device_that_starts_again_is_learned_anew() -> None:
+def test_the_clock_of_a_restarted_device_is_estimated_again() -> None:
     clocks = DeviceClocks()
     for second in range(30):
         clocks.read(ClockReading("SU00", 500 * NS + second * NS, second * NS, 50_000))

@@ -1,4 +1,4 @@
-"""The host's clock learns GPS time from marks, and says how well it knows it."""
+"""The host's clock estimates GPS time from marks, with its uncertainty."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ NS = 1_000_000_000
 OFFSET_NS = 1_400_000_000_000_000_000
 
 
-def test_before_anything_was_heard_no_time_is_told() -> None:
+def test_before_the_first_input_there_is_no_time() -> None:
     assert GpsClock().gps_at(5) is None
 
 
@@ -103,7 +103,7 @@ def test_edges_that_are_missing_for_minutes_are_still_the_right_seconds() -> Non
     assert abs(estimate.gps_ns - OFFSET_NS - 322 * NS) < 1_000_000
 
 
-def test_a_host_clock_that_steps_against_the_edges_is_followed_and_told() -> None:
+def test_a_host_clock_that_steps_against_the_edges_is_followed_and_reported() -> None:
     clock = GpsClock()
     for k in range(3):
         clock.message_arrived(OFFSET_NS + k * 200_000_000, k * 200_000_000 + 60_000_000)

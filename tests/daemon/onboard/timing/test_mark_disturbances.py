@@ -198,7 +198,7 @@ def test_a_mark_for_a_sealed_exposure_is_late_and_changes_nothing() -> None:
     bench.assert_right(1, 3)
 
 
-def test_of_two_edges_in_one_epoch_the_receiver_tells_the_last_and_the_first_stays_unmatched() -> (
+def test_of_two_edges_in_one_epoch_the_receiver_sends_the_last_and_the_first_stays_unmatched() -> (
     None
 ):
     bench = Bench("ublox", ORDINARY_NS)
@@ -236,7 +236,7 @@ def test_the_second_of_an_edge_is_named_by_messages_however_late_they_are(late_m
     assert abs(estimate.gps_ns - (ORDINARY_NS - 250_000_000 + 4 * NS)) < 10_000
 
 
-def test_a_second_that_messages_cannot_name_stays_unnamed_until_a_mark_says_it() -> None:
+def test_a_second_that_messages_cannot_resolve_stays_unresolved_until_a_mark() -> None:
     clock = GpsClock()
     epoch_ns = ORDINARY_NS - 250_000_000
     for k in range(5):

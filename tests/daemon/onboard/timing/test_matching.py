@@ -142,11 +142,11 @@ def test_a_mark_of_no_pulse_is_spurious() -> None:
     matching = matcher(range(1, 4))
     matching.mark(mark(1))
     stray = mark(2, gps_ns=mark(2).gps_ns + NS)
-    assert matching.mark(stray).cause is Cause.PENDING, "a pulse may still be told of"
+    assert matching.mark(stray).cause is Cause.PENDING, "its pulse may still arrive"
     assert matching.marks.give_up(9 * NS) == [stray]
 
 
-def test_where_the_clock_is_off_two_marks_that_agree_mend_it_and_none_is_shifted() -> None:
+def test_if_the_clock_is_off_two_agreeing_marks_correct_it_and_none_is_shifted() -> None:
     matching = matcher(range(1, 6))
     matching.mark(mark(1))
     for number in (2, 3, 4, 5):

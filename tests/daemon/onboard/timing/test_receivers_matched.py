@@ -1,6 +1,6 @@
-"""Marks of every kind of receiver, as their drivers hear them on the wire, find their own pulses.
+"""Marks of every kind of receiver, as their drivers receive them, match their own pulses.
 
-A flight without pictures: pulses are given, the emulated receiver stamps their strobes and tells
+A flight without pictures: pulses are given, the emulated receiver stamps their strobes and sends
 them over a real line, the driver reads it, and the service's own clock and matching decide.
 """
 
@@ -61,7 +61,7 @@ class Chain:
         self.thread = threading.Thread(target=run, args=(self.records.put,), daemon=True)
 
     def listen_until(self, mono_ns: int) -> None:
-        """Hand on what is heard, as the service does."""
+        """Pass on what is received, as the service does."""
         while (left_s := (mono_ns - time.monotonic_ns()) * 1e-9) > 0:
             try:
                 record = self.records.get(timeout=left_s)
