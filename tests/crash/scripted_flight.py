@@ -159,7 +159,7 @@ class ScriptedService:
         return next(a for a in reversed(self._answers) if isinstance(a, kinds))
 
     def _process(self, number: int) -> Iterator[object]:
-        """What a worker does in parallel; the second exposure twice, as when it is processed again."""
+        """What a worker does in parallel; the second exposure is processed twice."""
         for _ in range(2 if number == 2 else 1):
             pan = np.full((4, 6), number, np.uint16)
             try:

@@ -245,7 +245,7 @@ VARIANTS: Mapping[str, Callable[[Disk], Tree]] = {
     "only the last change survives": lambda disk: disk.left(select_last, select_last),
     "all but the first survive": lambda disk: disk.left(select_all_but_first, select_all_but_first),
 }
-"""The bounded set of states tried at each cut, in addition to a torn write and arbitrary survivors."""
+"""States tried at each cut, in addition to a torn write and arbitrary survivors."""
 
 
 def variants(disk: Disk, names: Collection[str]) -> Iterator[tuple[str, Tree]]:

@@ -1,4 +1,4 @@
-"""The disk refuses and stalls under a flying service: it stays alive, and keeps everything it acknowledged."""
+"""The disk refuses and stalls in flight: the service survives and keeps acknowledged data."""
 
 from __future__ import annotations
 

@@ -28,9 +28,9 @@ def kill_in_flight(
 ) -> dict[str, object]:
     """Kill a flight so often; every so many lives one lives until it has stored something.
 
-    What was reported stored, sealed or triggered is compared with the disk at the end; the ledger and
-    `syntopic verify` as well, and what the logs hold of every life is replayed. `scene` is how many
-    exposures of ground the emulator builds, `scenes` where it keeps them.
+    What was reported stored, sealed or triggered is compared with the disk at the end; the ledger
+    and `syntopic verify` as well, and what the logs hold of every life is replayed. `scene` is how
+    many exposures of ground the emulator builds, `scenes` where it keeps them.
     """
     rng = random.Random(seed)
     rig = "ultracam-l-mini"

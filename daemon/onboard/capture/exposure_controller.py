@@ -156,8 +156,8 @@ class ExposureController:
     def command(self, requested: Mapping[str, Any], by: str) -> str | None:
         """Apply an operator's request; return the reason if it is refused, else None.
 
-        `requested` may hold `control`, and `exposure_time_us`, `gain_db`, `tdi_shifts` for the group
-        `of`, or for all groups. Manual settings switch automatic control off.
+        `requested` may hold `control`, and `exposure_time_us`, `gain_db`, `tdi_shifts` for the
+        group `of`, or for all groups. Manual settings switch automatic control off.
         """
         keys = ("exposure_time_us", "gain_db", "tdi_shifts")
         given = {key: requested[key] for key in keys if requested.get(key) is not None}

@@ -1,7 +1,7 @@
 """Prerequisites of arming: which ones are missing, and what to do about each.
 
-Pure functions of `Readiness`. `daemon.onboard.service.command_execution` accepts overrides; they are
-recorded by `override_message` and `overrides_content`.
+Pure functions of `Readiness`. `daemon.onboard.service.command_execution` accepts overrides; they
+are recorded by `override_message` and `overrides_content`.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ FILE = "overrides.json"
 class Readiness:
     """State of everything that arming requires.
 
-    `absent` are the absent devices; `exposures_planned` are the planned exposures left, 1 without a plan.
-    `position_age_s` is None before the first position. `probes_c` holds a reading and its age in
-    seconds for each probe of the rig, None for one never read. `serials_unreported` are heads that
-    report no serial number although the calibration has one; `serials_mismatched` are sentences
-    about parts whose stated serial number is not the calibrated one.
+    `absent` are the absent devices; `exposures_planned` are the planned exposures left, 1 without a
+    plan. `position_age_s` is None before the first position. `probes_c` holds a reading and its age
+    in seconds for each probe of the rig, None for one never read. `serials_unreported` are heads
+    that report no serial number although the calibration has one; `serials_mismatched` are
+    sentences about parts whose stated serial number is not the calibrated one.
     """
 
     has_kernels: bool
@@ -53,11 +53,11 @@ class MissingPrerequisite:
 
     name: str
     sentence: str
-    cure: str
+    action: str
     may_be_overridden: bool = True
 
     def __str__(self) -> str:
-        return f"{self.sentence} ({self.cure})"
+        return f"{self.sentence} ({self.action})"
 
 
 def missing_prerequisites(
@@ -76,11 +76,11 @@ def missing_prerequisites(
     ]
     if readiness.serials_unreported:
         heads = ", ".join(readiness.serials_unreported)
-        cure = "compare their labels with the calibration"
-        found.append(MissingPrerequisite("arming-serial", f"no serial number from {heads}", cure))
-    cure = "fit that part, or fly with a calibration of this one"
+        action = "compare their labels with the calibration"
+        found.append(MissingPrerequisite("arming-serial", f"no serial number from {heads}", action))
+    action = "fit that part, or fly with a calibration of this one"
     found += [
-        MissingPrerequisite("arming-serial", sentence, cure)
+        MissingPrerequisite("arming-serial", sentence, action)
         for sentence in readiness.serials_mismatched
     ]
     return tuple(found)
@@ -121,10 +121,10 @@ def _kernels(readiness: Readiness) -> list[MissingPrerequisite]:
     if readiness.has_kernels:
         return []
     # Nothing compiles in flight, so this prerequisite cannot be overridden.
-    cure = "wait; where this takes minutes, run syntopic kernels on the ground"
+    action = "wait; where this takes minutes, run syntopic kernels on the ground"
     return [
         MissingPrerequisite(
-            "arming-kernels", "kernels are not loaded", cure, may_be_overridden=False
+            "arming-kernels", "kernels are not loaded", action, may_be_overridden=False
         )
     ]
 
@@ -142,12 +142,12 @@ def _time(readiness: Readiness, limits: LimitsSection) -> list[MissingPrerequisi
         return []
     found = []
     if not readiness.has_time:
-        cure = "wait for the receiver's fix; check its antenna"
-        found.append(MissingPrerequisite("arming-time", "GPS time is not known", cure))
+        action = "wait for the receiver's fix; check its antenna"
+        found.append(MissingPrerequisite("arming-time", "GPS time is not known", action))
     age_s = readiness.position_age_s
     if age_s is None or not readiness.has_fix:
-        cure = "wait for the receiver's fix; check its antenna"
-        found.append(MissingPrerequisite("arming-navigation", "no position", cure))
+        action = "wait for the receiver's fix; check its antenna"
+        found.append(MissingPrerequisite("arming-navigation", "no position", action))
     elif age_s > limits.navigation_stale_s:
         sentence = f"the position is {age_s:.0f} s old"
         found.append(
@@ -164,12 +164,12 @@ def _temperatures(readiness: Readiness, limits: LimitsSection) -> list[MissingPr
         elif reading[1] > limits.temperature_stale_s:
             outdated.append(probe)
     found = []
-    cure = "check the probes and their module"
+    action = "check the probes and their module"
     if missing:
         sentence = f"no temperature of probe {', '.join(missing)}"
-        found.append(MissingPrerequisite("arming-temperature", sentence, cure))
+        found.append(MissingPrerequisite("arming-temperature", sentence, action))
     if outdated:
         limit_s = limits.temperature_stale_s
         sentence = f"temperature of probe {', '.join(outdated)} older than {limit_s:g} s"
-        found.append(MissingPrerequisite("arming-temperature", sentence, cure))
+        found.append(MissingPrerequisite("arming-temperature", sentence, action))
     return found

@@ -17,8 +17,8 @@ FILE = "unhandled-faults.json"
 FAULTS_MAX = 200
 DELIVERING = frozenset({"opened", "recovered"})
 UNAVAILABLE = frozenset({"absent", "lost", "silent", "held-by-another"})
-"""Names of device events after which a device delivers, or does not. Other events report problems of
-a device that delivers."""
+"""Names of device events after which a device delivers, or does not. Other events report
+problems of a device that delivers."""
 SEARCHING, FIXED = "searching", "fixed"
 """The same for a receiver that is open: without a fix, and with one."""
 FILE_MAX_BYTES = 1_000_000
@@ -26,7 +26,7 @@ FILE_MAX_BYTES = 1_000_000
 
 @dataclass(frozen=True)
 class LatchedFault:
-    """A fault. `id` names it; `stands` is true while it is active; `previous` marks an earlier run."""
+    """A fault. `stands` is true while it is active; `previous` marks an earlier run."""
 
     id: str
     device: str
@@ -65,7 +65,7 @@ class FaultLatches:
             self._latches[fault] = replace(found, stands=False)
 
     def acknowledge(self, fault: str) -> bool:
-        """Acknowledge a fault. A past fault leaves the list; an active one stays. False if unknown."""
+        """Acknowledge a fault. A past fault is removed, an active one stays. False if unknown."""
         found = self._latches.get(fault)
         if found is None:
             return False

@@ -95,9 +95,9 @@ class Flight:
     """Exposures between trigger and seal.
 
     Every method that takes an instant takes `mono_ns`. Slots of frames that are not used are
-    collected in `idle_slots`, to be returned to the heads. Marks that became final after their arrival
-    are in `resolved_marks`. Heads in `absent_heads` are known to be lost; their frames are not awaited.
-    While `disk_is_low` is set, ordered exposures get the flag DISK_LOW.
+    collected in `idle_slots`, to be returned to the heads. Marks that became final after their
+    arrival are in `resolved_marks`. Heads in `absent_heads` are known to be lost; their frames are
+    not awaited. While `disk_is_low` is set, ordered exposures get the flag DISK_LOW.
     """
 
     def __init__(

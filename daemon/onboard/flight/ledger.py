@@ -1,7 +1,8 @@
 """The ledger: every trigger, frame and event mark is accounted for.
 
-Pure counting, without clock, disk or threads. One account counts what arrived, the other its causes;
-`imbalances` compares them. The states of an exposure are in `daemon.onboard.flight.transitions`.
+Pure counting, without clock, disk or threads. One account counts what arrived, the other its
+causes; `imbalances` compares them. The states of an exposure are in
+`daemon.onboard.flight.transitions`.
 
     triggers              = open + complete + degraded + lost
     received (each head)  = pending + used + late + duplicate + corrupt + spurious

@@ -1,7 +1,7 @@
 """Probe readings of the last minutes, and the readings at an exposure.
 
-A sensor with a thermal lag gets its own reading in addition to that of its probe: the probe's history
-through a first-order lag.
+A sensor with a thermal lag gets its own reading in addition to that of its probe: the probe's
+history through a first-order lag.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ class ExposureState(enum.Enum):
 
 
 class StorageState(enum.Enum):
-    """Durability of an exposure. STORED: pixels durable. SEALED: the record is final and durable."""
+    """Durability of an exposure. STORED: pixels durable. SEALED: record final and durable."""
 
     VOLATILE = "volatile"
     STORED = "stored"

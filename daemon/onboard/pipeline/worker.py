@@ -1,7 +1,7 @@
 """The pipeline worker: Level-0 in, Level-2 products and a verdict out.
 
-It reads an exposure from shared memory if its frames are still there, else from disk. It never delays
-capture. Several exposures are processed at a time (`daemon.onboard.pipeline.pipeline_pool`).
+It reads an exposure from shared memory if its frames are still there, else from disk. It never
+delays capture. Several exposures are processed at a time (`daemon.onboard.pipeline.pipeline_pool`).
 """
 
 from __future__ import annotations
@@ -184,7 +184,8 @@ def report_unprocessed(rig: Rig, exposure: Exposure, flags: Flag) -> dict[str, A
 class WorkerContext:
     """Shared state of the exposures in the pipeline.
 
-    `mission` changes when another disk becomes the leading one; it is looked up at each read and write.
+    `mission` changes when another disk becomes the leading one; it is looked up at each read and
+    write.
     """
 
     link: ServiceConnection

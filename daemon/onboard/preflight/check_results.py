@@ -26,9 +26,9 @@ class CheckOutcome(enum.StrEnum):
 class CheckResult:
     """One item: its kind and name, the outcome, and a sentence where it is not a plain pass.
 
-    `is_blocking`: `syntopic run` refuses to start, with the same sentence. Any other failure is emitted
-    as an event with the same sentence, and the service flies without the item.
-    `found` are the properties that the item reported (model, serial, ...).
+    `is_blocking`: `syntopic run` refuses to start, with the same sentence. Any other failure is
+    emitted as an event with the same sentence, and the service flies without the item. `found` are
+    the properties that the item reported (model, serial, ...).
     """
 
     kind: str

@@ -1,7 +1,7 @@
 """Prerequisites that are checked before any device is opened, by `run` at its start and by `check`.
 
-Both call `prerequisites`, so that their results agree. `daemon.onboard.capture.devices` evaluates the
-properties of devices, `daemon.onboard.flight.arming` the prerequisites of arming.
+Both call `prerequisites`, so that their results agree. `daemon.onboard.capture.devices` evaluates
+the properties of devices, `daemon.onboard.flight.arming` the prerequisites of arming.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ DIFFERENCES_NAMED_MAX: Final = 6
 class Resumption:
     """How a mission is flown on.
 
-    `refusal` is why it cannot be, with the cure; empty where it can.
+    `refusal` is the reason and the action; empty if it can be resumed.
     """
 
     rig: Rig

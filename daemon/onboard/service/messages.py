@@ -1,7 +1,7 @@
 """Messages between the service and its child processes: small frozen dataclasses.
 
-Pixels are never sent; a frame is identified by its slot in the shared memory of its head. This module
-has only light imports, so that every process can load it.
+Pixels are never sent; a frame is identified by its slot in the shared memory of its head. This
+module has only light imports, so that every process can load it.
 """
 
 from __future__ import annotations
@@ -326,7 +326,8 @@ class UseMission:
 class Process:
     """Process this exposure; `slots` by head, or None to read Level-0.
 
-    While it is not sealed, its verdict may be sent, but no product is written; `RecordFinalized` follows.
+    While it is not sealed, its verdict may be sent, but no product is written; `RecordFinalized`
+    follows.
     """
 
     exposure: Exposure
@@ -347,7 +348,7 @@ class RecordFinalized:
 
 @dataclass(frozen=True)
 class WorkerBuilt:
-    """The pipeline of this rig is built, its calibrations are read; it waits for `BeginProcessing`."""
+    """The pipeline is built and its calibrations are read; it waits for `BeginProcessing`."""
 
 
 @dataclass(frozen=True)

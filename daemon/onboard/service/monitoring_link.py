@@ -1,7 +1,7 @@
 """The service's side of monitoring: events to the watch process, which may die without harm.
 
-Events are buffered and finally dropped; the service never waits. What watchers see and how commands come in
-is in `daemon.onboard.monitoring`.
+Events are buffered and finally dropped; the service never waits. What watchers see and how commands
+come in is in `daemon.onboard.monitoring`.
 """
 
 from __future__ import annotations

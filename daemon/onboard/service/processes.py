@@ -1,7 +1,7 @@
 """Child processes of the service: spawned, never forked, and dead when the service is.
 
-A child is a function "module:name" that gets a `ServiceConnection` and its own arguments. It is named, not
-imported, so that what a child needs is never loaded into the service.
+A child is a function "module:name" that gets a `ServiceConnection` and its own arguments. It is
+named, not imported, so that what a child needs is never loaded into the service.
 """
 
 from __future__ import annotations

@@ -411,7 +411,7 @@ class Service(MessageDispatcher):
         return self.latches.acknowledge(fault)
 
     def land(self, *, new_mission: bool = False) -> None:
-        """End in good order: open exposures are sealed first. `new_mission`: another one follows."""
+        """End the flight: open exposures are sealed first. `new_mission`: another one follows."""
         self.continues = new_mission
         self.stopping.set()
 

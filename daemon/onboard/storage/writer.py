@@ -138,7 +138,7 @@ def _changed(event: DiskEvent) -> DiskChanged:
 
 def _index_event(backlog: int) -> ServiceEvent:
     sentence = (
-        f"index or chain.jsonl refused {backlog} changes; the data are safe. Check the disk. Retrying"
+        f"index or chain.jsonl refused {backlog} changes; data are safe. Check the disk. Retrying"
         if backlog
         else "index and chain.jsonl are up to date again"
     )

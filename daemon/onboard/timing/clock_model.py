@@ -1,7 +1,8 @@
 """One clock modelled by another: offset, rate and their uncertainty from pairs of readings.
 
-The clock that is read is an oscillator whose rate wanders. The amount of wander, and the scale of the
-stated sigmas, are estimated from the pairs. The model is independent of the source of the pairs.
+The clock that is read is an oscillator whose rate wanders. The amount of wander, and the scale of
+the stated sigmas, are estimated from the pairs. The model is independent of the source of the
+pairs.
 
 Source: docs/mathematics/time.md#clock-model; Rasmussen and Williams (2006), section 2.7.
 """

@@ -1,9 +1,9 @@
 """GPS time on the host's monotonic clock, and its uncertainty at every instant.
 
 There are three sources. Edges of a pulse per second are exact, but their second is unknown. Event
-marks of pulses that the host gave are as accurate as the pulse's host time. Navigation messages come
-up to 700 ms late and only resolve the second. `daemon.onboard.timing.clock_model` is the model of two
-clocks.
+marks of pulses that the host gave are as accurate as the pulse's host time. Navigation messages
+come up to 700 ms late and only resolve the second. `daemon.onboard.timing.clock_model` is the model
+of two clocks.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class GpsEstimate:
 
 @dataclass(frozen=True)
 class ClockEvent:
-    """An event of the clock: its stable name, whether it is a fault, and a sentence with the action."""
+    """An event of the clock: stable name, whether it is a fault, and a sentence with the action."""
 
     name: str
     is_fault: bool
@@ -394,7 +394,7 @@ class GpsClock:
         return Estimate(resolved_ns, estimate.sigma_ns, estimate.gap_ns)
 
     def _resolve_second(self) -> None:
-        """Resolve the second of the edges from messages, if they are unambiguous and no mark did."""
+        """Resolve the second of the edges from messages, if they are unambiguous."""
         if self._second is not None or len(self._messages) < MESSAGES_TO_RESOLVE_SECOND:
             return
         offsets_ns = []

@@ -1,4 +1,4 @@
-"""A service is armed when nothing is missing; what is, is named with its cure."""
+"""A service is armed when nothing is missing; a missing prerequisite is named with its action."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_nothing_is_missing_where_all_is_there() -> None:
     [
         ({"has_kernels": False}, "arming-kernels", "kernels"),
         ({"absent": ["head SU02"]}, "arming-device", "no head SU02"),
-        ({"exposures_left": 399}, "arming-disk", "room for 399 of 400"),
+        ({"exposures_left": 399}, "arming-disk", "space for 399 of 400"),
         ({"has_time": False}, "arming-time", "GPS time"),
         ({"position_age_s": None}, "arming-navigation", "no position"),
         ({"has_fix": False}, "arming-navigation", "no position"),
@@ -60,7 +60,7 @@ def test_each_thing_that_is_missing_is_named_with_its_cure(
 ) -> None:
     (item,) = missing_prerequisites(replace(READY, **change), LimitsSection())
     assert (item.name, part in str(item)) == (name, True)
-    assert item.cure and item.cure in str(item)
+    assert item.action and item.action in str(item)
     assert item.may_be_overridden is (name != "arming-kernels")
     assert entry_of(item.name) is not None
 

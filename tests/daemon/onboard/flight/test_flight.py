@@ -191,7 +191,7 @@ def missing_of(flying: Flight) -> dict[int, tuple[str, Flag]]:
 def test_a_corrupt_frame_that_may_belong_to_two_exposures_is_reported_at_both() -> None:
     flying = flight()
     in_two_that_wait(flying, FrameStatus.INCOMPLETE)
-    sentence = "may be a corrupt frame that came, which may be of another exposure"
+    sentence = "may be a corrupt frame that arrived; it may belong to another exposure"
     flags = Flag.FRAME_MISSING | Flag.FRAME_AMBIGUOUS
     assert missing_of(flying) == dict.fromkeys((1, 2), (sentence, flags))
 

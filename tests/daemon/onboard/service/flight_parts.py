@@ -219,7 +219,7 @@ def _state(_gps_ns: int) -> ReceiverState:
 
 
 class ThreadChild:
-    """In the place of `daemon.onboard.service.processes.ChildProcess`: the same target, in a thread."""
+    """Replaces `daemon.onboard.service.processes.ChildProcess`: the same target, in a thread."""
 
     pause_s = 0.0
 

@@ -221,7 +221,7 @@ FAULTS = (
     # What a flight goes on without
     Fault("disk too slow", "degraded", "too slow", replaced(prerequisites, "measure_write_s", lambda *_: 1e6)),
     Fault("disk refuses to write", "degraded", "check the disk", replaced(prerequisites, "measure_write_s", no_write)),
-    Fault("disk full", "degraded", "room for 0 of 3", changed("disk_reserve_bytes = 0", f"disk_reserve_bytes = {1 << 60}")),
+    Fault("disk full", "degraded", "space for 0 of 3", changed("disk_reserve_bytes = 0", f"disk_reserve_bytes = {1 << 60}")),
     Fault("calibration expired", "degraded", "was valid", changed('date = "2026-11-01"', 'date = "2001-01-01"')),
     Fault("calibration of no head", "degraded", "SUA, SUB", radiometry()),
     Fault("head absent", "degraded", "no folder", changed(f'"frames"\n{AFTER}', f'"/nowhere"\n{AFTER}')),

@@ -79,7 +79,7 @@ def test_a_full_disk_is_dropped_once_where_the_other_has_room(seen: Seen) -> Non
     seen.free["b"] = RESERVE + NEEDED - 1
     for _ in range(2):
         seen.mirror.check()
-    assert seen.sent == [DropDisk("mirror", "it has no room for another exposure")]
+    assert seen.sent == [DropDisk("mirror", "it has no space for another exposure")]
     seen.free["a"] = seen.free["b"] = 0
     seen.mirror.check()
     assert len(seen.sent) == 1, "where both are full none is dropped"
