@@ -215,7 +215,15 @@ def _scaled(sensor: Sensor, frame: Array, factor: Any) -> Array:
 
 
 def _gain_step(emulated: EmulatedExposure, percent: float, random: Random) -> Fault:
-    name, axis = _any(random, [s.name for s in emulated.rig.sensors]), int(random.integers(0, 2))
+    return _stepped(emulated, _any(random, _pan(emulated.rig)), percent, random)
+
+
+def _gain_step_colour(emulated: EmulatedExposure, percent: float, random: Random) -> Fault:
+    return _stepped(emulated, _any(random, _colour(emulated.rig)), percent, random)
+
+
+def _stepped(emulated: EmulatedExposure, name: str, percent: float, random: Random) -> Fault:
+    axis = int(random.integers(0, 2))
     sensor = emulated.rig.sensor(name)
     size = (sensor.height_px, sensor.width_px)[axis]
     line, off = int(random.integers(size // 8, size - size // 8)), _sign(random) * percent
@@ -226,7 +234,15 @@ def _gain_step(emulated: EmulatedExposure, percent: float, random: Random) -> Fa
 
 
 def _banding(emulated: EmulatedExposure, percent: float, random: Random) -> Fault:
-    name, axis = _any(random, [s.name for s in emulated.rig.sensors]), int(random.integers(0, 2))
+    return _banded(emulated, _any(random, _pan(emulated.rig)), percent, random)
+
+
+def _banding_colour(emulated: EmulatedExposure, percent: float, random: Random) -> Fault:
+    return _banded(emulated, _any(random, _colour(emulated.rig)), percent, random)
+
+
+def _banded(emulated: EmulatedExposure, name: str, percent: float, random: Random) -> Fault:
+    axis = int(random.integers(0, 2))
     sensor = emulated.rig.sensor(name)
     size, period = (sensor.height_px, sensor.width_px)[axis], int(random.integers(8, 41))
     signal = float(np.median(emulated.frames[name])) - sensor.black_dn
@@ -241,7 +257,14 @@ def _added(sensor: Sensor, frame: Array, dn: Any) -> Array:
 
 
 def _block_offset(emulated: EmulatedExposure, dn: float, random: Random) -> Fault:
-    name = _any(random, _pan(emulated.rig))
+    return _block(emulated, _any(random, _pan(emulated.rig)), dn, random)
+
+
+def _block_offset_colour(emulated: EmulatedExposure, dn: float, random: Random) -> Fault:
+    return _block(emulated, _any(random, _colour(emulated.rig)), dn, random)
+
+
+def _block(emulated: EmulatedExposure, name: str, dn: float, random: Random) -> Fault:
     sensor = emulated.rig.sensor(name)
     part, where = _part(sensor, 4, random)
     added = np.zeros((sensor.height_px, sensor.width_px))
@@ -272,6 +295,17 @@ def _exposure_pan(emulated: EmulatedExposure, percent: float, random: Random) ->
 
 def _exposure_colour(emulated: EmulatedExposure, percent: float, random: Random) -> Fault:
     return _exposure_of(emulated, _any(random, _colour(emulated.rig)), percent, random)
+
+
+def _exposure_unknown(emulated: EmulatedExposure, _: float, random: Random) -> Fault:
+    name = _any(random, _colour(emulated.rig))
+    times = {n: t for n, t in emulated.conditions.exposure_time_s.items() if n != name}
+    conditions = replace(emulated.conditions, exposure_time_s=times)
+    sensor = emulated.rig.sensor(name)
+    changed = emulated.with_frame(name, lambda f: _scaled(sensor, f, 0.5))
+    true_causes = frozenset({name, emulated.rig.cone_of(name).name})
+    description = f"{name}: exposed half as long, not stated"
+    return Fault(replace(changed, conditions=conditions), true_causes, description)
 
 
 def _exposure_stated(emulated: EmulatedExposure, percent: float, random: Random) -> Fault:
@@ -411,12 +445,16 @@ FAULTS: Final[Mapping[str, FaultInjector]] = {
     "blur-band": _blur_band,
     "smear": _smear,
     "gain-step": _gain_step,
+    "gain-step-colour": _gain_step_colour,
     "banding": _banding,
+    "banding-colour": _banding_colour,
     "block-offset": _block_offset,
+    "block-offset-colour": _block_offset_colour,
     "clipping": _clipping,
     "exposure-pan": _exposure_pan,
     "exposure-stated": _exposure_stated,
     "exposure-colour": _exposure_colour,
+    "exposure-unknown": _exposure_unknown,
     "probes-all": _probes_all,
     "probe-one": _probe_one,
     "stale": _stale,

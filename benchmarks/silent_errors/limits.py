@@ -43,13 +43,26 @@ LIMITS: Final[Mapping[str, Limit]] = {
     "blur-region": Limit("a quarter of a PAN frame blurred", "px (sigma)", _same_limit(STITCHED, 1.5)),
     "blur-band": Limit("a colour head blurred", "px (sigma)", _same_limit(STITCHED, 1.5)),
     "smear": Limit("a PAN head smeared along or across", "px", _same_limit(STITCHED, 4.0)),
-    "gain-step": Limit("signal of a frame from one line on", "%", _same_limit(EVERY, 5.5)),
-    "banding": Limit("lines of a frame brighter, 8 to 40 in turn", "%", _same_limit(EVERY, 5.0)),
-    "block-offset": Limit("a block of a frame brighter", "DN", _same_limit(STITCHED, 40.0)),
+    "gain-step": Limit("signal of a PAN frame from one line on", "%", _same_limit(EVERY, 8.0)),
+    "gain-step-colour": Limit(
+        "signal of a colour frame from one line on", "%", {X: 16.5, L: 8.0, DMC: 8.0}
+    ),
+    "banding": Limit("lines of a PAN frame brighter, 8 to 40 in turn", "%",
+                     _same_limit(EVERY, 5.5)),
+    "banding-colour": Limit(
+        "lines of a colour frame brighter, 8 to 40 in turn", "%", {X: 8.0, L: 5.5, DMC: 5.5}
+    ),
+    "block-offset": Limit("a block of a PAN frame brighter", "DN", {X: 160.0, L: 80.0, DMC: 80.0}),
+    "block-offset-colour": Limit(
+        "a block of a colour frame brighter", "DN", {X: 80.0, L: 160.0, DMC: 160.0}
+    ),
     "clipping": Limit("pixels of a PAN head clipped below full scale", "%", _same_limit(STITCHED, 2.0)),
     "exposure-pan": Limit("exposure time of a PAN head", "%", _same_limit((X, DMC), 8.0)),
     "exposure-stated": Limit("exposure time stated of a PAN head", "%", _same_limit((X,), 8.0)),
-    "exposure-colour": Limit("exposure time of a colour head", "%", _same_limit(STITCHED, 30.0)),
+    "exposure-colour": Limit("exposure time of a colour head, wrong in the record", "%", {}),
+    "exposure-unknown": Limit(
+        "exposure time of a colour head halved and not in the record", "", _same_limit(STITCHED, 1.0)
+    ),
     "probes-all": Limit("all probes alike", "K", {X: 2.0}),
     "probe-one": Limit("one probe of a PAN cone", "K", {X: 2.0, L: 8.0, DMC: 8.0}),
     "stale": Limit("age of all temperatures, at 0.02 K/s", "s", _same_limit(STITCHED, 30.0)),

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from typing import TypeVar
 
@@ -171,6 +171,24 @@ def exposure_scale_figures(scales: Mapping[str, float]) -> dict[str, Figure]:
         "exposure_scaled_sensor": None if name is None or scales[name] == 1.0 else name,
         "exposure_scale": None if name is None else scales[name],
     }
+
+
+def unknown_exposure_figures(
+    rig: Rig, present: Collection[str], exposure_time_s: Mapping[str, float]
+) -> dict[str, Figure]:
+    """Colour frames whose exposure time is not known while that of other frames is.
+
+    Overlaps show the level of a PAN head; nothing in one exposure shows that of a colour head.
+
+    Args:
+        present: names of the sensors that sent a frame.
+        exposure_time_s: by sensor name, what the record states.
+    """
+    if not any(name in exposure_time_s for name in present):
+        return {"exposure_unknown_sensors": None}
+    colour = [s.name for cone in rig.colour_cones for s in cone.sensors if s.name in present]
+    unknown = [name for name in colour if name not in exposure_time_s]
+    return {"exposure_unknown_sensors": ", ".join(unknown) or None}
 
 
 def condition_figures(

@@ -26,29 +26,34 @@ def line_means(frame: Array) -> tuple[Array, Array]:
         frame is smaller than one.
     """
     height, width = frame.shape
-    by_row = np.zeros((height, min(BUNDLES, width // BUNDLE_PX)), np.float32)
-    by_column = np.zeros((min(BUNDLES, height // BUNDLE_PX), width), np.float32)
+    by_row = np.zeros((min(BUNDLES, width // BUNDLE_PX), height), np.uint32)
+    by_column = np.zeros((min(BUNDLES, height // BUNDLE_PX), width), np.uint32)
     if by_row.size and by_column.size:
         _sum_lines(frame, by_row, by_column)
-    return by_row.T / BUNDLE_PX, by_column / BUNDLE_PX
+    share = np.float32(1.0 / BUNDLE_PX)  # a power of two: exact
+    return by_row.astype(np.float32) * share, by_column.astype(np.float32) * share
 
 
 @njit(cache=True, parallel=True, nogil=True)
 def _sum_lines(frame, by_row, by_column):
     height, width = frame.shape
-    blocks, bundles = by_column.shape[0], by_row.shape[1]
+    blocks, bundles = by_column.shape[0], by_row.shape[0]
     tall, wide = height // blocks, width // bundles
     for block in prange(blocks):
         first = block * tall
         last = height if block == blocks - 1 else first + tall
         sums = by_column[block]
+        # Sums in elements of 32 bits: numba's scalars would be of 64, and half as many at a time.
+        total = np.zeros(1, np.uint32)
         for r in range(first, last):
             line = frame[r]
             for k in range(bundles):
-                total = np.int64(0)
-                for c in range(k * wide, k * wide + BUNDLE_PX):
-                    total += line[c]
-                by_row[r, k] = total
-            if r < first + BUNDLE_PX:
-                for c in range(width):
-                    sums[c] += np.float32(line[c])
+                total[0] = 0
+                part = line[k * wide : k * wide + BUNDLE_PX]
+                for c in range(BUNDLE_PX):
+                    total[0] += part[c]
+                by_row[k, r] = total[0]
+        for r in range(first, first + BUNDLE_PX, 4):
+            one, two, three, four = frame[r], frame[r + 1], frame[r + 2], frame[r + 3]
+            for c in range(width):
+                sums[c] += np.uint32(one[c]) + two[c] + three[c] + four[c]

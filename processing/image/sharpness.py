@@ -15,6 +15,8 @@ from processing.rig import Sensor
 Array = NDArray[Any]
 
 _EVERY_ROW: Final = 16
+_ROWS: Final = 1024
+"""Of taller frames only every second, third .. row is looked at."""
 _BUNDLE: Final = 32
 _MIN_LENGTH: Final = 34
 _MIN_SIGNAL: Final = 4.0
@@ -38,8 +40,10 @@ def sharpness(
     first, last = rows
     if last - first + 1 < _MIN_LENGTH or frame.shape[1] < _MIN_LENGTH:
         return None, None
-    sums = np.zeros((last - first + 1, 2, 4))
-    _difference_sums(frame[first : last + 1], sums)
+    height = last - first + 1
+    pace = max(1, height // _ROWS)
+    sums = np.zeros((-(-height // pace), 2, 4))
+    _difference_sums(frame[first : last + 1], pace, sums)
     along, across = sums.sum(axis=0)
     counts = level1_counts_per_dn(sensor.bits)
     return _share(sensor, along, counts), _share(sensor, across, counts)
@@ -49,7 +53,8 @@ def bright_level(sensors: Sequence[Sensor], frames: Sequence[Array]) -> float | 
     """The 95th percentile of signal above black as a share of full scale; no data left out."""
     samples = []
     for sensor, frame in zip(sensors, frames, strict=True):
-        sample = frame[::_EVERY_ROW, ::_EVERY_ROW].ravel()
+        pace = _EVERY_ROW * max(1, len(frame) // _ROWS)
+        sample = frame[::pace, ::_EVERY_ROW].ravel()
         full = level1_counts_per_dn(sensor.bits) * sensor.full_scale_dn
         samples.append(sample[sample > 0] / full)
     if not samples or not sum(len(sample) for sample in samples):
@@ -73,16 +78,18 @@ def _share(sensor: Sensor, sums: Array, counts: float) -> float | None:
 
 
 @njit(cache=True, parallel=True, nogil=True, fastmath={"reassoc", "contract"})
-def _difference_sums(frame, sums):
+def _difference_sums(frame, pace, sums):
     """Sums of squared differences to the next pixel and to the one after it, of signal, of pixels.
 
-    `sums` is (rows, 2, 4): by row, along track from bundles of neighbouring columns (single ones
-    would each cost a line of cache), across track from every `_EVERY_ROW`-th row.
+    `sums` is (rows, 2, 4): by every `pace`-th row, along track from bundles of neighbouring columns
+    (single ones would each cost a line of cache), across track from every `_EVERY_ROW`-th of these
+    rows.
     """
     height, width = frame.shape
-    for r in prange(height):
-        if r + 2 < height:
-            here, next_row, after = frame[r], frame[r + 1], frame[r + 2]
+    for r in prange(len(sums)):
+        top = r * pace
+        if top + 2 < height:
+            here, next_row, after = frame[top], frame[top + 1], frame[top + 2]
             near = far = signal = 0.0
             for first in range(0, width - _BUNDLE + 1, _BUNDLE * _EVERY_ROW):
                 for c in range(first, first + _BUNDLE):
@@ -95,7 +102,7 @@ def _difference_sums(frame, sums):
                 sums[r, 0, 3] += _BUNDLE
             sums[r, 0, 0], sums[r, 0, 1], sums[r, 0, 2] = near, far, signal
         if r % _EVERY_ROW == 0:
-            line = frame[r]
+            line = frame[top]
             near = far = signal = 0.0
             for c in range(width - 2):
                 signal_here = np.int32(line[c])

@@ -24,6 +24,7 @@ from processing.geometry.conditions import (
     exposure_scales,
     parallax_px,
     tdi_misfit_px,
+    unknown_exposure_figures,
     usable_temperatures,
 )
 from processing.geometry.placement import SensorPlacement, nominal_placements
@@ -283,6 +284,7 @@ class Pipeline:
         with clock.stage("quality"):
             figures = condition_figures(rig, conditions, temperatures)
             figures |= exposure_scale_figures(exposure_scales(rig, conditions.exposure_time_s))
+            figures |= unknown_exposure_figures(rig, level1.keys(), conditions.exposure_time_s)
             figures |= unread | self._frame_figures(level1, statistics, start)
             figures |= stitching_figures(
                 rig,

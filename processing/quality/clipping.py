@@ -18,7 +18,9 @@ from processing.rig import Rig, Sensor
 Array = NDArray[Any]
 
 STEP: Final = (16, 8)
-"""Of the rows and columns looked at."""
+"""Of the rows and columns looked at, of rows at least."""
+ROWS: Final = 104
+"""Looked at, about."""
 MIN_SHARE: Final = 0.003
 """Of the pixels of a frame at the value where it ends."""
 MIN_PILE: Final = 8.0
@@ -58,7 +60,8 @@ def clipped_at(sensor: Sensor, frame: Array) -> tuple[int, float] | None:
         sensor: as in the rig file.
         frame: Level-0, (h, w) uint16.
     """
-    sample = frame[:: STEP[0], :: STEP[1]].ravel() // sensor.raw_units_per_dn
+    step = max(STEP[0], len(frame) // ROWS)
+    sample = frame[::step, :: STEP[1]].ravel() // sensor.raw_units_per_dn
     counts = np.bincount(sample, minlength=sensor.full_scale_dn + 1)
     above = np.cumsum(counts[::-1])[::-1]
     # The highest value that more than a few defects reach.

@@ -6,11 +6,13 @@ and fields now and then, but these are seen by other heads too.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from processing.geometry.placement import SensorPlacement, raw_from_vip_mm, vip_mm_from_raw
@@ -128,25 +130,54 @@ def _candidates(sensor: Sensor, lines: LineMeans) -> list[_Edge]:
     for axis, by_line, offset, length in axes:
         if len(by_line) < RUN:
             continue
-        change = np.diff(by_line, axis=1)
-        limit = max(least, OVER_TEXTURE * float(np.sqrt(np.mean(change * change))))
+        limit = max(least, OVER_TEXTURE * _texture(by_line))
         pace = length // len(by_line)
         for sign in (1.0, -1.0):
-            steps = sign * change > limit
-            runs = steps[: len(steps) - RUN + 1].copy()
-            for k in range(1, RUN):
-                runs &= steps[k : len(steps) - RUN + 1 + k]
-            for at in np.flatnonzero(runs.any(axis=0)):
-                start = int(np.argmax(runs[:, at]))
+            for at in np.flatnonzero(_has_run(by_line, sign, limit, RUN)):
+                # Of the lines before and after, too.
+                change = np.diff(by_line[:, max(at - 1, 0) : at + 3], axis=1)
+                here = min(int(at), 1)
+                steps = sign * change[:, here] > limit
+                runs = np.lib.stride_tricks.sliding_window_view(steps, RUN).all(axis=1)
+                start = int(np.argmax(runs))
                 stop = start
-                while stop < len(steps) and steps[stop, at]:
+                while stop < len(steps) and steps[stop]:
                     stop += 1
-                step = float(np.median(change[start:stop, at]))
-                if _blur(change[start:stop], int(at)) > MAX_BLUR * abs(step):
+                step = float(np.median(change[start:stop, here]))
+                if _blur(change[start:stop], here) > MAX_BLUR * abs(step):
                     continue
                 first, last = start * pace, min((stop - 1) * pace + BUNDLE_PX, length) - 1
                 edges.append(_Edge(axis, int(at) + offset, first, last, step))
     return sorted(edges, key=lambda e: -abs(e.step) * (e.last - e.first))
+
+
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
+def _texture(means: Array) -> float:
+    """RMS change from line to line."""
+    bundles, lines = means.shape
+    total = 0.0
+    for k in range(bundles):
+        row = means[k]
+        squares: Any = np.float32(0.0)
+        for i in range(lines - 1):
+            change = row[i + 1] - row[i]
+            squares += change * change
+        total += squares
+    return math.sqrt(total / (bundles * (lines - 1)))
+
+
+@njit(cache=True, nogil=True)
+def _has_run(means: Array, sign: float, limit: float, length: int) -> Array:
+    """Between which lines so many neighbouring bundles change by more than a limit."""
+    bundles, lines = means.shape
+    run = np.zeros(lines - 1, np.int32)
+    longest = np.zeros(lines - 1, np.int32)
+    for k in range(bundles):
+        row = means[k]
+        for i in range(lines - 1):
+            run[i] = (run[i] + 1) * (sign * (row[i + 1] - row[i]) > limit)
+            longest[i] = max(longest[i], run[i])
+    return np.asarray(longest >= length)
 
 
 def _cornered(edges: list[_Edge]) -> list[_Edge]:

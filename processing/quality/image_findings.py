@@ -190,6 +190,17 @@ def exposure_findings(figures: Mapping[str, Figure], t: Thresholds) -> list[Find
                 t.bright_refly_fraction if black else t.bright_fraction,
             )
         )
+    unknown = figures.get("exposure_unknown_sensors")
+    if unknown:
+        findings.append(
+            Finding(
+                Flag.UNDEREXPOSED,
+                Verdict.USABLE,
+                f"The record states no exposure time of {unknown}: the colour balance is not "
+                "verified, and one exposure cannot show it. Enter exposure_time_us in the record "
+                "and process it again, or compare colours on the ground.",
+            )
+        )
     scale, scaled = number(figures, "exposure_scale"), figures.get("exposure_scaled_sensor")
     if scale is not None and scale > t.exposure_scale:
         findings.append(

@@ -234,6 +234,8 @@ FIGURES: Final[Mapping[str, str]] = {
     "separated",
     "exchanged_from": "the heads they came from, in the same order",
     "exchanged_by": "what shows it: fixed pattern, geometry",
+    "exposure_unknown_sensors": "colour frames whose exposure time the record does not state while "
+    "it states others, comma separated",
     "exposure_scaled_sensor": "frame whose level was corrected most for an exposure time other "
     "than that of the other cones",
     "exposure_scale": "what its signal was multiplied by",

@@ -6,11 +6,13 @@ lines alike. An edge on the ground would have to run along one line of pixels ov
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from processing.image.line_means import line_means
@@ -22,7 +24,7 @@ Array = NDArray[Any]
 
 QUANTILE: Final = 0.2
 """A step holds in all but this share of the bundles of a line."""
-MIN_BUNDLES: Final = 16
+MIN_BUNDLES: Final = 15
 MIN_STEP: Final = 0.055
 BANDING_STEP: Final = 0.03
 BANDING_LINES: Final = 16
@@ -31,6 +33,9 @@ MAX_FRAMES: Final = 2
 """Steps in more frames of one exposure are rows of plants or roofs along the track."""
 MIN_STEP_DN: Final = 6.0
 SIGMAS: Final = 8.0
+ALL: Final = 2000
+SAMPLES: Final = 400
+"""The usual change is found by all lines of frames of fewer than `ALL`, else by about so many."""
 _MAD_TO_SIGMA: Final = 1.4826
 
 
@@ -133,15 +138,22 @@ def _largest(
 ) -> SignalStep | None:
     if len(means) < MIN_BUNDLES:
         return None
-    signal = 0.5 * (means[:, 1:] + means[:, :-1])
-    change = np.diff(means, axis=1)
+    # A step needs nearly all bundles of one sign: only such lines are looked at closely.
+    often = len(means) - math.ceil(QUANTILE * (len(means) - 1))
+    rising, falling = _signs(means)
+    lines = np.flatnonzero((rising >= often) | (falling >= often))
+    if not len(lines):
+        return None
+    count = means.shape[1]
+    usual = _medians(means, np.arange(0, count - 1, 1 if count < ALL else count // SAMPLES))
+    spread = _MAD_TO_SIGMA * float(np.median(np.abs(usual - np.median(usual))))
+    signal = 0.5 * (means[:, lines + 1] + means[:, lines])
     bright = np.median(signal, axis=0)
-    relative = change / np.maximum(signal, 1.0)
+    relative = (means[:, lines + 1] - means[:, lines]) / np.maximum(signal, 1.0)
     low, high = np.quantile(relative, (QUANTILE, 1.0 - QUANTILE), axis=0)
     # What nearly all bundles of a line share; nothing where they differ in sign.
     common = np.where(low > 0.0, low, np.where(high < 0.0, high, 0.0))
     middle = np.median(relative, axis=0)
-    spread = _MAD_TO_SIGMA * float(np.median(np.abs(middle - np.median(middle))))
     noise = np.maximum(SIGMAS * spread, min_counts / np.maximum(bright, 1.0))
     shared = np.abs(middle) * (np.abs(common) > 0.5 * np.abs(middle))
     steps = shared > np.maximum(BANDING_STEP, noise)
@@ -149,6 +161,36 @@ def _largest(
         steps = shared > np.maximum(MIN_STEP, noise)
     if not steps.any():
         return None
-    at = int(np.argmax(np.where(steps, np.abs(middle), 0.0)))
-    count = int(np.count_nonzero(steps))
-    return SignalStep(sensor, axis, at + offset, float(middle[at]), count)
+    best = int(np.argmax(np.where(steps, np.abs(middle), 0.0)))
+    stepping = int(np.count_nonzero(steps))
+    return SignalStep(sensor, axis, int(lines[best]) + offset, float(middle[best]), stepping)
+
+
+@njit(cache=True, nogil=True)
+def _signs(means: Array) -> tuple[Array, Array]:
+    """How many bundles rise and how many fall between each line and the next."""
+    bundles, lines = means.shape
+    rising = np.zeros(lines - 1, np.int32)
+    falling = np.zeros(lines - 1, np.int32)
+    for k in range(bundles):
+        row = means[k]
+        for i in range(lines - 1):
+            rising[i] += row[i + 1] > row[i]
+            falling[i] += row[i + 1] < row[i]
+    return rising, falling
+
+
+@njit(cache=True, nogil=True)
+def _medians(means: Array, lines: Array) -> Array:
+    """Medians over the bundles of the relative change between some lines and the next."""
+    bundles = means.shape[0]
+    found = np.empty(len(lines), np.float32)
+    values = np.empty(bundles, np.float32)
+    for j in range(len(lines)):
+        at = lines[j]
+        for k in range(bundles):
+            before, after = means[k, at], means[k, at + 1]
+            values[k] = (after - before) / max(np.float32(0.5) * (before + after), np.float32(1.0))
+        values.sort()
+        found[j] = np.float32(0.5) * (values[(bundles - 1) // 2] + values[bundles // 2])
+    return found

@@ -14,7 +14,9 @@ from processing.rig import Rig, Sensor
 Array = NDArray[Any]
 
 STEP: Final = (16, 4)
-"""Of the rows and columns looked at."""
+"""Of the rows and columns looked at, of rows at least."""
+ROWS: Final = 52
+"""Looked at, about."""
 MIN_SHARE: Final = 1e-3
 """Of the words looked at: fewer beyond the sensor's range are bits flipped on the way."""
 
@@ -48,7 +50,7 @@ def wrong_format(sensor: Sensor, frame: Array) -> str | None:
     """
     if sensor.bits >= 16:
         return None
-    sample = frame[:: STEP[0], :: STEP[1]]
+    sample = frame[:: max(STEP[0], len(frame) // ROWS), :: STEP[1]]
     unit = sensor.raw_units_per_dn
     if _share_beyond(sensor, sample) < MIN_SHARE:
         return None

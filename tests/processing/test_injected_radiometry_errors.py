@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
+from processing.geometry.conditions import unknown_exposure_figures
 from processing.geometry.placement import nominal_placements
 from processing.quality.band_levels import level_steps, levels_of
 from processing.quality.common_windows import measure_common_windows
@@ -48,6 +49,21 @@ def test_a_gain_step_within_a_frame_is_named_with_its_line(
     assert outcome.figure("signal_step") == pytest.approx(factor - 1.0, abs=0.03)
 
 
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("sensor", ["R", "N"])
+def test_a_gain_step_or_banding_in_a_coarse_colour_head_is_named(sensor: str, axis: int) -> None:
+    exposure = rendered("dmc-mini")
+
+    def in_bands(frame: Any) -> Any:
+        return banded(60, 12)(frame) if axis == 0 else banded(60, 12)(frame.T).T
+
+    for change in (gain(1.2, 200, axis), in_bands):
+        outcome = exposure.with_frame(sensor, change).outcome()
+        assert outcome.verdict == "usable" and "FRAME_CORRUPT" in outcome.flags
+        assert outcome.figure("signal_step_sensor") == sensor
+        assert outcome.figure("signal_step_axis") == ("rows", "columns")[axis]
+
+
 def test_banding_is_named(error_free: InjectedExposure) -> None:
     outcome = error_free.with_frame("SU10", banded(30, 20)).outcome()
     assert outcome.figure("signal_step_sensor") == "SU10" and "banding" in outcome.sentences
@@ -83,6 +99,34 @@ def test_a_head_exposed_half_as_long_as_its_record_states_keeps_its_level(
     for before, after in ((pan, outcome.product.pan), (red, outcome.product.colour["red"])):
         both = (before > 0) & (after > 0)
         assert np.median(after[both] / before[both]) == pytest.approx(1.0, abs=0.01)
+
+
+@pytest.mark.parametrize("unknown", [("R",), ("G", "N")])
+def test_a_colour_head_without_a_stated_exposure_time_is_not_good(
+    error_free: InjectedExposure, unknown: tuple[str, ...]
+) -> None:
+    times_s = {n: t for n, t in error_free.conditions.exposure_time_s.items() if n not in unknown}
+    conditions = replace(error_free.conditions, exposure_time_s=times_s)
+    outcome = replace(error_free, conditions=conditions).outcome()
+    assert outcome.verdict == "usable" and outcome.flags == {"UNDEREXPOSED"}
+    assert outcome.figure("exposure_unknown_sensors") == ", ".join(unknown)
+    assert f"no exposure time of {', '.join(unknown)}:" in outcome.sentences
+
+
+def test_unknown_exposure_times_of_pan_lost_or_of_all_heads_are_not_named(
+    error_free: InjectedExposure,
+) -> None:
+    times_s = dict(error_free.conditions.exposure_time_s)
+    present = set(error_free.frames)
+
+    def unknown(*without: str, lost: str = "") -> Any:
+        stated = {n: t for n, t in times_s.items() if n not in without}
+        figures = unknown_exposure_figures(error_free.rig, present - {lost}, stated)
+        return figures["exposure_unknown_sensors"]
+
+    assert unknown() is None and unknown("SU00", "SU30") is None
+    assert unknown("B", lost="B") is None and unknown("B") == "B"
+    assert unknown(*times_s) is None
 
 
 def test_red_exposed_half_as_long_without_saying_so_is_seen_over_a_flight(

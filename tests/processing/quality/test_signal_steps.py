@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from processing.quality.frame_blocks import _has_run, _texture
 from processing.quality.signal_steps import (
     SignalStep,
     _largest,
+    _medians,
+    _signs,
     line_means_of,
     signal_steps,
     step_figures,
@@ -82,10 +85,10 @@ def test_what_nearly_all_share_is_more_than_half_of_the_step(small: float, found
     assert (largest(means(changes)) is not None) == found
 
 
-@pytest.mark.parametrize(("bundles", "found"), [(15, False), (16, True)])
-def test_fewer_than_sixteen_bundles_say_nothing(bundles: int, found: bool) -> None:
-    line_values = means(one_step(0.1)[0], bundles=bundles)
-    assert (largest(line_values) is not None) == found
+@pytest.mark.parametrize(("bundles", "found"), [(14, False), (15, True)])
+def test_fewer_than_fifteen_bundles_say_nothing(bundles: int, found: bool) -> None:
+    made = means(one_step(0.1)[0], bundles=bundles)
+    assert (largest(made) is not None) == found
 
 
 @pytest.mark.parametrize(("sigmas", "found"), [(7.8, False), (8.2, True)])
@@ -177,3 +180,27 @@ def test_six_dn_of_a_sensor_are_the_least_step(step_dn: float, found: int) -> No
     frame = line_values[SENSORS[0].name]
     frame[FIRST + 100 : FIRST + SIDE] = 400 + round(8 * step_dn)
     assert len(signal_steps(SENSORS, line_means_of(SENSORS, line_values, ROWS))) == found
+
+
+@pytest.mark.parametrize("bundles", [16, 21])
+def test_signs_and_medians_are_those_of_numpy(bundles: int) -> None:
+    made = np.random.default_rng(7).normal(1000.0, 30.0, (bundles, 300)).astype(np.float32)
+    made[:, 100] = made[:, 99]
+    change = np.diff(made, axis=1)
+    rising, falling = _signs(made)
+    assert np.array_equal(rising, np.count_nonzero(change > 0.0, axis=0))
+    assert np.array_equal(falling, np.count_nonzero(change < 0.0, axis=0))
+    relative = change / (0.5 * (made[:, 1:] + made[:, :-1]))
+    lines = np.array([0, 5, 99, 298])
+    assert _medians(made, lines) == pytest.approx(np.median(relative, axis=0)[lines], rel=1e-5)
+
+
+def test_runs_of_steps_and_texture_are_those_of_numpy() -> None:
+    made = np.random.default_rng(8).normal(1000.0, 30.0, (20, 200)).astype(np.float32)
+    made[3:8, 51:] += 400.0
+    made[10:14, 121:] += 400.0
+    change = np.diff(made, axis=1)
+    assert _texture(made) == pytest.approx(float(np.sqrt(np.mean(change * change))), rel=1e-5)
+    assert np.flatnonzero(_has_run(made, 1.0, 150.0, 5)).tolist() == [50]
+    assert np.flatnonzero(_has_run(made, 1.0, 150.0, 4)).tolist() == [50, 120]
+    assert not _has_run(made, -1.0, 150.0, 4).any()

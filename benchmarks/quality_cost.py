@@ -1,0 +1,128 @@
+"""`python -m benchmarks.quality_cost`: CPU seconds of flags, verdicts and sigmas in one exposure.
+
+Processes the exposure of `syntopic bench` and counts the CPU time of the process, all threads, in
+each function that serves the quality report alone: tests of frames, stated accuracy, judgement.
+Their sum is compared with the CPU time of the pipeline. The valid area counts as a product.
+Nothing is written to disk.
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import json
+import os
+import statistics
+import time
+import tomllib
+from collections import defaultdict
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+import processing.pipelines.stitched as composed
+from daemon.cli.benchmark.measurement import machine
+from daemon.cli.benchmark.pipeline import exposures_of
+from daemon.configuration.model import PlanSection
+from daemon.mission.layout import Mission
+from daemon.mission.store.radiometry_folder import RadiometryFolder
+from daemon.mission.store.store import load_level0
+from daemon.products.conditions import conditions_of
+from processing.pipelines.stitched import Pipeline, PipelineSettings
+from processing.quality.report import Flag
+from processing.rig import find_rig, load_rig
+
+STEPS: Final = (
+    "unread_figures",
+    "word_format_figures",
+    "clipping_figures",
+    "heads_by_pattern",
+    "check_content",
+    "check_platform",
+    "check_layers",
+    "estimate_dc",
+    "held_quantities",
+    "uncertainty_contribution_of",
+    "frame_figures",
+    "stitching_figures",
+    "relative_sharpness_figures",
+    "line_means_of",
+    "signal_steps",
+    "block_edges",
+    "measure_common_windows",
+    "local_blur_figures",
+    "level_figures",
+    "identity_figures",
+    "precision_figures",
+    "evaluate",
+)
+"""Functions by their name in `processing.pipelines.stitched`."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.quality_cost")
+    add = parser.add_argument
+    add("--rig", default="ultracam-x", help="Name of a shipped rig (default: ultracam-x).")
+    add("--runs", type=int, default=5, help="Exposures timed (default: 5).")
+    add("--threads", type=int, default=2, help="Cores the pipeline may use (default: 2).")
+    add("--json", action="store_true", help="Print one JSON object.")
+    given = parser.parse_args()
+    result = measure(given.rig, runs=given.runs, threads=given.threads)
+    print(json.dumps(result) if given.json else table(result))
+
+
+def measure(rig_name: str, *, runs: int, threads: int) -> dict[str, Any]:
+    """Medians of CPU seconds by step, of their sum and of the pipeline, over `runs` exposures."""
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    folder = exposures_of(rig_name, find_rig(rig_name), cache / "syntopic" / "bench" / rig_name)
+    mission = Mission.open(folder / "mission")
+    rig = load_rig(mission.rig_path)
+    plan = tomllib.loads(mission.service_path.read_text(encoding="utf-8")).get("plan", {})
+    settings = PipelineSettings(geometry=False, threads=threads)
+    radiometry = RadiometryFolder(folder / "calibration" / "radiometry", rig)
+    pipeline = Pipeline(rig, radiometry, settings)
+    pipeline.warm_up()
+    stored, exposure = load_level0(mission.level0(1), rig)
+    frames = {name: np.array(frame) for name, frame in stored.items()}
+    conditions = conditions_of(exposure, rig, PlanSection.model_validate(plan), Flag(0))
+    used: dict[str, float] = defaultdict(float)
+    for name in STEPS:
+        setattr(composed, name, _counted(getattr(composed, name), name, used))
+    by_run: list[dict[str, float]] = []
+    for _ in range(runs + 1):
+        used.clear()
+        began = time.process_time()
+        pipeline.process(frames, conditions)
+        whole = time.process_time() - began
+        by_run.append({**used, "all steps": sum(used.values()), "pipeline": whole})
+    # The first exposure fills caches.
+    of = {key: statistics.median(run[key] for run in by_run[1:]) for key in by_run[0]}
+    share = of["all steps"] / of["pipeline"]
+    return {"machine": machine(), "rig": rig.name, "runs": runs, "cpu_s": of, "share": share}
+
+
+def _counted(function: Callable[..., Any], name: str, used: dict[str, float]) -> Callable[..., Any]:
+    @functools.wraps(function)
+    def timed(*args: Any, **others: Any) -> Any:
+        began = time.process_time()
+        try:
+            return function(*args, **others)
+        finally:
+            used[name] += time.process_time() - began
+
+    return timed
+
+
+def table(result: dict[str, Any]) -> str:
+    """Markdown: CPU milliseconds by step, the largest first."""
+    lines = ["| step | CPU ms |", "|---|---|"]
+    ordered = sorted(result["cpu_s"].items(), key=lambda item: item[1])
+    lines += [f"| `{name}` | {seconds * 1e3:.1f} |" for name, seconds in ordered]
+    lines.append(f"\nshare of the pipeline: {result['share']:.1%}  {json.dumps(result['machine'])}")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    main()
