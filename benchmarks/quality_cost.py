@@ -24,12 +24,12 @@ import numpy as np
 
 import processing.pipelines.stitched as composed
 from daemon.cli.benchmark.measurement import machine
-from daemon.cli.benchmark.pipeline import exposures_of
+from daemon.cli.benchmark.pipeline import benchmark_exposure
 from daemon.configuration.model import PlanSection
 from daemon.mission.layout import Mission
 from daemon.mission.store.radiometry_folder import RadiometryFolder
 from daemon.mission.store.store import load_level0
-from daemon.products.conditions import conditions_of
+from daemon.products.exposure_conditions import conditions_of
 from processing.pipelines.stitched import Pipeline, PipelineSettings
 from processing.quality.report import Flag
 from processing.rig import find_rig, load_rig
@@ -76,7 +76,9 @@ def main() -> None:
 def measure(rig_name: str, *, runs: int, threads: int) -> dict[str, Any]:
     """Medians of CPU seconds by step, of their sum and of the pipeline, over `runs` exposures."""
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    folder = exposures_of(rig_name, find_rig(rig_name), cache / "syntopic" / "bench" / rig_name)
+    folder = benchmark_exposure(
+        rig_name, find_rig(rig_name), cache / "syntopic" / "bench" / rig_name
+    )
     mission = Mission.open(folder / "mission")
     rig = load_rig(mission.rig_path)
     plan = tomllib.loads(mission.service_path.read_text(encoding="utf-8")).get("plan", {})
