@@ -315,7 +315,7 @@ def _gnss_rows(
 
 
 def _seconds_from_mean(network: Network) -> Array:
-    """Seconds since the mean time of each line's positions, so that shift and drift are uncorrelated."""
+    """Seconds since the mean time of each line's positions, so shift and drift are uncorrelated."""
     gnss = network.gnss
     since = np.zeros(len(gnss.station))
     for line in range(len(gnss.lines)):

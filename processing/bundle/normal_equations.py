@@ -1,8 +1,8 @@
 """Normal equations with the object points eliminated (Schur complement), and their solution.
 
 Each point's three columns are first made orthonormal within the point (its own Cholesky factor), so
-that eliminating it needs a product and no inverse. Columns that most rows touch (interior orientation)
-are kept dense, all others sparse; the reduced matrix itself is dense.
+that eliminating it needs a product and no inverse. Columns that most rows touch (interior
+orientation) are stored dense, all others sparse; the reduced matrix itself is dense.
 """
 
 from __future__ import annotations

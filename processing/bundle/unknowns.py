@@ -42,7 +42,7 @@ class ParameterLayout:
         terms: (t,) per camera.
         shift, drift: (lines, 3).
         retained_points: (points, 3), points with columns of their own.
-        eliminated_points: (points,) position among the eliminated points, -1 for retained and left-out ones.
+        eliminated_points: (points,) position among the eliminated points, -1 for others.
         locked: (points, 3) coordinates that are held.
         unknowns: what each column is.
         constraints: (c, columns) rows; corrections summed over all iterations obey them.

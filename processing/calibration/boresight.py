@@ -96,9 +96,9 @@ class BoresightCalibration:
 
     `covariance` (10, 10) in the order of `PARAMETERS` (rad, m, s), within what is determined: held
     parameters and unseparated directions have none. `determined` (10,) marks the parameters that
-    are completely determined. `basis` (10, r) are the determined directions, scaled by `WORTH`. Residuals are
-    (n, 3): positions in m (object axes), attitudes in rad (rig's body axes). `sigma0` has expected
-    value one.
+    are completely determined. `basis` (10, r) are the determined directions, scaled by `WORTH`.
+    Residuals are (n, 3): positions in m (object axes), attitudes in rad (rig's body axes).
+    `sigma0` has expected value one.
     """
 
     mounting: ImuMounting

@@ -293,7 +293,7 @@ def _mounting_correction(rig: Rig, cone: Cone, record: StitchRecord) -> tuple[Ar
 
 
 def _base_rotation(rig: Rig, cone: Cone, record: StitchRecord) -> Array:
-    """Apparent rotation by a base over even ground: seen from the right, everything appears farther left."""
+    """Apparent rotation by a base over even ground: seen from the right, all appears farther left."""
     right, forward = base_mm(rig, cone)
     if record.height_m is None:
         return np.zeros(3)

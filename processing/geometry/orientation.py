@@ -2,7 +2,7 @@
 
 Inertial systems report roll, pitch and heading of the body against the local level (north, east,
 down); photogrammetry uses omega, phi, kappa of the camera against a map grid (east, north, up).
-Between them lie two constant matrices, the boresight, and the convergence of the meridian.
+The conversion takes two constant matrices, the boresight, and the convergence of the meridian.
 Conversion goes through the matrix, never by renaming angles. Rotations are (3, 3), float64.
 
 Source: docs/mathematics/coordinates.md#from-roll-pitch-heading-to-the-grid.

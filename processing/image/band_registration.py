@@ -60,7 +60,7 @@ class RegisteredBand:
     the band's own calibration has it. `shift_px` (columns right, rows down) is the raw displacement
     of the points, mean; `largest_shift_px` its largest length. `rms_px` is the root mean square
     length of the residuals of the `points` kept, and `rms_x_px`, `rms_y_px` its parts.
-    `registered` False: too few points, the band lies as calibrated.
+    `registered` False: too few points, the band keeps its calibrated position.
     """
 
     band: str
@@ -103,7 +103,7 @@ def register_to_reference(
     *,
     settings: BandSettings | None = None,
 ) -> RegisteredBand:
-    """Find where a band lies against the reference band.
+    """Estimate the transformation of a band against the reference band.
 
     Args:
         reference, other: placements by calibration.

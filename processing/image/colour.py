@@ -88,7 +88,7 @@ class BandRegistration:
     """One head, by its leading band, against green.
 
     `band_from_green` (3, 3) carries a VIP point in mm to where the band's own placement has it.
-    Where too few points were found it is the identity: the band lies as calibrated, and
+    Where too few points were found it is the identity: the band stays as calibrated, and
     `registered` is False; `textured` counts the positions that were tried there and where the band
     has texture well above noise. `rms_px` is the residual length per point, colour pixels.
     """
@@ -103,7 +103,7 @@ class BandRegistration:
 
 
 def nominal_registration(band: str, sensor: str, *, textured: int = 0) -> BandRegistration:
-    """A band that lies as calibrated."""
+    """A band at its calibrated position."""
     return BandRegistration(band, sensor, np.eye(3), 0, None, registered=False, textured=textured)
 
 
@@ -117,7 +117,7 @@ def register_band(
     positions: Array,
     settings: ColourSettings,
 ) -> BandRegistration:
-    """Find where a band lies against green.
+    """Estimate the transformation of a band against green.
 
     Args:
         green: adjusted placement of the green sensor.

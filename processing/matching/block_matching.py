@@ -31,7 +31,7 @@ Carry = Callable[[Array], Array]
 _OBLIQUE_COSINE: Final = math.cos(math.radians(20.0))
 """Looking farther from the vertical, an image differs from its neighbour by more than a turn."""
 _SIMILAR_VIEW_COSINE: Final = math.cos(math.radians(35.0))
-"""Views farther apart show other sides of what stands on the ground."""
+"""Views farther apart show other sides of objects on the ground."""
 
 
 @dataclass(frozen=True)
@@ -182,7 +182,7 @@ def pixels_of(image: VirtualImage, station_m: Array, rotation: Array, xyz_m: Arr
 
 
 def quarter_rotations(rotation: Array, other: Array) -> int:
-    """By how many quarters, counter-clockwise, another image is turned to lie like the first."""
+    """Quarter turns, counter-clockwise, that align another image with the first."""
     between = rotation.T @ other
     return round(math.atan2(between[1, 0], between[0, 0]) / (math.pi / 2.0)) % 4
 
@@ -253,7 +253,7 @@ def _matched_in(
     known: NDArray[np.bool_],
     settings: BlockMatching,
 ) -> tuple[int, Array]:
-    """How many places were sought in another image, and where they are in it (n, 2), else NaN."""
+    """Number of places searched in another image, and where they are in it (n, 2), else NaN."""
     rotated, into, back = rectified
     seen = pixels_of(image, station_m, rotation, ground)
     predicted = into(seen)

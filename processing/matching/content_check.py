@@ -1,7 +1,7 @@
 """Check that frames show the ground that the calibration predicts.
 
 Texture that matches nowhere is no water: frames are swapped, of another exposure, turned or
-mirrored, or a head has moved farther than tie points are sought. Frames whose tie points fail are
+mirrored, or a head has moved beyond the search range. Frames whose tie points fail are
 searched again farther away; what is found there moves the prediction, and what is not is named.
 """
 
@@ -121,7 +121,7 @@ def check_content(
 def moved_placements(
     placements: Mapping[str, SensorPlacement], check: ContentCheck, pitch_mm: float
 ) -> dict[str, SensorPlacement]:
-    """Where frames are to be sought once more: the shifted ones where they were found."""
+    """Predictions for a second search: the shifted frames where they were found."""
     moved = dict(placements)
     for name, (dx_px, dy_px) in check.shifted_px.items():
         shift = np.eye(3)
@@ -175,7 +175,7 @@ def _wide_search_shifts(
     settings: TiePointSettings,
     name: str,
 ) -> list[Array]:
-    """How far points of frame `name` lie from where they are expected, px in the VIP."""
+    """Displacement of points of frame `name` from their prediction, px in the VIP."""
     if search.region is not None:
         return []
     a, b = search.pair

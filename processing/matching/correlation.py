@@ -1,4 +1,4 @@
-"""Correlation search: where in a patch the window of another looks most alike, to a whole pixel.
+"""Correlation search: the best match of a window in another patch, to a whole pixel.
 
 Compiled kernels; refining the place is done in `processing.matching.least_squares`.
 """
@@ -149,7 +149,7 @@ def _add_taps(s: Array, w: tuple[Any, ...], o: Array, count: int) -> None:
 def peak(surface: Array, reach: Array, found: Array) -> bool:
     """Best offset, its sub-pixel part by parabola, its height and that of the next maximum.
 
-    False where the peak lies on the edge of what was searched.
+    False where the peak is on the edge of the search range.
     """
     search = (surface.shape[0] - 1) // 2
     best, row, col = -2.0, 0, 0

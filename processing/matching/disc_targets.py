@@ -1,7 +1,7 @@
 """Bright discs on dark ground: detection, measurement by weighted means, and identification.
 
 Which target a disc shows follows from where the nominal camera would see each: the holder's
-settings are off by tens of pixels, alike for all, so the shift most pairs agree on is taken first.
+settings have a common error of tens of pixels, so the shift of most pairs is removed first.
 """
 
 from __future__ import annotations

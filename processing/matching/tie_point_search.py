@@ -37,7 +37,7 @@ _MAX_SHEAR: Final = 0.01
 
 @dataclass(frozen=True)
 class TiePointSettings:
-    """How many points are sought, how, and what a match must reach.
+    """Number of points, search parameters, and limits of a match.
 
     Window and search of P/C are in pixels of the colour master, of P/P in PAN pixels; so are the
     sigmas. `floor_sigma_px` is the error besides noise: rotation within the patch, interpolation.
@@ -302,7 +302,7 @@ def _raw_area(
 def _shrunk(
     area: tuple[float, float, float, float], usable: tuple[int, int, int, int], margin_px: int
 ) -> tuple[int, int, int, int]:
-    """Where a window's centre may lie: the area, `room` pixels inside of what is usable."""
+    """Area of window centres: `room` pixels inside of the usable area."""
     return (
         max(math.ceil(area[0]), usable[0] + margin_px),
         min(math.floor(area[1]), usable[1] - margin_px),

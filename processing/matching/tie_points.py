@@ -41,7 +41,7 @@ class TiePoints:
     `sensor_a`, `sensor_b` index `names`; `raw_a`, `raw_b` are (column, row) of the same ground.
     `sigma_px` is the predicted standard deviation of one coordinate of their difference, in PAN
     pixels. `kind` is PAN_TO_PAN or PAN_TO_COLOUR (then b is the colour master). `overlap` indexes
-    `pairs`, the pairs of sensors where points were sought; `sought` counts the positions tried.
+    `pairs`, the searched pairs of sensors; `attempted` counts the positions tried.
     """
 
     names: tuple[str, ...]
@@ -60,7 +60,7 @@ class TiePoints:
         return len(self.sigma_px)
 
     def only(self, keep: NDArray[np.bool_]) -> TiePoints:
-        """The points whose rows `keep` (n,) marks; `pairs` and `sought` stay."""
+        """The points whose rows `keep` (n,) marks; `pairs` and `attempted` stay."""
         columns = ("sensor_a", "sensor_b", "raw_a", "raw_b", "sigma_px", "correlation", "kind")
         selected = {name: getattr(self, name)[keep] for name in (*columns, "overlap")}
         return replace(self, **selected)

@@ -79,7 +79,7 @@ def solve(
 ) -> ConstrainedSolution:
     """Solve the normal equations, bordered with constraints @ dp = misclosure.
 
-    Unknowns must be scaled alike. Directions with less information (eigenvalue of the normal
+    Unknowns must have one scale. Directions with less information (eigenvalue of the normal
     matrix, constraints included) than `min_information` count as undetermined: these alone get a
     pseudo-observation of that information that draws them to `fixed_at` (as a correction dp).
 

@@ -84,7 +84,7 @@ def contradicted_colour(
 
     Those of a sensor found off its calibrated place that P/P points do not hold on every side. A
     cloud under the camera is nearer than the ground, and the colour master is next to the PAN
-    cones: all P/C points of a sensor that sees the cloud are off alike, and hide P/P points, too.
+    cones: all P/C points of a sensor that sees the cloud have a common error, and hide P/P points.
     """
     affected = {
         h.sensor for h in (validity.displaced, validity.insignificant_displacement) if h is not None
@@ -130,7 +130,7 @@ def supported_mosaic(
         placements: calibration + TDM, as of `mosaic`.
         tie_points: those of `mosaic`.
         mosaic: the free mosaic, its datum repaired.
-        validity: the judgement on it.
+        validity: the test of it.
         temperatures_c: temperatures that were read, by probe name.
         settings: of the adjustment; None takes the defaults.
         support: None takes the defaults.

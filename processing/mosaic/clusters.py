@@ -27,8 +27,8 @@ _POINTS_PER_CLUSTER: Final = 30.0
 _MIN_CLUSTERS: Final = 30
 """Fewer sums of residuals determine their variance to no better than a quarter."""
 _REACH_PX: Final = 93.0
-"""How far, in colour pixels, P/C points err alike: sums over cells of area a show a / (a + reach^2)
-of what sums over whole sensors have. Measured on rendered exposures (docs/matching.md)."""
+"""Correlation length of errors of P/C points, colour pixels: sums over cells of area a show
+a / (a + reach^2) of what sums over whole sensors have. Measured on rendered exposures (docs/matching.md)."""
 
 
 def clustered_cofactor(

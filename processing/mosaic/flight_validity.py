@@ -203,8 +203,8 @@ def _steps(
 ) -> list[FlightDisplacement]:
     """Steps one after the other, each with those before it taken out, in order of strength.
 
-    They are sought by the first view, and weighed by the second. Where a probe misreads, the rest
-    of the flight is judged without believing it: what a stuck probe does is no single step.
+    The first view detects them, the second estimates them. After a biased probe is found, the rest
+    of the flight is evaluated without it: a stuck probe causes no single step.
     """
     (view, series), wide = ((v, replace(s, factor=variance_factor(s))) for v, s in views)
     count, size = series.y.shape
@@ -317,7 +317,7 @@ def _step(
     lead = probe_bias.statistic - _moved(*wide)[0][0]
     freedom = len(narrow[1][1]) - 2
     if not relative and lead >= -odds_limit:
-        # Where sensors have moved, too, that is sought again without the probe.
+        # Sensors that have moved as well are searched again without the probe.
         with_free_probe = _moved(wide[0], _with_free_probe(*wide, probe_bias.probe))
         displacement = with_free_probe[0][0] > chi2.isf(
             settings.family_alpha / len(with_free_probe), 2

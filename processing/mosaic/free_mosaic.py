@@ -66,7 +66,7 @@ __all__ = [
 Array = NDArray[np.float64]
 
 _STRAIGHT_PX: Final = 0.05
-"""Steps this small change neither derivatives nor, by more than 1e-6 px, what they foretell: a step
+"""Steps this small change neither derivatives nor, by more than 1e-6 px, their predictions: a step
 d is off by d squared over the size of the image."""
 
 

@@ -32,7 +32,7 @@ QUANTITIES: Final = np.eye(3)
 SCALE_SIGMA: Final = 0.01
 """A scale is not farther off; it keeps heads without points where they are."""
 SIGNIFICANT: Final = 6.0
-"""Standard deviations; those of neighbours that err alike are up to 1.8 times as large."""
+"""Standard deviations; those of correlated neighbours are up to 1.8 times as large."""
 _NO_INFORMATION: Final = 1e-10
 """Share of the largest eigenvalue below which tie points say nothing."""
 

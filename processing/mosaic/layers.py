@@ -3,7 +3,7 @@
 Stitching transforms every layer onto the master's, independent of the calibration. The change is
 compared here with how well principal distances, mountings and sensor places are known.
 A change that all other cones share is the master's own; it moves the whole image and is not
-corrected. What changes in all cones alike cannot be observed by stitching: that takes a bundle
+corrected. A change common to all cones cannot be observed by stitching: that takes a bundle
 adjustment with ground control or GNSS.
 
 Source: docs/mathematics/validity.md#layers-against-the-platform-calibration; Ladstädter et al.

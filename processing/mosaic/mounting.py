@@ -90,8 +90,8 @@ class PlatformCheck:
 
     `covariance` (3 n, 3 n) is that of the turns of all heads, by tie points and by the sensors'
     places; their mean, which is the datum, has none.
-    `statistic` is chi-square with `degrees_of_freedom` degrees of freedom on a platform as calibrated; what
-    all heads turned together does not count, it cannot be seen.
+    `statistic` is chi-square with `degrees_of_freedom` on a platform as calibrated; a common
+    rotation of all heads cannot be observed and does not count.
     """
 
     heads: tuple[EstimatedMounting, ...]
@@ -156,7 +156,7 @@ def verified_mosaic(rig: Rig, mosaic: Mosaic, tie_points: TiePoints) -> Mosaic:
 
 
 def has_scaled_head(rig: Rig, mosaic: Mosaic, tie_points: TiePoints) -> bool:
-    """Whether a converging head differs from its neighbours in scale, along both axes alike.
+    """Whether a converging head differs from its neighbours in scale, equally along both axes.
 
     That is a principal distance; lines lost in read-out change one axis.
     """

@@ -36,7 +36,7 @@ BLIND_SIGMA_K = 15.0
 
 @dataclass(frozen=True)
 class UncertaintyContribution:
-    """Covariance in addition to that of tie points and datum (`processing.mosaic.uncertainty_contribution`).
+    """Covariance besides tie points and datum (`processing.mosaic.uncertainty_contribution`).
 
     `datum` (4, 4) is that of shift x, y (px), scale and rotation (px per mm) of the whole image;
     `frames` (2,) the variance of a coordinate, px squared, of one sensor's pixels, by its name;
@@ -97,7 +97,7 @@ def placed_sigma_px(
     measured_c: Mapping[str, float],
     uncertainty_contribution: UncertaintyContribution | None = None,
 ) -> Array:
-    """Standard deviation (n, 2), px, of where raw pixels (n, 2) lie in the virtual image.
+    """Standard deviation (n, 2), px, of the positions of raw pixels (n, 2) in the virtual image.
 
     What tie points do not determine counts with the a-priori accuracy it is held with.
     """
@@ -119,7 +119,7 @@ def placed_sigma_px(
 def placed_covariance_px(
     rig: Rig, mosaic: Mosaic, points: Mapping[str, Array], measured_c: Mapping[str, float]
 ) -> tuple[Array, Array]:
-    """Covariance of where raw pixels of several sensors lie in the virtual image.
+    """Covariance of the positions of raw pixels of several sensors in the virtual image.
 
     Args:
         rig: the camera.

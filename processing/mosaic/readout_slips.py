@@ -1,4 +1,4 @@
-"""Read-out slips: rows or columns of one frame that lie where they should not, by their residuals.
+"""Read-out slips: displaced rows or columns of one frame, detected by residuals.
 
 A head that drops or repeats lines shifts a band of its frame, or everything after one line. The
 adjustment spreads that over sensors that are in order; the residuals of the frame's own tie
@@ -41,9 +41,9 @@ class SlipSettings:
 
     A band holds at least two bins of `bin_points` tie points; the mean of their medians differs
     from the median of the rest of the frame by more than `limit` standard deviations of
-    independent points, and by more than `min_shift_px`. The second is what decides on ground where
-    neighbouring points err alike: relief, trees, clouds, vehicles (docs/validity.md). All of a band
-    moves: `min_share` of its points have its shift, of vehicles on a road fewer.
+    independent points, and by more than `min_shift_px`. The second decides on ground where errors of
+    neighbouring points are correlated: relief, trees, clouds, vehicles (docs/validity.md). All of a
+    band moves: `min_share` of its points have its shift, of vehicles on a road fewer.
     """
 
     bin_points: int = 7
@@ -58,7 +58,7 @@ class SlipSettings:
 
 @dataclass(frozen=True)
 class Slip:
-    """A band of one frame that lies elsewhere than the rest of the frame.
+    """A band of one frame that is displaced against the rest of the frame.
 
     The band reaches from pixel `first` to `last` along `axis`; `dx_px`, `dy_px` are its shift
     against the rest in the VIP (x right, y up), PAN pixels, `share` its part of the frame, `score`

@@ -29,7 +29,7 @@ SENSOR_UNITS = {"x_um": 1e3, "y_um": 1e3, "rotation_urad": 1e6, "scale_ppm": 1e6
 """Quantities of a sensor, and what turns the adjustment's own units (mm, rad, 1) into theirs."""
 LAYER_SCALE = "layer_scale_ppm"
 ROTATIONS = ("rotation_x_urad", "rotation_y_urad", "rotation_z_urad")
-"""How a cone stands turned against its calibration, about the axes of the virtual image."""
+"""Rotation of a cone against its calibration, about the axes of the virtual image."""
 
 
 class StitchRecordError(ValueError):

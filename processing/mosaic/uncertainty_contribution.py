@@ -48,7 +48,7 @@ HEAD_SCALE_PPM: Final = 50.0
 RELATIVE_SHIFT: Final = 3.0
 """The largest of a few shifts between frames, over the sigma of a coordinate of one."""
 MIN_DISPLACEMENT_PX: Final = 0.02
-"""Displacements below are alike."""
+"""Displacements with a smaller difference count as equal."""
 
 
 def uncertainty_contribution_of(
@@ -85,7 +85,7 @@ def uncertainty_contribution_of(
         smear_px: by cone, what its stated TDI count leaves of the motion, where that is too much.
     """
     warmed = tuple(_wrong_temperature(rig, mosaic, estimated_dc))
-    # A wrong temperature changes the scale of all layers alike, too.
+    # A wrong temperature changes the common scale of all layers, too.
     changed = () if warmed else tuple(_changed_master(rig, mosaic, layers))
     datum = np.zeros((4, 4))
     contributions = [*_rotated_heads(mosaic, platform, held), *_stale(rig, mosaic, stale_s)]
@@ -276,7 +276,7 @@ def _changed_master(rig: Rig, mosaic: Mosaic, layers: LayerCheck | None) -> Iter
     """The change all other layers share is the master's own.
 
     Where several cones are not as calibrated, the master's scale is known no better than theirs;
-    so is the place of a single master sensor. That of several is judged by themselves.
+    so is the place of a single master sensor. That of several is tested separately.
     """
     if layers is None:
         return

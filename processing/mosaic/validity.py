@@ -150,7 +150,7 @@ def evaluate_master(
     The covariance of the residuals is that of stitching + calibration (`position_sigma_um`) + TDM
     (coefficient sigma times dC, and the probe's sigma common to its sensors). The datum does not
     matter: shift, rotation and scale common to the master sensors are taken out. A sensor is only
-    accused where no probe's error explains it better.
+    named where no probe's error explains it better.
 
     Args:
         rig: the camera.
@@ -205,7 +205,7 @@ def evaluate_master(
 
 @dataclass(frozen=True)
 class _Cause:
-    """What is accused, by hypotheses best first; the chi-square it leaves, and its freedom."""
+    """Named causes, best hypothesis first; the remaining chi-square and its degrees of freedom."""
 
     hypotheses: tuple[Displacement, ...] = ()
     displaced: Displacement | None = None

@@ -154,7 +154,7 @@ class BandPipeline:
 
         Args:
             frames: Level-0 frames by sensor name, (h, w) uint16. A missing one leaves no band;
-                without the reference all bands lie as calibrated.
+                without the reference all bands stay as calibrated.
             conditions: exposure times, temperatures, what capture knows.
             heads: gain and black level by sensor name.
             frames_read: called once the pixels of `frames` are no longer needed.

@@ -60,7 +60,7 @@ def measure_common_windows(
 
     Args:
         rig: the camera.
-        placements: where the sensors lie, by name.
+        placements: of the sensors, by name.
         frames: Level-1 words by sensor name, (h, w) uint16. Those behind a colour filter array are
             left out.
 

@@ -26,7 +26,7 @@ from processing.rig import Rig, Sensor
 Array = NDArray[Any]
 
 RUN: Final = 5
-"""Neighbouring bundles of pixels that step alike."""
+"""Neighbouring bundles of pixels with the same step."""
 MIN_STEP_DN: Final = 12.0
 """Of 12 bits, in each of them."""
 OVER_TEXTURE: Final = 1.0
@@ -75,7 +75,7 @@ def block_edges(
 
     Args:
         rig: the camera.
-        placements: where the sensors lie, by name.
+        placements: of the sensors, by name.
         frames: Level-1 words by sensor name, (h, w) uint16.
         means: of their lines, by sensor name.
 
@@ -120,7 +120,7 @@ class _Edge:
 
 
 def _candidates(sensor: Sensor, lines: LineMeans) -> list[_Edge]:
-    """Runs of bundles that step alike between two lines, the largest first."""
+    """Runs of bundles with the same step between two lines, the largest first."""
     least = MIN_STEP_DN * level1_counts_per_dn(sensor.bits)
     edges: list[_Edge] = []
     axes: tuple[tuple[Literal["rows", "columns"], Array, int, int], ...] = (

@@ -1,6 +1,6 @@
-"""Which head did a frame come from? Frames of heads of the same kind fit each other's places.
+"""Identification of the head of a frame: frames of heads of one kind may be exchanged.
 
-Two witnesses: the fixed pattern of the pixels' response, which no two sensors share, where heads
+Two indicators: the fixed pattern of the pixels' response, which no two sensors share, where heads
 are calibrated for it; and the place of the colour master's layer, where it fits another head's
 calibration.
 """

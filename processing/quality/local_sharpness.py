@@ -1,8 +1,8 @@
 """A region of one frame that is less sharp than the other frames show the same ground.
 
 Colour heads are compared with each other and with PAN reduced to their pixels. A PAN head is
-compared by how much detail of its own pixels goes with the detail that colour sees there: nobody
-else sees as finely, but blur takes detail that the rest of the image has.
+compared by how much detail of its own pixels goes with the detail that colour sees there: no other
+head resolves as finely, but blur takes detail that the rest of the image has.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The valid area of an image as its heads give it by calibration: before it is made, or judged.
+"""The valid area of an image by the calibration of its heads, without the image itself.
 
 Missions recorded before quality reports held the valid area are counted by this, too.
 """

@@ -118,7 +118,7 @@ def evaluate_probes(
     estimates: Mapping[str, tuple[float, float]] | None = None,
     settings: ProbeSettings | None = None,
 ) -> dict[str, ProbeReading]:
-    """Judge every probe at an instant from what was read up to then, and bridge the bad ones.
+    """Evaluate every probe at an instant from earlier readings, and bridge the bad ones.
 
     Args:
         histories: samples by probe, in order of time.
@@ -171,8 +171,8 @@ def _plausible_readings(
 ) -> list[ProbeSample]:
     """Readings that can follow each other; what jumps away is left out until it comes back.
 
-    What is possible counts from reading to reading: a probe that stays away is not believed for
-    staying long.
+    What is possible counts from reading to reading: a probe that stays away does not become
+    valid by staying long.
     """
     plausible_samples: list[ProbeSample] = []
     before_s = -math.inf

@@ -37,7 +37,7 @@ def relative_sharpness_figures(
 
     Args:
         rig: the camera.
-        placements: where the sensors lie, by name.
+        placements: of the sensors, by name.
         frames: Level-1 words by sensor name, (h, w) uint16.
     """
     ratios: dict[str, list[float]] = {}

@@ -118,8 +118,8 @@ class Thresholds:
     """Test statistic over its critical value (0.1 %) from which a displaced sensor changes the
     verdict: of 100,000 healthy exposures one does. Below, the image is corrected and stays good."""
     colour_blur_deficit: float = 0.12
-    """Share of the finest detail that is missing in a region of a colour frame against the others: 0.25 is
-    left without any, a sharp one has about 0.45."""
+    """Share of the finest detail that is missing in a region of a colour frame against the others:
+    0.25 is left without any, a sharp one has about 0.45."""
     pan_blur_deficit: float = 0.6
     """Natural logarithm of how many times less energy of detail a region of a PAN frame has."""
     exposure_scale: float = 1.25

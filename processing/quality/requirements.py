@@ -1,4 +1,4 @@
-"""What a project asks of every exposure, and the findings where one falls short.
+"""Requirements of a project on every exposure, and findings where they are not met.
 
 A specification is a contract: what breaks it has to be flown again, however well it looks. Limits
 that hold for any project are in `processing.quality.report.Thresholds`.
@@ -35,7 +35,7 @@ def requirement_findings(
 ) -> Iterator[Finding]:
     """A finding, and a re-fly, for everything asked for that an exposure does not keep.
 
-    What is not known is not judged.
+    Unknown figures are not evaluated.
     """
     for name, limit, flag, is_minimum, sentence in (
         (

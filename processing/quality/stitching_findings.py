@@ -29,8 +29,8 @@ def stitching_findings(
         )
         if saturated_fraction > t.saturated_overlap_fraction:
             sentence = (
-                f"Few tie points in {where} because it is saturated: {saturated_fraction:.0%} of the places "
-                "where points are sought hold saturated pixels. Shorten the exposure."
+                f"Few tie points in {where} because it is saturated: {saturated_fraction:.0%} of the "
+                "places where points are sought hold saturated pixels. Shorten the exposure."
             )
         findings.append(
             Finding(

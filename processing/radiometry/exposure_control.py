@@ -2,7 +2,7 @@
 
 A pure law: counts and limits in, settings out. Which frames are looked at, when settings may change
 and who changes them is the daemon's. Exposure time comes first, since it gains light; it ends where
-motion would smear, and gain, which amplifies noise alike, does the rest up to its own limit.
+motion would smear, and gain, which amplifies noise as well, does the rest up to its own limit.
 """
 
 from __future__ import annotations

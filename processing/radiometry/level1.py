@@ -230,8 +230,8 @@ def _fixed_point(
 def _quantised(values: Array, good: Array, coarsest: float) -> tuple[Array, float, float]:
     """A map as words above its least value, in 8 bits where steps stay below the coarsest allowed.
 
-    Half the bytes are half the time: the pass waits for memory. Words of defects, which nobody
-    reads, are cut off to the range of good pixels.
+    Half the bytes are half the time: the pass waits for memory. Words of defects, which are not
+    read, are cut off to the range of good pixels.
 
     Returns:
         The words, the least value, the unit of a word.

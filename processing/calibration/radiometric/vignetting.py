@@ -110,8 +110,8 @@ def _relative_aperture_area(f_number: float, base: float) -> float:
 
 
 def _blocks(values: Array, good: Array) -> Array:
-    """Means of the good pixels of blocks, flat; blocks half of which is defect are left out alike
-    in every map."""
+    """Means of the good pixels of blocks, flat; blocks with half of their pixels defect are left
+    out of every map."""
     height, width = (n // _BLOCK_PX * _BLOCK_PX for n in values.shape)
 
     def summed(array: Array) -> Array:

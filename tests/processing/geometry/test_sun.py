@@ -1,4 +1,4 @@
-"""The sun stands where others computed and observed it."""
+"""The sun's elevation agrees with published computations and observations."""
 
 from __future__ import annotations
 

@@ -97,9 +97,9 @@ def test_a_ray_meets_the_plane_where_a_drawing_states_it_does() -> None:
         rays = np.stack([x, y, np.full(3, -cone.lens.f_mm)], axis=1)
         rays = rays @ rotation_matrix(*cone.rotation_rad).T
         forward, right, _ = np.subtract(cone.position_mm, rig.image_position_mm)
-        stands = np.array([right, forward, 0.0])
-        reach = (-height_mm - stands @ up) / (rays @ up)
-        ground = stands + rays * reach[:, None]
+        origin = np.array([right, forward, 0.0])
+        reach = (-height_mm - origin @ up) / (rays @ up)
+        ground = origin + rays * reach[:, None]
         seen = 120.0 * ground[:, :2] / -ground[:, 2:]
         start = dataclasses.replace(placement, similarity=placements[sensor.name].similarity)
         found = vip_mm_from_raw(start, raw)
