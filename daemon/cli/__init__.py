@@ -69,7 +69,7 @@ def main() -> NoReturn:
 
 
 def _print_refusal(error: Exception) -> NoReturn:
-    """One sentence for an error that names its cure; the exit status is 1, of configuration 2.
+    """Print an error with its corrective action; the exit status is 1, of configuration 2.
 
     Raises:
         Exception: `error` itself, where it is no error of the user or of the machine.
@@ -83,7 +83,7 @@ def _print_refusal(error: Exception) -> NoReturn:
     console = Console(stderr=True, soft_wrap=True)
     if isinstance(error, ConfigurationError | RigError):
         count = len(error.problems)
-        console.print(f"Refused: {count} mistake{'s' if count > 1 else ''}", style="bold red")
+        console.print(f"Refused: {count} error{'s' if count > 1 else ''}", style="bold red")
         for problem in error.problems:
             console.print(f"  {problem}", markup=False, highlight=False)
         sys.exit(2)

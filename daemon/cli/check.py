@@ -23,13 +23,13 @@ if TYPE_CHECKING:
 
 HELP = """Validate a configuration, build what `run` builds, and prove each device with one datum.
 
-Prerequisites, pipeline, kernels, page and arming are looked at with the functions that `run` uses.
+Prerequisites, pipeline, kernels, page and arming are checked with the functions that `run` uses.
 Nothing is fired without `--fire`: frames and event marks are then proven by one exposure. While the
-service runs, it is asked over its control socket, and nothing is opened. The exit status is 0 when
+service runs, it is queried over its control socket, and no device is opened. The exit status is 0 when
 all passes, 1 when something fails, 2 when the configuration is refused, and 3 when nothing fails
 and something is waited for, such as a receiver that searches.
 
-With `--find`, find out what speaks at serial ports, tcp://host:port, udpin://host:port (those
+With `--find`, detect the protocols at serial ports, tcp://host:port, udpin://host:port (those
 given, or all serial ports and the usual addresses): protocol, speed, and the configuration for it.
 With `--find-heads`, which GigE Vision, USB3 Vision and V4L2 heads there are, and the same.
 
@@ -47,7 +47,7 @@ def check(
         ),
     ] = None,
     find: Annotated[
-        bool, typer.Option("--find", help="Find out what speaks at ports, and how fast.")
+        bool, typer.Option("--find", help="Detection of protocol and speed at ports.")
     ] = False,
     heads: Annotated[
         bool, typer.Option("--find-heads", help="Find out which heads there are.")

@@ -52,7 +52,7 @@ TABLE: Final = {
         _command(
             "check", _IN_FLIGHT, "Check a configuration and prove each device with one datum."
         ),
-        _command("monitor", _IN_FLIGHT, "Watch a flight from a terminal."),
+        _command("monitor", _IN_FLIGHT, "Monitor a flight from a terminal."),
         _command("send", _IN_FLIGHT, "Send a command to a running service."),
         _command("token", _IN_FLIGHT, "Create, list and revoke access tokens.", "token:app"),
         _command("certificate", _IN_FLIGHT, "Create a local authority and a TLS certificate."),
@@ -170,7 +170,7 @@ class CommandGroup(TyperGroup):
         return list(self.commands)
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """As click asks for it.
+        """The command for click.
 
         Raises:
             UsageError: `cmd_name` is a former name; the sentence has the present one.

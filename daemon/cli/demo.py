@@ -34,7 +34,7 @@ from daemon.terminal.tables import light_table
 from drivers.base.extras import require
 from processing.rig import Rig, RigError, find_rig
 
-HELP = """Fly the first flight: an emulated rig is captured, stitched and judged.
+HELP = """Fly a first flight with an emulated rig: capture, stitching and verdict.
 
 A line of exposures is flown 12 K above the calibration temperature, with one sensor of the master
 cone displaced where it has several. The stitched images are then compared with the emulator's
@@ -64,7 +64,7 @@ def demo(
         str, typer.Option(help="ublox, novatel, septentrio, nmea, or mavlink (an autopilot).")
     ] = "ublox",
     seed: Annotated[int, typer.Option(help="Everything random follows from it.")] = 1,
-    out: Annotated[Path, typer.Option(help="Where flights are kept.")] = Path("flights"),
+    out: Annotated[Path, typer.Option(help="Folder of the flights.")] = Path("flights"),
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     require("aravis", "watch", *(["mavlink"] if receiver == "mavlink" else []))

@@ -13,7 +13,7 @@ from daemon.terminal.tables import light_table
 
 
 def exit_if_failed(failures: Sequence[ExposureFailure]) -> None:
-    """List the exposures that failed on stderr; a command without any goes on.
+    """List the exposures that failed on stderr; a command without any continues.
 
     Raises:
         typer.Exit: with status 1, where an exposure failed.

@@ -38,7 +38,7 @@ def find_heads(*, as_json: bool) -> NoReturn:
 
 
 def found_heads() -> tuple[list[dict[str, Any]], list[str]]:
-    """Heads by driver, with the settings that reach them; and what could not be asked."""
+    """Heads by driver, with the settings that reach them; and the drivers without an answer."""
     genicam, problems = _genicam_heads()
     video, more = v4l2_heads()
     return genicam + video, problems + more

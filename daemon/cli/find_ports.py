@@ -1,4 +1,4 @@
-"""`syntopic check --find`: what speaks at the ports of this computer, and what to write for it."""
+"""`syntopic check --find`: detect protocols at the ports of this computer, with their configuration."""
 
 from __future__ import annotations
 

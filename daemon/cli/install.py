@@ -90,7 +90,7 @@ def _print_outcome(done: InstallationReport, as_json: bool, verb: str, next_line
         console = Console()
         console.print(f"{len(done.files)} files {verb}")
         for path in done.retained:
-            console.print(f"kept, edited by hand: {path}", style="yellow", highlight=False)
+            console.print(f"retained, edited by hand: {path}", style="yellow", highlight=False)
         for purpose, outcome in done.steps.items():
             console.print(f"{purpose}: {outcome}", highlight=False, soft_wrap=True)
         console.print(f"Next: {next_line}", highlight=False, soft_wrap=True)

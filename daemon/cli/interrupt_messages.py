@@ -37,7 +37,7 @@ SENTENCES = {
         "every file copied so far is complete, and nothing is removed before the copy is sealed; "
         f"{RETRY_HINT} to continue"
     ),
-    "kernels": f"the kernels compiled so far are kept; {RETRY_HINT} to compile the others",
+    "kernels": f"the kernels compiled so far remain; {RETRY_HINT} to compile the others",
     "install": f"every file written so far is complete; {RETRY_HINT} to finish",
     "uninstall": f"every file left is complete; {RETRY_HINT} to finish",
     **dict.fromkeys(

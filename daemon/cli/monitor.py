@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 HELP = """Watch a flight from a terminal: phase, ledger, faults, the last exposures.
 
 Without an address the services that announce themselves are listed; a single one is watched. What
-is announced decides neither about TLS nor about where a token goes: https:// or --tls asks for TLS,
+is announced determines neither TLS nor the receiver of a token: https:// or --tls requires TLS,
 and a token is sent only to an address that was given.
 
 Examples: `syntopic monitor`, `syntopic monitor 10.0.0.5:8470 --bytes-per-s 4000`,
@@ -162,7 +162,7 @@ def _single_service(console: Console, token: str) -> str:
     console.print(_services_table(found))
     if token:
         raise MonitorError(
-            "a token is not sent to an address that was only announced, since anybody can announce "
+            "a token is not sent to an address that was only announced, since any host can announce "
             "one; give the address: syntopic monitor https://HOST:PORT"
         )
     if len(found) >= SERVICES_MAX:
@@ -192,7 +192,7 @@ class _MonitorState:
             first = error.errors()[0]
             where = ".".join(str(part) for part in first["loc"])
             raise MonitorError(
-                f"the service sends no telemetry that is understood: {where}: {first['msg']}; look "
+                f"the service sends invalid telemetry: {where}: {first['msg']}; look "
                 "at the address, and at the version of both sides"
             ) from None
         self._record = validated
@@ -231,7 +231,7 @@ class _MonitorState:
     def _faults(self, faults: list[_Fault]) -> Iterator[Text]:
         for fault in faults[:FAULTS_SHOWN]:
             verdict_or_step, style = (
-                ("✖ WARNING", "red") if fault.stands else ("▲ passed", "yellow")
+                ("✖ WARNING", "red") if fault.stands else ("▲ cleared", "yellow")
             )
             yield Text(f"{verdict_or_step}  {fault.sentence}", style=style)
         if len(faults) > FAULTS_SHOWN:

@@ -52,7 +52,7 @@ def process(
         Path | None, typer.Option(help="Folder of radiometric calibrations.")
     ] = None,
     elevation: Annotated[
-        Path | None, typer.Option(help="Height model, where that of the flight lies elsewhere.")
+        Path | None, typer.Option(help="Height model (default: that of the flight).")
     ] = None,
     baselines: Annotated[
         bool, typer.Option(help="Also solve the fixed method, with and without TDM.")
@@ -136,7 +136,7 @@ def process(
 
 
 def flown_thresholds(folder: Mission) -> dict[str, float]:
-    """Thresholds of the configuration that was flown, so that it is judged as in the air."""
+    """Thresholds of the flown configuration, for the same verdicts as in flight."""
     given = nested_value(folder.flown_configuration(), "processing", "thresholds") or {}
     try:
         return ProcessingSection.model_validate({"thresholds": given}).thresholds
@@ -152,7 +152,7 @@ def as_flown(
 ) -> tuple[PlanSection, Path | None]:
     """Plan and radiometry of the configuration that was flown, where the mission has one.
 
-    Only these two are read: devices that were there in the air need not be here. They are looked
+    Only these two are read: the devices of the flight need not be present. They are looked
     for only where a mission may name them (`Mission.file_named`); the options name any place.
 
     Raises:

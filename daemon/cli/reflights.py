@@ -61,7 +61,7 @@ def reflights(
     notes = [level] if level else []
     if without := exposure_footprints.without_valid_area(folder):
         notes.append(
-            f"{without} of {len(taken)} exposures have no recorded valid area: they count whole, "
+            f"{without} of {len(taken)} exposures have no recorded valid area: they count completely, "
             "except for heads that sent no image. Run syntopic process to compute it."
         )
     base_m = along_m * (1.0 - read.specification.forward_overlap)

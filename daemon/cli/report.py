@@ -1,4 +1,4 @@
-"""`syntopic report`: a mission to be read, and to be sent to whoever helps."""
+"""`syntopic report`: the mission report, and a support bundle."""
 
 from __future__ import annotations
 

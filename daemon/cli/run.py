@@ -17,7 +17,7 @@ HELP = """Run the onboard service with a configuration, until SIGTERM or until t
 
 A service that was killed resumes the same mission with the rig it began with; where the configured
 rig differs, the sentence names the keys, and --new-mission begins another one. Events are printed
-one a line, for people, or with --json-lines as one JSON object each, for programs.
+one per line as text, or with --json-lines as one JSON object each.
 
 Examples: `syntopic run service.toml`, `syntopic run service.toml --json-lines`
 """

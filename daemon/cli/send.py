@@ -14,7 +14,7 @@ HELP = """Send a command to a running service.
 
 Commands are those of the API (docs/watching.md): arm, start, stop, trigger, interval, distance,
 land, acknowledge, exposure, new-mission, release-disk, accept-disk. They go over the service's Unix
-socket (`[watch] control`) and need no token: the machine knows who you are, and your group decides.
+socket (`[watch] control`) and need no token: the service authorizes them by user and group.
 The exit status is 1 where the service refuses.
 
 Examples: `syntopic send start`,

@@ -153,7 +153,7 @@ def free_first_address() -> str:
     """The first loopback block 127.p.k.2 on which no emulated rig answers yet.
 
     p is this process's own, so that rigs started at the same moment do not choose the same one, and
-    a service that still looks for the heads of an earlier flight does not find those of this.
+    a service that searches for the heads of an earlier flight does not find these.
     """
     own = 1 + os.getpid() % 250
     for block in range(256):
@@ -178,7 +178,7 @@ def service_toml(
 ) -> str:
     """A service configuration that fits the emulated devices.
 
-    Watchers are served on `watch_port`, 0 being any that is free; nobody where it is None.
+    Clients are served on `watch_port` (0: a free port; None: no monitoring).
     """
     plan = ready["plan"]
     rig = find_rig(ready["rig_file"])
@@ -237,7 +237,7 @@ def _section(kind: str, name: str, settings: Mapping[str, Any]) -> list[str]:
     lines = ["", f"[[{kind}]]", f"name = {_quoted(name)}"]
     lines += [f"{key} = {json.dumps(value)}" for key, value in settings.items()]
     if settings["driver"] == "modbus-rtu":
-        lines.append('parity = "N"  # a pseudo terminal knows no parity')
+        lines.append('parity = "N"  # a pseudo terminal has no parity')
     return lines
 
 

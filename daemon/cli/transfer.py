@@ -20,7 +20,7 @@ from daemon.terminal.console import Console
 HELP = """Copy a mission to another disk and verify every file.
 
 Each file is read back from the other disk and compared by hash, in every run. An interrupted
-transfer continues when the same command is run again. The source is kept unless --remove-source is
+transfer continues when the same command is run again. The source remains unless --remove-source is
 given: then the copy is sealed, the source is removed, and no later run changes the copy.
 
 Example: `syntopic transfer MISSION /media/shuttle`
@@ -70,10 +70,10 @@ def transfer(
         return
     console = Console(soft_wrap=True)
     console.print(
-        f"{report.copied} files copied, {report.already_present} identical files kept, "
+        f"{report.copied} files copied, {report.already_present} identical files unchanged, "
         f"{report.nbytes / 1e9:.2f} GB in all; {report.verified.exposures} exposures and "
         f"{report.verified.frames} frames verified in {report.target}"
     )
     if report.sealed_utc:
         console.print(f"The copy is sealed since {report.sealed_utc}.")
-    console.print("The source is removed." if report.source_removed else "The source is kept.")
+    console.print("The source is removed." if report.source_removed else "The source is unchanged.")

@@ -35,8 +35,8 @@ are on the ground (--points) and where in the images (--measured). Writes an adj
 its report (image residuals in um, control and checks in m and px, systematic image residuals on a
 grid), `exterior.csv` with the adjusted orientations, and all the tables docs/formats.md names.
 
-Of a rig whose heads look apart, those alike in pixels and principal distance make a block (--head):
-views that look about the same way are matched, oblique ones by the plane of the ground.
+If the heads of a rig have diverging axes, heads with equal pixels and principal distance form a
+block (--head). Views of similar direction are matched, oblique ones by the plane of the ground.
 
 Examples: `syntopic triangulate MISSION --trajectory sbet.out`,
 `syntopic triangulate MISSION --head 5 --head 8`,

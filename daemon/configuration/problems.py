@@ -148,7 +148,7 @@ def _trigger_problems(content: Mapping[str, Any], file: str) -> list[str]:
 
 
 def _port_problems(content: Mapping[str, Any], file: str) -> list[str]:
-    """Two devices at one port or address: whoever opens it second gets nothing."""
+    """Two devices at one port or address."""
     problems = []
     used_by: dict[tuple[str, str], str] = {}
     for kind, key in (

@@ -1,4 +1,4 @@
-"""What people read in a terminal or on a page: text of others is shown, and never obeyed.
+"""Console output, with markup and control sequences of foreign text disabled.
 
 No text is markup, and no character of it moves the cursor, changes colours or turns the reading
 direction. Commands print through `Console`; styles are given as arguments.

@@ -1,6 +1,6 @@
 """Texts from the network or a foreign file, made fit for a terminal and a log.
 
-A terminal obeys control sequences, and some characters reorder or hide what stands around them.
+A terminal executes control sequences, and some characters reorder or hide adjacent text.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ def printable(text: str, max_characters: int = TEXT_MAX) -> str:
 
     Args:
         text: anything.
-        most: characters that are kept; a longer text ends with an ellipsis.
+        most: maximum length in characters; a longer text ends with an ellipsis.
 
     Example:
         >>> printable("head\\x1b[2J SU11")

@@ -1,4 +1,4 @@
-"""How figures are laid out for people: light tables that fit a terminal of 80 columns."""
+"""Light tables that fit a terminal of 80 columns."""
 
 from __future__ import annotations
 

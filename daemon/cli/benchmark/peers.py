@@ -33,7 +33,7 @@ PACKAGES = {
 }
 CONTROL_POINTS = 100
 GEOMETRY_POINTS = 5000
-"""Points of each sensor whose place in the peer's panorama is looked up."""
+"""Points of each sensor that are located in the panorama."""
 
 
 class PeerError(DaemonError):

@@ -1,7 +1,7 @@
-"""The plan of the mission being flown, and what of it is not seen by enough images yet.
+"""The plan of the current mission, and its coverage by images.
 
-Exposures are gathered from the state as they come, so that those it no longer keeps still count.
-What has to be flown again is computed by `daemon.planning.reflight_planning`.
+Exposures are collected from the state as they arrive, so that those it has dropped still count.
+Re-flights are computed by `daemon.planning.reflight_planning`.
 """
 
 from __future__ import annotations
@@ -48,12 +48,12 @@ class _PlanContext:
 
 
 class Coverage:
-    """What is planned and what has been seen of it. Without a plan there is neither.
+    """The plan and its coverage; both are empty without a plan.
 
     Args:
-        state: the flight as it is watched.
-        configured: where the service's own configuration puts the height model; without it the
-            mission's names count, within its folder.
+        state: the state of the flight.
+        configured: the plan section of the service, with the path of the height model; without
+            it the mission's names are used, relative to its folder.
     """
 
     def __init__(self, state: FlightState, configured: PlanSection | None = None) -> None:
@@ -65,7 +65,7 @@ class Coverage:
         self._cursor = 0
 
     def update(self) -> None:
-        """Take in what is new; often enough, since the state forgets."""
+        """Add new exposures; must be called often, since the state drops old ones."""
         if self._state.mission_path != self._mission:
             self._mission = self._state.mission_path
             self._context = (
@@ -84,7 +84,7 @@ class Coverage:
                 self._taken[one["number"]] = (str(one.get("line") or ""), taken)
 
     def plan_json(self) -> dict[str, Any] | None:
-        """Lines with their places, as the page draws them."""
+        """Lines with their exposure positions, for the page."""
         self.update()
         if self._context is None:
             return None
@@ -96,7 +96,7 @@ class Coverage:
         }
 
     def advice_task(self) -> Callable[[], ReflightPlan] | None:
-        """What must be flown yet or again: the answer takes a while, and may in any thread."""
+        """The computation of remaining and repeated segments; it may run in any thread."""
         self.update()
         context = self._context
         if context is None:
@@ -114,7 +114,7 @@ class Coverage:
         )
 
     def notes(self) -> list[str]:
-        """What the advice assumes."""
+        """Assumptions of the advice."""
         context = self._context
         return (
             [context.flat_ground_reason]
@@ -123,7 +123,7 @@ class Coverage:
         )
 
     def _remaining(self, context: _PlanContext) -> dict[str, tuple[float, float]]:
-        """By line, what is still to be flown: all of it, or what lies ahead on the line in work."""
+        """Remaining segment of each line: all of it, or the part ahead on the current line."""
         flown: dict[str, list[ExposureFootprint]] = {}
         latest = ""
         for latest, taken in (self._taken[number] for number in sorted(self._taken)):
@@ -155,17 +155,17 @@ class Coverage:
 
     @property
     def height_m(self) -> float:
-        """Height above ground as planned, for missions that are written out."""
+        """Planned height above ground, for exported missions."""
         return self._context.height_m if self._context else 0.0
 
     @property
     def distance_m(self) -> float:
-        """Between two exposures, by the overlap asked for."""
+        """Distance between two exposures for the required overlap."""
         return self._context.base_m if self._context else 0.0
 
 
 def advice_json(advice: ReflightPlan, coverage: Coverage) -> dict[str, Any]:
-    """Segments as the page lists and draws them."""
+    """Segments, for the page."""
     return {
         "planned_m": round(advice.planned_m, 1),
         "covered_m": round(advice.covered_m, 1),
@@ -211,7 +211,7 @@ def _load_context(path: Path, configured: PlanSection | None) -> _PlanContext | 
 
 
 def _taken(one: Mapping[str, Any], context: _PlanContext) -> ExposureFootprint:
-    """An exposure as the advisor counts it; until it is judged, its missing heads alone decide."""
+    """An exposure for the coverage; before its verdict only its missing heads count."""
     corners, place = one.get("footprint"), one.get("place") or {}
     if not corners:
         return ExposureFootprint(one["number"], (), _exclusion_reason(one) or NO_FOOTPRINT)
@@ -248,7 +248,7 @@ def _line_json(line: PlannedLine, context: _PlanContext) -> dict[str, Any]:
 
 
 def _exclusion_reason(one: Mapping[str, Any]) -> str:
-    """Why an exposure does not count; coverage itself is counted by the advisor."""
+    """The reason why an exposure is excluded; empty if it counts."""
     if one.get("state") == "lost":
         return "lost"
     if one.get("verdict") != "refly":

@@ -33,10 +33,10 @@ FIGURES_REPORTED = (
     *("stitched_sigma_px", "missing_sensors", "smear_along_px", "smear_across_px"),
 )
 PARTS = ("exposures", "devices", "settings", "track", "history", "events")
-"""Parts of the state besides what is brief, in the order of their worth on a thin link."""
+"""Parts of the state in addition to the brief, in order of priority on a slow link."""
 
 PREVIEW_PARTS = ("residuals", "thumbnails")
-"""Behind all of these, for those who have no page: not part of the snapshot."""
+"""Parts of lowest priority, for clients without the page; not in the snapshot."""
 
 RESIDUALS_MAX, PIECES_MAX = 5, 40
 
@@ -50,9 +50,9 @@ Json = dict[str, Any]
 
 
 class FlightState:
-    """The state of one flight, for watchers.
+    """The state of one flight, for monitoring clients.
 
-    `sequence` grows with every event, so that a watcher knows whether it missed one.
+    `sequence` grows with every event, so that a client detects missing events.
     """
 
     def __init__(
@@ -61,9 +61,9 @@ class FlightState:
         footprint: Callable[[Mapping[str, Any]], Any] = lambda _: None,
         pictures: Callable[[str | None, int], Preview] = lambda _mission, _number: Preview(),
     ) -> None:
-        """`footprint` gives the corners of what an exposure's navigation saw, where it can.
+        """`footprint` computes the corners of an exposure from its navigation, or None.
 
-        `pictures` reads what is there of a mission's exposure.
+        `pictures` reads the preview of an exposure of a mission.
         """
         self.sequence = 0
         self._footprint = footprint
@@ -79,14 +79,14 @@ class FlightState:
         self._latches = FaultLatches()
         self._exposures: dict[int, Json] = {}
         self._dropped_verdicts = dict.fromkeys(VERDICT_RANK, 0)
-        """Verdicts of exposures that are no longer kept: who counts must not see fewer."""
+        """Counts of verdicts of dropped exposures, so that totals do not decrease."""
         self._temperatures: dict[int, Any] = {}
         self._events: deque[Json] = deque(maxlen=EVENTS_MAX)
         self._history: deque[Json] = deque(maxlen=HISTORY_MAX)
         self._track: deque[Json] = deque(maxlen=HISTORY_MAX)
 
     def apply(self, event: Mapping[str, Any]) -> None:
-        """Take in one event of the service; one of an unknown kind is only listed."""
+        """Apply one event of the service; an unknown kind is only listed."""
         self.sequence += 1
         kind = str(event.get("event", ""))
         self._latches.apply(event, sequence=self.sequence)
@@ -97,7 +97,7 @@ class FlightState:
             self._events.append({"sequence": self.sequence, **event})
 
     def brief(self) -> Json:
-        """What everybody must know at all times; a few hundred bytes."""
+        """The essential state; a few hundred bytes."""
         return {
             "sequence": self.sequence,
             "software": self._software,
@@ -111,9 +111,9 @@ class FlightState:
         }
 
     def changed(self, part: str, after: int) -> list[Json]:
-        """What of one of PARTS or PREVIEW_PARTS is newer than a sequence.
+        """Items of one of PARTS or PREVIEW_PARTS that are newer than a sequence.
 
-        Ordered by sequence, so that a watcher may be given the beginning now and the rest later.
+        Ordered by sequence, so that a client may receive the first items now and the rest later.
         """
         items: Iterable[Json] = {
             "exposures": self._exposures.values(),
@@ -129,7 +129,7 @@ class FlightState:
         return sorted(newer, key=lambda item: item["sequence"])
 
     def snapshot(self) -> Json:
-        """Everything, for somebody who has just come."""
+        """The complete state, for a new client."""
         return {"version": 1, **self.brief(), **{part: self.changed(part, 0) for part in PARTS}}
 
     @property
@@ -142,7 +142,7 @@ class FlightState:
         return path if isinstance(path, str) else None
 
     def faults(self) -> list[Json]:
-        """Faults that stand, or stood and nobody has acknowledged; the newest first."""
+        """Active faults and cleared, unacknowledged ones; the newest first."""
         return self._latches.listed()
 
     def exposures(self, after: int = 0, limit: int = EXPOSURES_MAX) -> list[Json]:
@@ -153,7 +153,7 @@ class FlightState:
         return self._exposures.get(number)
 
     def acknowledge(self, fault: str) -> bool:
-        """A person has seen a fault. One that has passed leaves the list; one that stands stays."""
+        """Acknowledge a fault. A cleared one leaves the list; an active one stays."""
         self.sequence += 1
         return self._latches.acknowledge(fault)
 
@@ -169,7 +169,7 @@ class FlightState:
         elif report is not None:
             self._apply_products({"number": number, "report": report})
 
-    # What each event means
+    # Handlers by event
 
     def _on_mission(self, event: Mapping[str, Any]) -> None:
         self._mission = {
@@ -181,7 +181,7 @@ class FlightState:
         device = self._device(str(event.get("device")))
         device |= {"kind": event.get("kind"), "found": event.get("found", {})}
         if device["state"] == "unknown":
-            # A trigger unit has nothing to open; other devices say when they deliver.
+            # A trigger unit has nothing to open; other devices report when they deliver.
             device["state"] = "ready" if event.get("kind") == "trigger" else "found"
 
     def _on_device(self, event: Mapping[str, Any]) -> None:
@@ -237,7 +237,7 @@ class FlightState:
             record["place"] = {key: event["navigation"].get(key) for key in PLACE_KEYS}
 
     def _on_verdict(self, event: Mapping[str, Any]) -> None:
-        """The verdict, before there are pictures to it."""
+        """Apply the verdict, which precedes the pictures."""
         record = self._exposure(event)
         report = event.get("report", {})
         _apply_report(record, report)

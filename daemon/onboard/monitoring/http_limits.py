@@ -1,7 +1,7 @@
-"""HTTP and WebSocket as the page server reads them: uvicorn's protocols, with limits.
+"""HTTP and WebSocket protocols of uvicorn, with limits.
 
-What is refused here is refused before the application, and before a token is looked at: bodies of
-unknown or excessive length, compressed bodies, bodies where none belongs, and talkative watchers.
+Requests are refused here before the application runs and before a token is checked: bodies of
+unknown or excessive length, compressed or unexpected bodies, and clients that send too much.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ HEAD_MAX_BYTES = 16_384
 """Request line and headers."""
 HEADERS_MAX = 64
 SLICE_BYTES = 16_384
-"""This much is parsed at a time, so that the limits are checked in between."""
+"""Bytes parsed at a time, so that the limits are checked in between."""
 MESSAGE_MAX_BYTES = 4096
-"""A WebSocket message; watchers have nothing to say."""
+"""Limit of a WebSocket message; clients send none."""
 RECEIVED_BURST_BYTES, RECEIVED_BYTES_PER_S = 2 * HEAD_MAX_BYTES, 1024
-"""From one watcher, header and frames; answers to pings take a few bytes a second."""
+"""Per client, header and frames; pong frames take a few bytes per second."""
 LOGGED_PER_S, LOGGED_BURST = 0.1, 10
 PROBLEM_JSON = b"application/problem+json"
 
@@ -99,7 +99,7 @@ def _refusal(request: h11.Request) -> tuple[int, str] | None:
 
 
 class LimitedWebSocket(WebSocketsSansIOProtocol):
-    """WebSocket whose client may say little."""
+    """WebSocket with a limit on received bytes."""
 
     def __init__(self, *arguments: Any, **named: Any) -> None:
         super().__init__(*arguments, **named)

@@ -1,6 +1,6 @@
-"""What the kernel forbids the page's process towards the others (Landlock, landlock(7)).
+"""Landlock restrictions of the monitoring process (landlock(7)).
 
-It may not start programs, look into or change processes of its user that are not its own (ptrace,
+It may not start programs, read or change processes of its user that are not its own (ptrace,
 /proc/PID/mem, process_vm_writev), nor send them signals. Files are not restricted here.
 """
 
@@ -22,7 +22,7 @@ PR_SET_NO_NEW_PRIVS: Final = 38
 
 
 def restrict() -> bool:
-    """Restrict this thread and those it starts; False where the kernel cannot."""
+    """Restrict this thread and those it starts; False if the kernel does not support it."""
     libc = ctypes.CDLL(None, use_errno=True)
     abi = libc.syscall(CREATE_RULESET, None, ctypes.c_size_t(0), ABI_VERSION)
     if abi < 1:

@@ -20,7 +20,7 @@ PHASES = tuple(phase.value for phase in Phase)
 
 
 def exposition(state: FlightState) -> bytes:
-    """The text that `/metrics` answers."""
+    """The response of `/metrics`."""
     registry = CollectorRegistry()
     registry.register(_FlightCollector(state))
     return generate_latest(registry)
@@ -50,7 +50,7 @@ class _FlightCollector(Collector):
         yield phase
         yield from self._ledger(status.get("ledger") or {})
         verdicts = CounterMetricFamily(
-            "syntopic_exposure_verdicts", "Exposures judged, by verdict.", labels=["verdict"]
+            "syntopic_exposure_verdicts", "Exposures by verdict.", labels=["verdict"]
         )
         for verdict, count in brief["verdicts"].items():
             verdicts.add_metric([verdict], count)
@@ -95,7 +95,7 @@ class _FlightCollector(Collector):
         )
 
     def _disks(self, disks: Sequence[Mapping[str, Any]]) -> Iterator[Metric]:
-        """What is known of each disk; nothing where the mission has one of which nothing is."""
+        """Known properties of each disk; empty if none is known."""
         figures = {
             "syntopic_disk_in_use": ("1 while a disk is in use.", "state"),
             "syntopic_disk_healthy": ("1 while a disk states no problem.", "healthy"),

@@ -1,7 +1,7 @@
-"""What watching needs: its port, tokens, certificate, keys and addresses.
+"""Prerequisites of monitoring: port, tokens, certificate, keys and addresses.
 
 Looked at by `syntopic check`, and by the watch process at its start, which reports the same
-sentences; the flight goes on without what fails here.
+sentences; the flight continues without what fails here.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class WatchError(DaemonError):
 
 
 def check_monitoring(settings: WatchSection, *, port: bool = True) -> Iterator[CheckResult]:
-    """What was found of each thing.
+    """Check each prerequisite.
 
     Args:
         settings: `[watch]` of the configuration.
@@ -83,24 +83,24 @@ def _tokens(path: Path | None) -> Iterator[CheckResult]:
     try:
         tokens = read_tokens(path)
     except TokenError as error:
-        yield failed("watch", "tokens", f"{error}; nobody may command with a token")
+        yield failed("watch", "tokens", f"{error}; no commands with a token")
         return
     if not path.exists():
-        sentence = f"nobody has a token yet; make one: syntopic token add NAME --file {path}"
+        sentence = f"no tokens yet; create one: syntopic token add NAME --file {path}"
         yield passed("watch", "tokens", sentence)
         return
     yield passed("watch", "tokens", f"{len(tokens.holders)} holders")
 
 
 def _certificate(settings: WatchSection) -> Iterator[CheckResult]:
-    """Whether there is a usable certificate, and whether clients accept it."""
+    """Check that a certificate is usable and that clients accept it."""
     path, key = settings.tls_certificate, settings.tls_key
     if path is None or key is None:
         return
     try:
         certificate = read_certificate(path, server_context(path, key))
     except TlsCertificateError as error:
-        yield failed("watch", "certificate", f"{error}. Nobody can watch")
+        yield failed("watch", "certificate", f"{error}. Monitoring is not possible")
         return
     yield passed("watch", "certificate")
     now_s = time.time()
@@ -129,10 +129,10 @@ def _control(settings: WatchSection) -> Iterator[CheckResult]:
         )
         yield failed("watch", "control", sentence)
     elif not path.parent.is_dir():
-        sentence = f"{path.parent} is no folder; [watch] control names a path in a folder"
+        sentence = f"{path.parent} is not a folder; [watch] control names a path in a folder"
         yield failed("watch", "control", sentence)
     elif path.exists() and not stat.S_ISSOCK(path.lstat().st_mode):
-        yield failed("watch", "control", f"{path} exists and is no socket; remove it")
+        yield failed("watch", "control", f"{path} exists and is not a socket; remove it")
     else:
         yield passed("watch", "control")
 

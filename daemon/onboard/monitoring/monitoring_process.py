@@ -62,11 +62,10 @@ from processing.rig import Rig, RigError, load_rig
 
 COVERAGE_UPDATE_S = 10.0
 RENEWAL_S = 5.0
-"""How often the certificate's files are looked at."""
+"""Interval at which the certificate files are checked."""
 
 PING_S, PONG_TIMEOUT_S = 5.0, 10.0
-"""So often a watcher is asked whether it still listens, and has so long to answer: what the kernel
-holds for one that stalls may be minutes of telemetry."""
+"""Interval and timeout of pings; the kernel may buffer minutes of telemetry for a stalled client."""
 
 
 def main(link: PageConnection, settings: WatchSection, plan: PlanSection | None = None) -> None:
@@ -167,7 +166,7 @@ async def _serve(link: PageConnection, settings: WatchSection, plan: PlanSection
 def _guarded(
     app: FastAPI, settings: WatchSection, tokens: Tokens, connections: Connections
 ) -> Application:
-    """The application behind what every request passes first, outermost last."""
+    """The application with its request filters, outermost last."""
 
     def is_authenticated(token: str) -> bool:
         return tokens.holder_of(token) is not None
@@ -221,7 +220,7 @@ def _certificate_files(settings: WatchSection) -> CertificateFiles | None:
 
 
 async def _renew(files: CertificateFiles | None, link: PageConnection) -> None:
-    """Use a renewed certificate without a restart; connections that are open keep theirs."""
+    """Use a renewed certificate without a restart; open connections keep the previous one."""
     while files is not None:
         await asyncio.sleep(RENEWAL_S)
         try:
@@ -230,7 +229,7 @@ async def _renew(files: CertificateFiles | None, link: PageConnection) -> None:
             problem = ""
         except TlsCertificateError as error:
             problem = f"{error}. The previous certificate is still used"
-        sentence = problem or "the renewed certificate is used from now on"
+        sentence = problem or "the renewed certificate is in use"
         event = {"event": "tls-certificate", "fault": bool(problem), "sentence": sentence}
         link.send(ServiceEvent(event))
 
@@ -249,7 +248,7 @@ async def _camera(
     ground: _MissionGeometry,
     link: PageConnection,
 ) -> MavlinkCamera | None:
-    """The rig as a camera of the vehicle, where that is wanted and possible."""
+    """The rig as a MAVLink camera, if configured and possible."""
     if settings.mavlink is None:
         return None
 
@@ -262,7 +261,7 @@ async def _camera(
         )
         await camera.begin()
     except (MissingExtraError, OSError, ValueError) as error:
-        sentence = f"no MAVLink camera: {error}; look at [watch.mavlink]"
+        sentence = f"no MAVLink camera: {error}; check [watch.mavlink]"
         link.send(ServiceEvent(_absent_event("mavlink camera", sentence)))
         return None
     return camera
@@ -271,7 +270,7 @@ async def _camera(
 async def _control(
     settings: WatchSection, state: FlightState, gateway: CommandGateway, link: PageConnection
 ) -> ControlSocket | None:
-    """The Unix socket for commands, where that is wanted and possible."""
+    """The Unix socket for commands, if configured and possible."""
     if settings.control is None:
         return None
 
@@ -288,7 +287,7 @@ async def _control(
 
 
 class _MissionGeometry:
-    """Footprints for the map, once it is known which rig flies and how it is mounted."""
+    """Footprints for the map, after the rig and its mounting are known."""
 
     def __init__(self) -> None:
         self.state: FlightState | None = None
@@ -297,13 +296,13 @@ class _MissionGeometry:
 
     @property
     def rig(self) -> Rig | None:
-        """The rig that flies, once that is known."""
+        """The rig of the mission; None before it is known."""
         geometry = self._load()
         return None if geometry is None else geometry[0]
 
     @property
     def height_m(self) -> float | None:
-        """Of the ground, as planned."""
+        """Planned height of the ground."""
         geometry = self._load()
         return None if geometry is None else geometry[2]
 
@@ -315,7 +314,7 @@ class _MissionGeometry:
         return self._geometry
 
     def footprint_corners(self, navigation: Mapping[str, Any]) -> list[list[float]] | None:
-        """Corners [latitude, longitude] of an exposure; None where they are not to be had."""
+        """Corners [latitude, longitude] of an exposure; None if they cannot be computed."""
         geometry = self._load()
         if geometry is None:
             return None

@@ -21,11 +21,11 @@ NO_PLAN = "this mission is flown without a plan ([plan] file)"
 
 
 def add_plan(app: FastAPI, coverage: Coverage, watcher: Depends) -> None:
-    """Add the routes; `watcher` is who may look."""
+    """Add the routes; `watcher` authorizes readers."""
 
     @app.get("/api/v1/plan", dependencies=[watcher], tags=["plan"])
     async def plan() -> dict[str, Any]:
-        """Planned lines and what the project asks for; an empty object without a plan."""
+        """Planned lines and the specification; an empty object without a plan."""
         return coverage.plan_json() or {}
 
     @app.get("/api/v1/advice", dependencies=[watcher], tags=["plan"])
@@ -46,7 +46,7 @@ def add_plan(app: FastAPI, coverage: Coverage, watcher: Depends) -> None:
         responses={200: {"content": {kind: {} for kind in KINDS.values()}}},
     )
     async def fly_again(file: ReflightFile) -> Response:
-        """The same segments as a plan (GeoJSON), for a map (KML), as a MAVLink mission."""
+        """The segments as a plan (GeoJSON), for maps (KML), or as a MAVLink mission."""
         advice_task = coverage.advice_task()
         if advice_task is None:
             raise HTTPException(404, NO_PLAN)

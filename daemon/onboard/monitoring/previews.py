@@ -14,7 +14,7 @@ from typing import Any
 from daemon.mission.layout import exposure_name
 
 PIECE_BYTES = 700
-"""A piece fits into a datagram, and into the burst of the thinnest link."""
+"""A piece fits into a datagram and into the burst of the slowest link."""
 
 THUMBNAIL_MAX_BYTES = 40_000
 RESIDUALS_MAX_BYTES = 1_000_000
@@ -31,7 +31,7 @@ class Preview:
 
 
 def read_preview(mission: str | None, number: int) -> Preview:
-    """What is on disk of an exposure; nothing where nothing, or nothing of use, is there."""
+    """Read the preview of an exposure; empty if no usable file exists."""
     if mission is None:
         return Preview()
     folder = Path(mission) / "L2" / exposure_name(number)

@@ -17,11 +17,11 @@ from daemon.onboard.monitoring.flight_state import PARTS, FlightState
 
 VERSION = 1
 MIN_BYTES_PER_S = 1000
-"""Below this not even what is brief gets through once in a few seconds."""
+"""Below this rate not even the brief state fits once in a few seconds."""
 
 BRIEF_SHARE = 0.5
 ARRAY_HEAD_BYTES = 3
-"""Of a list of up to 65535 items."""
+"""Header of a list of up to 65535 items."""
 
 BURST_S = 2.0
 """Unused budget is accumulated for at most this time."""
@@ -53,7 +53,7 @@ class Subscription:
         record: dict[str, Any] = {"version": VERSION, **state.brief()}
         nbytes = packed_nbytes(record)
         left = self._credit - nbytes
-        # What is brief may have half of the budget; a new fault waits for nothing but credit.
+        # The brief state may use half of the budget; a new fault is sent as soon as credit allows.
         pause_s = nbytes / (BRIEF_SHARE * self.bytes_per_s)
         is_too_soon = now_s - self._sent_s < pause_s and record["faults"] == self._sent_faults
         if left < 0 or is_too_soon:

@@ -46,7 +46,7 @@ _PRIVATE = (
 
 @dataclass(frozen=True)
 class IssuedCertificate:
-    """What was made: the files, the names in the certificate, and the authority's SHA-256."""
+    """The created files, the names in the certificate, and the SHA-256 of the authority."""
 
     certificate: Path
     key: Path
@@ -63,9 +63,9 @@ def issue_certificate(
     names: Sequence[str] = (),
     days: int = SERVER_DAYS,
 ) -> IssuedCertificate:
-    """Make a server certificate, and the authority that signs it where there is none yet.
+    """Create a server certificate, and its authority if there is none.
 
-    What exists is used again: the authority, and the server's key, so that a renewal replaces one
+    Existing files are used again: the authority, and the server's key, so that a renewal replaces one
     file, at once.
 
     Args:
@@ -113,7 +113,7 @@ def issue_certificate(
 
 
 def machine_addresses() -> tuple[str, ...]:
-    """The addresses of this machine's interfaces, IPv4 first; none that is only link-local."""
+    """The addresses of this machine's interfaces, IPv4 first, without link-local ones."""
     require("watch")
     import ifaddr
 
@@ -164,7 +164,7 @@ class _Openssl:
 
 
 def _create_key(openssl: _Openssl, path: Path, *, mode: int) -> None:
-    """A key of the curve P-256, where there is none yet."""
+    """Create a key of the curve P-256 if there is none."""
     if not path.exists():
         created = openssl("genpkey", "-algorithm", "EC", "-pkeyopt", "ec_paramgen_curve:P-256")
         durable.replace_file(path, created, mode=mode)

@@ -47,19 +47,19 @@ def server_context(certificate: Path, key: Path) -> ssl.SSLContext:
     Raises:
         TlsCertificateError: a file is missing or damaged, the key belongs to another certificate,
         is
-            encrypted, or can be read by everybody.
+            encrypted, or readable by all users.
     """
     for path, setting in ((certificate, "tls_certificate"), (key, "tls_key")):
         mode = _mode_of_file(path, setting)
     if mode & 0o007:
         raise TlsCertificateError(
-            f"{key} can be read or changed by everybody on this machine, and so is no secret; make "
-            f"a new one, or if nobody has read it: chmod 640 {key}"
+            f"{key} can be read or changed by all users of this machine and is not secret; make "
+            f"a new one, or if it was not read: chmod 640 {key}"
         )
 
     def refuse_to_decrypt() -> str:
         raise TlsCertificateError(
-            f"{key} is encrypted, and a service has nobody to ask for its passphrase; store it "
+            f"{key} is encrypted, and the service has no passphrase; store it "
             f"without one: openssl pkey -in {key} -out PLAIN"
         )
 
@@ -109,7 +109,7 @@ def read_certificate(path: Path, context: ssl.SSLContext) -> Certificate:
         stated: dict[str, Any] = client_side.getpeercert() or {}
     except (OSError, ValueError) as error:
         raise TlsCertificateError(
-            f"{path} is no certificate for a server ({error}); make one: syntopic certificate"
+            f"{path} is not a server certificate ({error}); make one: syntopic certificate"
         ) from error
     alternatives = stated.get("subjectAltName", ())
     return Certificate(
@@ -121,7 +121,7 @@ def read_certificate(path: Path, context: ssl.SSLContext) -> Certificate:
 
 
 def validity_problem(certificate: Certificate, now_s: float) -> str | None:
-    """Why no client accepts the certificate at this time; None if its dates are valid."""
+    """The reason why clients reject the certificate at this time; None if its dates are valid."""
     if now_s < certificate.begins_s:
         return (
             f"the certificate is valid only from {_date(certificate.begins_s)} on; set the clock "
@@ -136,7 +136,7 @@ def validity_problem(certificate: Certificate, now_s: float) -> str | None:
 
 
 def expiry_warning(certificate: Certificate, now_s: float) -> str | None:
-    """A sentence where the certificate expires within 30 days."""
+    """A warning if the certificate expires within 30 days; else None."""
     left_s = certificate.ends_s - now_s
     if not 0 <= left_s < EXPIRES_SOON_S:
         return None
@@ -147,7 +147,7 @@ def expiry_warning(certificate: Certificate, now_s: float) -> str | None:
 
 
 def name_problem(certificate: Certificate, host: str, names: Collection[str]) -> str | None:
-    """What clients would miss in the certificate; None if nothing.
+    """Names missing in the certificate, as a message; None if complete.
 
     Args:
         certificate: of the server.
@@ -172,13 +172,13 @@ def name_problem(certificate: Certificate, host: str, names: Collection[str]) ->
 
 
 def machine_names() -> tuple[str, ...]:
-    """The names of this machine: by multicast DNS, as it calls itself, and by its name server."""
+    """The names of this machine: multicast DNS, host name, and fully qualified name."""
     name = socket.gethostname().lower()
     return tuple(dict.fromkeys((f"{name.partition('.')[0]}.local", name, socket.getfqdn().lower())))
 
 
 class CertificateFiles:
-    """The two files, looked at again and again: a renewed certificate needs no restart.
+    """The two files, checked periodically; a renewed certificate needs no restart.
 
     Args:
         certificate: PEM, the server's certificate first.
@@ -193,7 +193,7 @@ class CertificateFiles:
         self._refused = self._stamps
 
     def renewed(self) -> bool:
-        """Whether the files were changed and are used now.
+        """Load the files if they changed; whether they are in use.
 
         Raises:
             TlsCertificateError: they were changed and cannot be used, raised once; `context`
@@ -232,7 +232,9 @@ def _mode_of_file(path: Path, setting: str) -> int:
             f"{path} cannot be read ({error.strerror}); [watch] {setting} names a PEM file"
         ) from error
     if not stat.S_ISREG(mode):
-        raise TlsCertificateError(f"{path} is no regular file; [watch] {setting} names a PEM file")
+        raise TlsCertificateError(
+            f"{path} is not a regular file; [watch] {setting} names a PEM file"
+        )
     return mode
 
 

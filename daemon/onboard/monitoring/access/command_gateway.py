@@ -1,4 +1,4 @@
-"""The way from a watcher's command to the service and its answer back.
+"""Path of commands to the service and of its answers back.
 
 Every command passes here, whatever way it came, and needs a role; an attempt that is refused is
 recorded. The service decides the rest: a command gets a number and waits for its answer, for a
@@ -25,11 +25,11 @@ class AnswerTimeoutError(RuntimeError):
 
 
 class NotPermittedError(RuntimeError):
-    """The command needs a role that its sender does not have."""
+    """The sender does not have the required role."""
 
 
 class CommandGateway:
-    """Commands on their way.
+    """Pending commands.
 
     Args:
         send: hands a command, or the record of a refused one, to the service; never blocks for
@@ -44,7 +44,7 @@ class CommandGateway:
         self._waiting: dict[int, asyncio.Future[Answer]] = {}
 
     async def command(self, name: str, arguments: Mapping[str, Any], by: Principal) -> Answer:
-        """Give a command and wait for the answer.
+        """Send a command and wait for the answer.
 
         Raises:
             NotPermittedError: the role does not permit it; the attempt is recorded.
@@ -61,13 +61,13 @@ class CommandGateway:
             return await asyncio.wait_for(answer, ANSWER_TIMEOUT_S)
         except TimeoutError as error:
             raise AnswerTimeoutError(
-                f"the service did not answer within {ANSWER_TIMEOUT_S:.0f} s; look at its log"
+                f"the service did not answer within {ANSWER_TIMEOUT_S:.0f} s; see its log"
             ) from error
         finally:
             del self._waiting[number]
 
     def admit(self, name: str, by: Principal) -> None:
-        """Make sure that a role permits a command, before anything else of it is looked at.
+        """Check that a role permits a command, before its arguments are read.
 
         Raises:
             NotPermittedError: it does not; the attempt is recorded.
@@ -100,7 +100,7 @@ class CommandGateway:
             self._send(CommandRefused("several", "several", "none", "", sentence, count))
 
     def on_answer(self, answer: Answer) -> None:
-        """The service's answer has come; one that is too late is dropped."""
+        """Handle an answer of the service; a late one is dropped."""
         waiting = self._waiting.get(answer.number)
         if waiting is not None and not waiting.done():
             waiting.set_result(answer)

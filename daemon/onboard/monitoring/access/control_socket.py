@@ -1,4 +1,4 @@
-"""Commands over a Unix socket, for those whom the machine itself knows to be of a group.
+"""Commands over a Unix socket, authorized by peer credentials and group.
 
 Members of `control_group` are operators; root, the service's own user and members of
 `control_administrator_group` are administrators.
@@ -40,11 +40,11 @@ from daemon.onboard.service.command_rules import CommandBody
 SO_PEERGROUPS: Final = 59
 """Of Linux 4.13, <asm-generic/socket.h>; Python has no name for it."""
 GROUPS_MAX: Final = 256
-"""Python asks for 1024 bytes at most. Whoever is in more groups is taken by the first one alone."""
+"""Python reads 1024 bytes at most. Of a user in more groups only the first group counts."""
 LINE_MAX_BYTES: Final = 16_384
 ANSWER_MAX_BYTES: Final = 1_000_000
 STATE: Final = "state"
-"""Asks for what the service knows of itself; nothing is done, and nothing goes to the log."""
+"""Query of the state; changes nothing and is not logged."""
 IDLE_TIMEOUT_S: Final = 30.0
 ANSWER_TIMEOUT_S: Final = 10.0
 UNAUTHORIZED_TIMEOUT_S: Final = 1.0
@@ -57,7 +57,7 @@ class ControlError(DaemonError):
 
 @dataclass(frozen=True)
 class PeerProcess:
-    """Who is at the other end, by the kernel."""
+    """Peer credentials of a client."""
 
     pid: int
     uid: int
@@ -73,7 +73,7 @@ class PeerProcess:
 
 
 def peer_process(connection: socket.socket) -> PeerProcess:
-    """Who connected, at the time of connecting."""
+    """Peer credentials at the time of connecting."""
     layout = struct.Struct("3i")
     found = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, layout.size)
     pid, uid, gid = layout.unpack(found)
@@ -86,12 +86,12 @@ def peer_process(connection: socket.socket) -> PeerProcess:
 
 
 class ControlSocket:
-    """The socket, and what is asked over it.
+    """The socket and its requests.
 
     Args:
         path: where it is; the folder must be there.
-        group: whose members are operators; None for the group the service runs as.
-        administrators: the group whose members are administrators; None for none.
+        group: its members are operators; None: the group of the service.
+        administrators: its members are administrators; None: no group.
         gate: the way to the service.
         state: what a fault that is acknowledged leaves.
     """
@@ -124,14 +124,14 @@ class ControlSocket:
         )
 
     def end(self) -> None:
-        """Listen no more; the path is free again."""
+        """Stop listening and remove the socket."""
         if self._server is not None:
             self._server.close()
             with suppress(OSError):
                 self.path.unlink()
 
     def role_of(self, caller: PeerProcess) -> Role | None:
-        """The role of a process, by its user and groups; None for one that may not command."""
+        """The role of a process by its user and groups; None: not authorized."""
         if caller.uid in (0, os.geteuid()) or self._administrators in caller.groups:
             return "administrator"
         return "operator" if self._gid in caller.groups else None
@@ -151,17 +151,17 @@ class ControlSocket:
                 finally:
                     self._callers -= 1
         except (TimeoutError, ConnectionError, ValueError):
-            pass  # it stalled, went, or sent a line without end; nothing is kept for it
+            pass  # it stalled, disconnected, or sent an endless line
         finally:
             writer.close()
 
     async def _refuse(
         self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, by: Principal
     ) -> None:
-        """Refuse a process that may not command, and record what it asked for."""
+        """Refuse an unauthorized process and record its request."""
         sentence = f"{by.name} may not command; the group {self._group} may"
         attempted: tuple[str, Any] | str = ""
-        # Unread bytes would take the answer with them when the socket closes.
+        # Unread bytes would discard the answer when the socket closes.
         with suppress(TimeoutError, ValueError):
             attempted = _request(await asyncio.wait_for(reader.readline(), UNAUTHORIZED_TIMEOUT_S))
         self._gateway.refuse("" if isinstance(attempted, str) else attempted[0], by, sentence)
@@ -192,7 +192,7 @@ class ControlSocket:
         return answer.done, answer.sentence
 
     def _state_now(self) -> dict[str, Any]:
-        """What `ask` returns."""
+        """The state, as `ask` returns it."""
         brief = self._state.brief()
         devices = [
             {key: device.get(key) for key in ("kind", "name", "state", "sentence")}
@@ -214,10 +214,10 @@ class ControlSocket:
 
 
 def send_command(path: Path, name: str, arguments: Mapping[str, Any]) -> tuple[bool, str]:
-    """Give one command over a socket; whether it was done, and the service's sentence.
+    """Send one command over a socket; whether it succeeded, and the message of the service.
 
     Raises:
-        ControlError: nobody listens, it may not be reached, or no answer came in time.
+        ControlError: no service listens, access is denied, or the answer timed out.
     """
     answer = _exchange(path, {"command": name, "arguments": dict(arguments)})
     return bool(answer.get("done")), str(answer.get("sentence", ""))
@@ -246,7 +246,7 @@ def _exchange(path: Path, query: Mapping[str, Any]) -> Mapping[str, Any]:
             with connection.makefile("rb") as answers:
                 answer = json.loads(answers.readline(ANSWER_MAX_BYTES))
     except PermissionError as error:
-        raise ControlError(f"{path}: permission denied; ask for the group that commands") from error
+        raise ControlError(f"{path}: permission denied; join the group that commands") from error
     except (OSError, ValueError) as error:
         raise ControlError(
             f"{path}: no answer ({error}); does the service run, with [watch] control?"
@@ -255,7 +255,7 @@ def _exchange(path: Path, query: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def _request(line: bytes) -> tuple[str, dict[str, Any]] | str:
-    """The command of a line and its arguments, or what is wrong with it."""
+    """The command and arguments of a line, or an error message."""
     try:
         query = json.loads(line)
         name, arguments = query["command"], query.get("arguments", {})
@@ -322,10 +322,10 @@ def _listen(path: Path, gid: int) -> socket.socket:
 
 
 def _remove_stale_socket(path: Path) -> None:
-    """Take away a socket that nobody listens at any more, and nothing else."""
+    """Remove a socket without a listener, and nothing else."""
     try:
         if not stat.S_ISSOCK(path.lstat().st_mode):
-            raise FileExistsError(17, "something that is no socket lies there")
+            raise FileExistsError(17, "a file that is not a socket exists")
     except FileNotFoundError:
         return
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
@@ -335,4 +335,4 @@ def _remove_stale_socket(path: Path) -> None:
         except ConnectionRefusedError:
             path.unlink()
             return
-    raise FileExistsError(17, "another service listens there")
+    raise FileExistsError(17, "another service listens on it")

@@ -1,7 +1,7 @@
-"""Who gives a command, and whether their role permits it.
+"""Sender of a command, and authorization by role.
 
 A command reaches the service only through `daemon.onboard.monitoring.access.command_gateway`, which
-asks here, whatever way it came: page, API, MAVLink or control socket.
+calls this, for page, API, MAVLink and control socket.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ __all__ = ["COMMAND_ROLES", "ROLES", "Principal", "Role", "missing_role"]
 
 @dataclass(frozen=True)
 class Principal:
-    """Who gives a command: name, role (None: unknown, nothing is permitted), and address."""
+    """Sender of a command: name, role (None: unknown, nothing is permitted), and address."""
 
     name: str
     role: Role | None
@@ -23,7 +23,7 @@ class Principal:
 
 
 def missing_role(principal: Principal, command: str) -> Role | None:
-    """The role that `principal` needs for a command and does not have; None if permitted."""
+    """The role required for a command; None if `principal` has it."""
     if permits(principal.role, command):
         return None
     return COMMAND_ROLES.get(command, ROLES[-1])

@@ -11,7 +11,7 @@ from daemon.onboard.monitoring.access.control_socket import ControlError, query_
 from daemon.onboard.preflight.check_results import CheckOutcome, CheckResult, failed, passed
 
 STATES = {"ready": CheckOutcome.PASS, "found": CheckOutcome.PASS}
-"""Of a device; others are failures."""
+"""State of a device; others are failures."""
 
 
 def query_service(configuration: Configuration, mission: Mission) -> list[CheckResult]:
@@ -20,7 +20,7 @@ def query_service(configuration: Configuration, mission: Mission) -> list[CheckR
     control = None if configuration.watch is None else configuration.watch.control
     if control is None:
         sentence = (
-            f"{runs}; it cannot be asked without [watch] control = PATH. Look at its page, or "
+            f"{runs}; it cannot be queried without [watch] control = PATH. See its page, or "
             "stop it and check again"
         )
         return [CheckResult("service", mission.id, CheckOutcome.WAITING, sentence)]

@@ -1,6 +1,6 @@
-"""Who may command: tokens, kept as hashes, compared in constant time, guessing slowed down.
+"""Access tokens: stored as hashes, compared in constant time, with limited attempts.
 
-A token is 256 random bits, so that one SHA-256 is hash enough. It is shown once, when it is made.
+A token is 256 random bits, so that one SHA-256 is a sufficient hash. It is shown once, on creation.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class TokenError(DaemonError):
 
 @dataclass(frozen=True)
 class TokenHolder:
-    """Whom a token belongs to, and what they may do."""
+    """Holder of a token, with role."""
 
     name: str
     role: Role
@@ -48,7 +48,7 @@ class Tokens:
     holders: Mapping[str, TokenHolder]
 
     def holder_of(self, token: str) -> TokenHolder | None:
-        """Who holds a token; every hash is looked at, whatever the token."""
+        """The holder of a token; every hash is compared, in constant time."""
         given = _hash_of(token)
         found = None
         for known, holder in self.holders.items():
@@ -58,7 +58,7 @@ class Tokens:
 
 
 class FailedAttempts:
-    """Counts wrong tokens by address; more than a few a minute are not even looked at."""
+    """Counts wrong tokens by address; more than a few per minute are refused unchecked."""
 
     def __init__(self) -> None:
         self._failures: dict[str, deque[float]] = {}
@@ -78,16 +78,16 @@ class FailedAttempts:
 
 
 def read_tokens(path: Path | None) -> Tokens:
-    """The holders of a token file; nobody where there is none.
+    """The holders of a token file; empty if the file does not exist.
 
     Raises:
-        TokenError: not readable, not as written by `add_token`, or readable by everybody.
+        TokenError: not readable, not as written by `add_token`, or readable by all users.
     """
     if path is None or not path.exists():
         return Tokens({})
     try:
         if path.stat().st_mode & 0o007:
-            raise TokenError(f"{path} is open to everybody; chmod 640 {path}")
+            raise TokenError(f"{path} is readable by all users; run: chmod 640 {path}")
         content = parse_toml(path.read_bytes())
     except (OSError, ValueError) as error:
         raise TokenError(f"{path}: cannot be read ({error})") from error
@@ -106,7 +106,7 @@ def read_tokens(path: Path | None) -> Tokens:
 
 
 def add_token(path: Path, name: str, role: Role) -> str:
-    """Make a token for somebody, note its hash, and return it; it cannot be had again.
+    """Create a token, store its hash, and return it; it cannot be read again.
 
     Raises:
         TokenError: a name that is none, or that has a token already.
@@ -123,15 +123,15 @@ def add_token(path: Path, name: str, role: Role) -> str:
 
 
 def remove_token(path: Path, name: str) -> None:
-    """Take a token back.
+    """Revoke a token.
 
     Raises:
-        TokenError: nobody of that name has one.
+        TokenError: no token has that name.
     """
     holders = dict(read_tokens(path).holders)
     remaining = {hashed: holder for hashed, holder in holders.items() if holder.name != name}
     if len(remaining) == len(holders):
-        raise TokenError(f"{path}: nobody called {name} has a token")
+        raise TokenError(f"{path}: no token has the name {name}")
     _write(path, remaining)
 
 

@@ -1,1 +1,1 @@
-"""The other side of the page: `syntopic monitor` and discovery."""
+"""Client side of monitoring: `syntopic monitor` and discovery."""

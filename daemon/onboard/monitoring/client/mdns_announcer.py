@@ -31,7 +31,7 @@ class MdnsAnnouncer:
         self._task: asyncio.Task[None] | None = None
 
     async def begin(self) -> None:
-        """Announce, and keep the text record up to date."""
+        """Announce the service and update its text record."""
         if not self._settings.announce:
             return
         from zeroconf import IPVersion
@@ -41,7 +41,7 @@ class MdnsAnnouncer:
         self._task = asyncio.create_task(self._refresh())
 
     async def end(self) -> None:
-        """Say good-bye."""
+        """Withdraw the announcement."""
         if self._task is not None:
             self._task.cancel()
             with suppress(asyncio.CancelledError):
@@ -94,7 +94,7 @@ def _truncated(text: object) -> str:
 
 
 def _addresses(host: str) -> list[str]:
-    """What is to be dialled: the address listened on, or every IPv4 one of this machine."""
+    """The announced addresses: the one listened on, or every IPv4 address of this machine."""
     if host not in ("0.0.0.0", "::", "localhost"):
         return [host]
     found = [address for address in machine_addresses() if ":" not in address]

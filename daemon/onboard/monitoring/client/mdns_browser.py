@@ -1,6 +1,6 @@
-"""Services that announce themselves by multicast DNS.
+"""Discovery of services by multicast DNS.
 
-Anybody on the network can announce anything: what is found is shown to a person, with texts made
+Any host on the network can announce anything: results are shown to a person, with texts made
 printable, and decides nothing.
 """
 
@@ -31,7 +31,7 @@ class AnnouncedService:
 
 
 def find_services(within_s: float = BROWSE_S) -> list[AnnouncedService]:
-    """Services that announce themselves on this network, 32 at most.
+    """Find announced services on this network, 32 at most.
 
     Args:
         within_s: how long to listen.
@@ -66,7 +66,7 @@ def find_services(within_s: float = BROWSE_S) -> list[AnnouncedService]:
 
 
 def parse_announcement(info: Any) -> AnnouncedService | None:
-    """What a zeroconf ServiceInfo announces; None where it has no address or port."""
+    """The service of a zeroconf ServiceInfo; None without address or port."""
     addresses = info.parsed_addresses()
     if not addresses or not isinstance(info.port, int) or not 0 < info.port < 65536:
         return None

@@ -1,6 +1,6 @@
-"""Telemetry from a service, for programs of ours that watch over the network.
+"""Telemetry client for the network.
 
-The address that a person gives decides about TLS and about where a token goes; no announcement,
+The address given by the user determines TLS and the receiver of a token; no announcement,
 redirect or proxy does.
 """
 
@@ -38,7 +38,7 @@ class ClientError(DaemonError):
 
 @dataclass(frozen=True)
 class ServiceAddress:
-    """Where a service listens, and whether TLS is spoken there."""
+    """Address of a service, and whether it uses TLS."""
 
     host: str
     port: int
@@ -46,13 +46,13 @@ class ServiceAddress:
 
     @property
     def address(self) -> str:
-        """As a person would write it."""
+        """The address as a URL."""
         host = f"[{self.host}]" if ":" in self.host else self.host
         return f"{'https' if self.is_tls else 'http'}://{host}:{self.port}"
 
     @property
     def is_loopback(self) -> bool:
-        """Whether what is sent there stays on this machine."""
+        """Whether the address is on this machine."""
         try:
             return ip_address(self.host).is_loopback
         except ValueError:
@@ -61,10 +61,10 @@ class ServiceAddress:
 
 @dataclass(frozen=True)
 class AccessOptions:
-    """How a service is asked.
+    """Access parameters of a service.
 
     Attributes:
-        token: goes into a header; none if empty.
+        token: sent in a header; none if empty.
         authority: PEM of the authority to trust; those of the system if None.
         is_token_public: send the token without TLS, too.
     """
@@ -100,7 +100,7 @@ def parse_service_address(text: str, *, tls: bool = False) -> ServiceAddress:
         raise ClientError(f"{shown} is no address; write HOST:PORT")
     by_scheme = _SCHEMES[scheme.lower()]
     if by_scheme is False and tls:
-        raise ClientError(f"{shown} is without TLS, and --tls asks for it; write https://")
+        raise ClientError(f"{shown} has no TLS, and --tls requires it; write https://")
     return ServiceAddress(host, port, tls if by_scheme is None else by_scheme)
 
 
@@ -111,11 +111,11 @@ def check_token_transport(service: ServiceAddress, access: AccessOptions) -> Non
         ClientError: it is no token, or it would travel unencrypted beyond this machine.
     """
     if access.token and not _TOKEN.fullmatch(access.token):
-        raise ClientError("the token has characters that no token has; copy it again")
+        raise ClientError("the token contains invalid characters; copy it again")
     may_be_read = not service.is_tls and not service.is_loopback
     if access.token and may_be_read and not access.is_token_public:
         raise ClientError(
-            f"{service.address}: without TLS everybody on the way could read the token; use "
+            f"{service.address}: without TLS the token can be read in transit; use "
             f"https:// (or --tls), or accept that with --token-without-tls"
         )
 
@@ -123,7 +123,7 @@ def check_token_transport(service: ServiceAddress, access: AccessOptions) -> Non
 def telemetry_records(
     service: ServiceAddress, access: AccessOptions, bytes_per_s: float
 ) -> Iterator[dict[str, Any] | None]:
-    """Telemetry for ever, its texts printable; None when the link breaks, which is retried.
+    """Telemetry for ever, with printable texts; None when the connection is lost. It is retried.
 
     Raises:
         ClientError: the first link could not be opened, or what came is no telemetry.
@@ -158,7 +158,7 @@ def _connect(
     context: ssl.SSLContext | None,
     bytes_per_s: float,
 ) -> Any:
-    """An open WebSocket. On a socket of ours no redirect and no proxy is followed."""
+    """An open WebSocket, without redirects and proxies."""
     from websockets.sync.client import connect
 
     opened = socket.create_connection((service.host, service.port), OPEN_TIMEOUT_S)
@@ -229,7 +229,7 @@ def _reason(error: BaseException) -> str:
         return f"refused with status {status}: {reason}"
     if isinstance(error, ConnectionClosed):
         reason = printable(error.rcvd.reason if error.rcvd else "it closed the connection", 160)
-        return f"no telemetry ({reason}); look at the address, and whether reading needs a token"
+        return f"no telemetry ({reason}); check the address, and whether reading requires a token"
     if isinstance(error, OSError):
-        return f"no connection ({printable(str(error), 160)}); look at the address"
-    return f"sends no telemetry ({printable(str(error), 160)}); look at the address"
+        return f"no connection ({printable(str(error), 160)}); check the address"
+    return f"sends no telemetry ({printable(str(error), 160)}); check the address"

@@ -42,7 +42,7 @@ HEARTBEAT_S = 1.0
 TICK_S = 0.1
 SAVE_EVERY_S = 30.0
 SAVE_WITHIN_S = 1.0
-"""How long a command waits for the disk that keeps the last timestamps."""
+"""Time limit for saving the last timestamps."""
 GPS_EPOCH_UNIX_S = 315_964_800
 COORDINATE_UNKNOWN = 2**31 - 1
 """INT32_MAX, as in MAVLink's other messages with a latitude."""
@@ -51,7 +51,7 @@ VENDOR, FIRMWARE = "Syntopic", 1 << 24
 NAME_BYTES = 32
 MODE_IMAGE = 0
 ROLE: Role = "operator"
-"""Of senders that the configuration lets command."""
+"""Role of senders that may command by the configuration."""
 
 _log = logging.getLogger(__name__)
 
@@ -71,9 +71,9 @@ class MavlinkCamera(asyncio.DatagramProtocol):
         ground_height_m: Callable[[], float | None] = lambda: None,
         report: Callable[[str], None] = _log.error,
     ) -> None:
-        """`rig` is asked for the camera's figures, `ground_height_m` for what an exposure is above.
+        """`rig` returns the rig, `ground_height_m` the height of the ground.
 
-        Both are None until a mission has begun. `report` gets a sentence about what is wrong.
+        Both return None before a mission has begun. `report` receives error messages.
         """
         self._settings = settings
         self._state = state
@@ -100,7 +100,7 @@ class MavlinkCamera(asyncio.DatagramProtocol):
         self.counts: dict[str, int] = {}
 
     async def begin(self) -> None:
-        """Open the socket and begin to be alive. OSError: the address is taken."""
+        """Open the socket and start the heartbeat. OSError: the address is in use."""
         scheme, _, rest = self._settings.connect.partition(":")
         host, _, port = rest.rpartition(":")
         address = (host, int(port))
@@ -123,7 +123,7 @@ class MavlinkCamera(asyncio.DatagramProtocol):
         if self._transport is not None:
             self._transport.close()
 
-    # What comes in
+    # Receiving
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = cast(asyncio.DatagramTransport, transport)
@@ -146,7 +146,7 @@ class MavlinkCamera(asyncio.DatagramProtocol):
             self._count("messages")
             is_peer = self._senders.register(addr, now_s, is_signed=is_signed)
             if message.get_type() == "HEARTBEAT" and not is_peer:
-                # One for one: however many others there are, nobody misses that the camera is here.
+                # One heartbeat per heartbeat, so that every peer detects the camera.
                 self._send(self._heartbeat(), addr)
             elif message.get_type() == "COMMAND_LONG" and self._is_for_us(message):
                 self._command(message, addr, is_signed=is_signed)
@@ -194,7 +194,7 @@ class MavlinkCamera(asyncio.DatagramProtocol):
         self._send(encode(), address)
 
     def _execute(self, message: Any, address: Address, action: str, *, is_signed: bool) -> None:
-        """What changes something: only from those the configuration lets."""
+        """Execute a command of an authorized sender."""
         if self._settings.commands != "any" and not (
             self._settings.commands == "signed" and is_signed
         ):
@@ -251,7 +251,7 @@ class MavlinkCamera(asyncio.DatagramProtocol):
             address,
         )
 
-    # What goes out by itself
+    # Unrequested messages
 
     async def _run(self) -> None:
         beat_s, saved_s = -math.inf, time.monotonic()
@@ -282,7 +282,7 @@ class MavlinkCamera(asyncio.DatagramProtocol):
             self._broadcast(self._capture_status())
 
     def _is_final(self, one: Mapping[str, Any]) -> bool:
-        """Whether it is final when and where it was taken, or that it is lost."""
+        """Whether its time and position are final, or it is lost."""
         return one.get("state") == "lost" or "mark_gps_ns" in one
 
     def _broadcast(self, message: Any) -> None:
@@ -417,7 +417,7 @@ class MavlinkCamera(asyncio.DatagramProtocol):
         return signatures
 
     async def _save_timestamps(self) -> None:
-        """What was obeyed is durable before it is; a disk that hangs holds a command up shortly."""
+        """Save the timestamps before executing; a slow disk delays a command briefly."""
         if self._signatures is None or self._signatures.is_saved:
             return
         saving = asyncio.get_running_loop().run_in_executor(self._saver, self._signatures.save)
@@ -433,7 +433,7 @@ class MavlinkCamera(asyncio.DatagramProtocol):
             )
 
     def _advance_clock(self) -> None:
-        """GPS time may only advance the signing clock; that of an emulated flight is not real."""
+        """Advance the signing clock by GPS time; emulated GPS time is not used."""
         brief = self._state.brief()
         unix_us = _utc_us(brief["status"].get("gps_ns"))
         if self._signatures is not None and not brief["simulated"]:
@@ -456,7 +456,7 @@ def _name(text: str) -> list[int]:
 
 
 def _utc_us(gps_ns: object) -> int:
-    """A GPS instant as microseconds of Unix time; 0 where it is not known."""
+    """GPS time as microseconds of Unix time; 0 if unknown."""
     if not isinstance(gps_ns, str):
         return 0
     instant = int(gps_ns)
@@ -465,12 +465,12 @@ def _utc_us(gps_ns: object) -> int:
 
 
 def _scaled(value: float | None, scale: float) -> int:
-    """A coordinate as MAVLink's integer; its largest one means that it is not known."""
+    """A coordinate as MAVLink's integer; the largest value if unknown."""
     return COORDINATE_UNKNOWN if value is None else round(value * scale)
 
 
 def _quaternion(place: Mapping[str, Any]) -> tuple[float, ...]:
-    """Camera attitude w, x, y, z against north, east, down."""
+    """Camera attitude as quaternion w, x, y, z relative to north, east, down."""
     angles = [place.get(f"{name}_rad") for name in _ANGLES]
     if any(angle is None for angle in angles):
         return UNKNOWN_ANGLE

@@ -22,7 +22,7 @@ from daemon.onboard.monitoring.flight_state import FlightState
 from daemon.onboard.monitoring.telemetry import VERSION, packed
 
 DATAGRAM_MAX_BYTES = 1200
-"""Passes every link without being cut in pieces."""
+"""Passes every link without fragmentation."""
 
 BRIEF_EVERY_S = 1.0
 FAULT_EVERY_S = 2.0
@@ -56,7 +56,7 @@ class DatagramScheduler:
     _preview_at: int = -1
 
     def due(self, state: FlightState, now_s: float) -> Iterator[bytes]:
-        """The datagrams that are due now, as far as the budget goes."""
+        """The datagrams that are due, within the budget."""
         passed_s = BURST_S if self._at_s is None else now_s - self._at_s
         limit = max(self.bytes_per_s * BURST_S, DATAGRAM_MAX_BYTES)
         self._credit, self._at_s = min(self._credit + passed_s * self.bytes_per_s, limit), now_s
@@ -100,7 +100,7 @@ class DatagramScheduler:
 
 
 class DatagramReceiver:
-    """A watcher's end: datagrams in any order, with any of them missing, made a state again."""
+    """Receiver: the state from datagrams in any order, with any of them missing."""
 
     def __init__(self) -> None:
         self.brief: dict[str, Any] = {}
@@ -111,14 +111,14 @@ class DatagramReceiver:
         self.rejected_count = 0
 
     def thumbnail(self, number: int) -> bytes | None:
-        """An exposure's JPEG, once all of its pieces are here."""
+        """The JPEG of an exposure; None before all pieces have arrived."""
         pieces = self._pieces.get(number, {})
         if not pieces or len(pieces) < next(iter(pieces.values()))["pieces"]:
             return None
         return b"".join(pieces[k]["data"] for k in sorted(pieces))
 
     def receive(self, datagram: bytes) -> None:
-        """Take one in; what is no datagram of ours is counted."""
+        """Add one datagram; invalid ones are counted."""
         try:
             message = msgpack.unpackb(datagram)
             kind, content = message["kind"], message["content"]
@@ -168,12 +168,12 @@ class DatagramReceiver:
 
 def _check_number(value: object) -> int:
     if isinstance(value, bool) or not isinstance(value, int):
-        raise TypeError("a whole number is needed")
+        raise TypeError("an integer is required")
     return value
 
 
 async def send(state: FlightState, addresses: Mapping[str, tuple[str, int]], budget: float) -> None:
-    """Say it to each address, for ever; a link that refuses costs only its datagrams."""
+    """Send to each address for ever; a failing link loses only its own datagrams."""
     senders = {name: DatagramScheduler(budget) for name in addresses}
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
         link.setblocking(False)
@@ -187,7 +187,7 @@ async def send(state: FlightState, addresses: Mapping[str, tuple[str, int]], bud
 
 
 def _brief_of(state: FlightState) -> dict[str, Any]:
-    """What is brief, and the ids of the faults there are."""
+    """The brief state, with the ids of the faults."""
     brief = state.brief()
     status = dict(brief["status"])
     mission = brief["mission"]
@@ -206,7 +206,7 @@ _DROP_ORDER = ("findings", "found", "valid_area", "footprint", "place", "figures
 
 
 def _datagram(kind: str, content: Mapping[str, Any]) -> bytes:
-    """One datagram; what does not fit loses its least important parts."""
+    """One datagram; the least important parts are dropped if it is too long."""
     remaining = dict(content)
     data = packed({"version": VERSION, "kind": kind, "content": remaining})
     for name in _DROP_ORDER:

@@ -37,7 +37,7 @@ ACTIONS: Mapping[int, str] = {
 
 
 def service_command(action: str, message: Any) -> tuple[str, dict[str, Any]] | None:
-    """The service's command for a MAVLink one; None where its parameters make no sense."""
+    """The service's command for a MAVLink one; None if its parameters are invalid."""
     if action == "stop":
         return "stop", {}
     if action == "once":
@@ -71,7 +71,7 @@ def service_command(action: str, message: Any) -> tuple[str, dict[str, Any]] | N
 
 
 def as_integer(value: float) -> int | None:
-    """A parameter as a whole number; None for what is none, such as NaN."""
+    """A parameter as an integer; None otherwise, such as NaN."""
     return int(value) if math.isfinite(value) and abs(value) < 2**31 else None
 
 

@@ -1,6 +1,6 @@
-"""Who sends MAVLink to the camera: each is parsed apart, and their number is bounded.
+"""Senders of MAVLink to the camera: each has its own parser, and their number is bounded.
 
-What a message asks for is in `daemon.onboard.monitoring.mavlink.camera`.
+Messages are executed in `daemon.onboard.monitoring.mavlink.camera`.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ from drivers.receivers.message_framer import MessageFramer
 
 DATAGRAM_MAX_BYTES: Final = 2048
 STREAMS_MAX: Final = 16
-"""Senders whose messages go on from one datagram to the next."""
+"""Senders whose messages span several datagrams."""
 STREAM_BYTES_PER_S: Final = 8000
-"""For all unsigned ones of these together; searching damaged bytes for messages costs time."""
+"""Limit for all unsigned ones together; searching damaged bytes for messages costs time."""
 PEERS_MAX: Final = 16
 PEER_TIMEOUT_S: Final = 60.0
 
@@ -46,7 +46,7 @@ class Senders:
         return tuple(self._peers)
 
     def messages(self, data: bytes, address: Address, now_s: float) -> tuple[list[bytes], int]:
-        """Whole checked messages of a datagram, and the number of bytes that were none.
+        """Complete, checked messages of a datagram, and the number of other bytes.
 
         A datagram of whole messages, as nearly all are, is parsed alone: nothing that came before
         can damage it. Others are a part of the stream of bytes of their sender.
@@ -59,7 +59,7 @@ class Senders:
             return complete, 0
         if not self._is_signed(address) and not self._spend(len(data), now_s):
             return [], len(data)
-        # Taken out and put back: the last one is the one that was used last.
+        # Removed and inserted again, so that the order is that of last use.
         stream = self._streams.pop(address, None) or self._parser.framer()
         self._streams[address] = stream
         while len(self._streams) > STREAMS_MAX:
@@ -69,7 +69,7 @@ class Senders:
         return stream.feed(data), stream.bad_bytes - before
 
     def register(self, address: Address, now_s: float, *, is_signed: bool) -> bool:
-        """A message of a sender came; whether it is a peer now."""
+        """Register a sender; whether it is a peer now."""
         for old in [a for a, p in self._peers.items() if now_s - p.last_s > PEER_TIMEOUT_S]:
             del self._peers[old]
         peer = self._peers.get(address)

@@ -1,4 +1,4 @@
-"""Signatures of MAVLink messages: whose is right, whose was used before, and the signing clock.
+"""Signatures of MAVLink messages: verification, replay protection, and the signing clock.
 
 The last timestamp of each stream and the clock outlive the process, so that a recorded message is
 refused after a restart as well. Source: https://mavlink.io/en/guide/message_signing.html.
@@ -78,16 +78,16 @@ class Signatures:
         return min(max(host, self._base + passed, 0), TICKS_MAX)
 
     def next_timestamp(self) -> int:
-        """The clock for a message that is sent; later than that of the message before."""
+        """The clock for a message to send; later than that of the previous message."""
         self._sent = max(self.now(), self._sent + 1)
         return self._sent
 
     def advance(self, unix_ns: int) -> None:
-        """Set the clock to that of GPS time, where that is later."""
+        """Set the clock to GPS time if that is later."""
         self._advance((unix_ns - SIGNING_EPOCH_UNIX_NS) // NS_PER_TICK)
 
     def accept(self, frame: bytes) -> bool:
-        """Whether a whole message is signed with the key and was not used before.
+        """Whether a complete message is signed with the key and is not a replay.
 
         The stream advances only after the signature was verified: a forged message with a
         timestamp of the future changes nothing.
@@ -113,7 +113,7 @@ class Signatures:
         return True
 
     def save(self) -> None:
-        """Make what is known durable. OSError: the disk refuses."""
+        """Save the timestamps. OSError: the disk refuses."""
         if self._path is None:
             return
         streams = [[*stream, last] for stream, last in list(self._last.items())]
@@ -155,7 +155,7 @@ def read_key(path: Path) -> bytes:
     """The signing key of a file.
 
     Raises:
-        ValueError: it cannot be read, is no key, or is open to everybody on this computer.
+        ValueError: it cannot be read, is no key, or is readable by all users.
     """
     try:
         with path.open("rb") as file:
@@ -167,7 +167,7 @@ def read_key(path: Path) -> bytes:
         raise ValueError(f"{path}: a signing key has 64 hexadecimal digits")
     if is_open:
         raise ValueError(
-            f"{path}: everybody on this computer may read or change the signing key; run: chmod "
+            f"{path}: all users of this computer may read or change the signing key; run: chmod "
             f"600 {shlex.quote(str(path))}, and use a new key if others could log in"
         )
     return key
@@ -178,7 +178,7 @@ def _checked(content: Any) -> tuple[int, dict[Stream, int]]:
     for system, component, link, last in content["streams"]:
         numbers = (system, component, link)
         if not all(type(n) is int and 0 <= n <= 255 for n in numbers) or not _is_ticks(last):
-            raise ValueError(f"{[*numbers, last]} is no stream")
+            raise ValueError(f"{[*numbers, last]} is not a stream")
         streams[system, component, link] = last
     if not _is_ticks(content["clock"]) or not isinstance(content["key"], str):
         raise ValueError("clock or key is missing")

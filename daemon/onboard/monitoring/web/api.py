@@ -1,7 +1,7 @@
-"""The API over HTTP and WebSocket: state for watchers, commands for those who hold a token.
+"""The API over HTTP and WebSocket: state for readers, commands for token holders.
 
-Errors are problem+json (RFC 9457). What an exposure looks like is read from the mission folder; the
-service is asked for nothing but commands.
+Errors are problem+json (RFC 9457). Products are read from the mission folder; the
+service receives only commands.
 """
 
 from __future__ import annotations
@@ -52,13 +52,13 @@ PAGE = Path(__file__).parent / "page"
 PROBLEM_JSON = "application/problem+json"
 TELEMETRY_TICK_S = 0.05
 SEND_TIMEOUT_S = 5.0
-"""A watcher that does not take a record in this time is let go."""
+"""A client that does not accept a record in this time is disconnected."""
 
 LEAST_COMMAND = "arm"
-"""One of those that need the least role."""
+"""A command with the lowest required role."""
 
 SUBPROTOCOL = "syntopic.v1"
-"""What a browser offers for telemetry, besides its token."""
+"""Subprotocol that a browser offers for telemetry, in addition to its token."""
 
 IMAGES = {
     "quicklook.jpg": "image/jpeg",
@@ -74,7 +74,7 @@ CONTENT_SECURITY_POLICY = (
     "object-src 'none'; require-trusted-types-for 'script'; trusted-types default"
 )
 PRODUCT_POLICY = "sandbox; default-src 'none'; style-src 'unsafe-inline'; img-src data:"
-"""Of a file from a mission: whatever it holds, it is a picture and no page."""
+"""Headers of a file from a mission, so that no browser treats it as a page."""
 
 
 class Problem(BaseModel):
@@ -87,7 +87,7 @@ class Problem(BaseModel):
 
 
 class CommandResponse(BaseModel):
-    """What became of a command."""
+    """Result of a command."""
 
     done: bool
     sentence: str
@@ -120,9 +120,9 @@ CommandName = Literal[
 
 @dataclass(frozen=True)
 class AccessSettings:
-    """Who may look and who may command.
+    """Access of readers and of senders of commands.
 
-    `anonymous_read`: looking needs no token.
+    `anonymous_read`: reading requires no token.
     """
 
     tokens: Tokens
@@ -136,7 +136,7 @@ def create_app(
     coverage: Coverage | None = None,
     connections: Connections | None = None,
 ) -> FastAPI:
-    """The application; it has no state of its own but who is connected."""
+    """The application; its only own state is the open connections."""
     app = FastAPI(
         title="Syntopic",
         description="State, products and commands of an aerial camera in flight.",
@@ -159,7 +159,7 @@ def create_app(
 
 
 class _AccessControl:
-    """Checks tokens; a door is a dependency of a route."""
+    """Checks tokens, as dependencies of routes."""
 
     def __init__(
         self, settings: AccessSettings, gateway: CommandGateway, connections: Connections
@@ -174,7 +174,7 @@ class _AccessControl:
             self.admit(request)
 
     async def command(self, request: Request) -> Principal:
-        """Who gives the command, if their role permits it: before its name and body are judged."""
+        """The authorized sender of a command; checked before its name and body."""
         address, name = _address(request), request.path_params.get("name", "")
         try:
             holder = self.admit(request)
@@ -192,10 +192,10 @@ class _AccessControl:
         self._gateway.refuse(name, by, "there is no such command")
         if missing_role(by, LEAST_COMMAND) is not None:
             raise HTTPException(403, f"{by.name} has the role {by.role}, which gives no commands")
-        return by  # whoever commands at all learns which commands there are
+        return by  # an authorized sender may learn the names of commands
 
     def admit(self, http: HTTPConnection) -> TokenHolder:
-        """Who comes with this token. A valid one is admitted, however many wrong ones came before.
+        """The holder of this token. A valid one is admitted after any number of wrong ones.
 
         Raises:
             HTTPException: 401, or 429 after too many wrong tokens.
@@ -234,7 +234,7 @@ def _add_state(app: FastAPI, state: FlightState, access: _AccessControl) -> None
 
     @app.get("/api/v1/state", dependencies=[watcher], tags=["state"])
     async def whole_state() -> dict[str, Any]:
-        """Everything a watcher needs to begin with."""
+        """The complete state."""
         return state.snapshot()
 
     @app.get("/api/v1/brief", dependencies=[watcher], tags=["state"])
@@ -254,7 +254,7 @@ def _add_state(app: FastAPI, state: FlightState, access: _AccessControl) -> None
 
     @app.get("/api/v1/faults", dependencies=[watcher], tags=["state"])
     async def faults() -> list[dict[str, Any]]:
-        """Faults that stand, or that passed and nobody has acknowledged."""
+        """Active faults, and cleared ones that are not acknowledged."""
         return state.faults()
 
     @app.get("/api/v1/events", dependencies=[watcher], tags=["state"])
@@ -298,7 +298,7 @@ def _add_products(app: FastAPI, state: FlightState, access: _AccessControl) -> N
 
     @app.get("/api/v1/exposures/{number}", dependencies=[watcher], tags=["exposures"])
     async def exposure(number: Number) -> dict[str, Any]:
-        """One exposure: what came, when it was, how it was judged."""
+        """One exposure: frames, time, verdict."""
         found = state.exposure(number)
         if found is None:
             raise HTTPException(404, f"exposure {number} is not known")
@@ -312,7 +312,7 @@ def _add_products(app: FastAPI, state: FlightState, access: _AccessControl) -> N
         responses={200: {"content": {kind: {} for kind in IMAGES.values()}}},
     )
     async def product(number: Number, product: Product) -> FileResponse:
-        """Quick look, residual vectors, histogram or quality report, as they are on disk."""
+        """Quick look, residual vectors, histogram or quality report, as stored."""
         if state.mission_path is None:
             raise HTTPException(404, "no mission yet")
         path = Path(state.mission_path) / "L2" / exposure_name(number) / product
@@ -366,7 +366,7 @@ def _add_telemetry(app: FastAPI, state: FlightState, access: _AccessControl) -> 
         form: Literal["json", "msgpack"] = "msgpack",
         bytes_per_s: float = math.inf,
     ) -> None:
-        """Records as in docs/telemetry.md, from the whole state on, until the watcher goes."""
+        """Records as in docs/telemetry.md, beginning with the complete state, until the client disconnects."""
         if "token" in socket.query_params:
             await socket.close(1008, "a token belongs into a header, not into the address")
             return
@@ -375,7 +375,7 @@ def _add_telemetry(app: FastAPI, state: FlightState, access: _AccessControl) -> 
             return
         connection = _connection(socket)
         if not access.connections.may_watch(connection):
-            await socket.close(1013, f"too many watchers: {WATCHERS_MAX}")
+            await socket.close(1013, f"too many clients: {WATCHERS_MAX}")
             return
         if connection is not None:
             connection.enter(ConnectionUse.WATCHER)
@@ -392,7 +392,7 @@ def _add_telemetry(app: FastAPI, state: FlightState, access: _AccessControl) -> 
                     await asyncio.wait_for(_send(socket, record, form), SEND_TIMEOUT_S)
                 await asyncio.wait([disconnected], timeout=TELEMETRY_TICK_S)
         except (TimeoutError, WebSocketDisconnect, RuntimeError):
-            pass  # it stalled or went; nothing is kept for it
+            pass  # it stalled or disconnected
         finally:
             disconnected.cancel()
             with suppress(RuntimeError, WebSocketDisconnect):

@@ -28,7 +28,7 @@ REQUESTS_PER_CONNECTION = 1000
 IDLE_MAX_S = 30.0
 """From the TCP handshake, or the last answer, to the end of the next request's header."""
 REQUEST_MAX_S = 120.0
-"""For a request and its answer: a quick look over 25 kbit/s."""
+"""Time limit of a request and its answer: a quick look over 25 kbit/s."""
 SWEEP_S = 1.0
 REQUESTS_PER_S, REQUESTS_BURST = 50.0, 400
 """Anonymous requests of one source."""
@@ -125,7 +125,7 @@ class Connections:
         )
 
     def may_watch(self, new_connection: ClientConnection | None) -> bool:
-        """Whether one more watcher is served; where all places are taken, somebody else may go."""
+        """Whether one more client is served; if all places are taken, another may be disconnected."""
         self._remove_closed()
         watchers = [one for one in self._by_peer.values() if one.use is ConnectionUse.WATCHER]
         others = [one for one in watchers if one is not new_connection]
@@ -173,7 +173,7 @@ class Connections:
 
 
 class ListeningSocket(socket.socket):
-    """A listening socket that asks the table about every connection.
+    """A listening socket that registers every connection in the table.
 
     Args:
         listening: a socket that listens; it is taken over.
@@ -188,7 +188,7 @@ class ListeningSocket(socket.socket):
         """As of a socket.
 
         Raises:
-            ConnectionAbortedError: the connection was refused; the event loop goes on.
+            ConnectionAbortedError: the connection was refused; the event loop continues.
         """
         link, address = super().accept()
         if not self._connections.admit(link, str(address[0]), int(address[1])):

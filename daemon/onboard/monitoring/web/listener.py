@@ -81,7 +81,7 @@ class ConnectionListener:
             async with asyncio.timeout(HANDSHAKE_TIMEOUT_S):
                 await self._hand_over(connection)
         except (OSError, TimeoutError):
-            connection.close()  # it stalled, went, or speaks no TLS that we do
+            connection.close()  # it stalled, disconnected, or supports no common TLS version
         except asyncio.CancelledError:
             connection.close()
             raise
@@ -121,14 +121,14 @@ async def _readable(connection: socket.socket) -> None:
 
 
 async def _reject_plain_http(connection: socket.socket) -> None:
-    """Say where TLS is spoken to somebody who does not speak it, and close.
+    """Answer a client without TLS with the https address, and close.
 
     Nothing of the request is repeated in the answer.
     """
     loop = asyncio.get_running_loop()
     host, port = connection.getsockname()[:2]
     address = f"[{host}]" if ":" in host else host
-    text = f"This port speaks TLS: use https://{address}:{port}/\n".encode()
+    text = f"This port requires TLS: use https://{address}:{port}/\n".encode()
     head = (
         "HTTP/1.1 400 Bad Request\r\nContent-Type: text/plain; charset=utf-8\r\n"
         f"Content-Length: {len(text)}\r\nConnection: close\r\nX-Content-Type-Options: nosniff\r\n"

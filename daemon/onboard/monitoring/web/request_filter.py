@@ -1,5 +1,5 @@
-"""What every request passes before the application: whose it is, whether a browser was led here
-from elsewhere, and whether its source asks too often.
+"""Request filters before the application: source address, cross-site requests of browsers, and rate
+limits.
 
 Tokens and roles are checked by the application, for each route.
 """
@@ -133,7 +133,7 @@ class RequestFilter:
 
 
 def local_host_names() -> frozenset[str]:
-    """Names of this machine that no name server is asked for: localhost and multicast DNS."""
+    """Names of this machine that need no name server: localhost and multicast DNS."""
     return frozenset({"localhost", f"{socket.gethostname()[:40]}.local".lower()})
 
 
@@ -153,7 +153,7 @@ def is_allowed_host(host: str, names: Collection[str]) -> bool:
 
 
 def is_same_origin(origin: str, host: str) -> bool:
-    """Whether the page of a request was served under the same name and port as is asked now."""
+    """Whether the page of a request has the same name and port as the request."""
     try:
         parts = urlsplit(origin)
     except ValueError:

@@ -162,7 +162,7 @@ def _a_folder(tls: Path) -> None:
         (_other_key, "is not the key of|cannot be loaded"),
         (_other_key_of_the_same_kind, "is not the key of"),
         (_encrypted, "is encrypted.*openssl pkey"),
-        (_readable_by_all, "everybody.*chmod 640"),
+        (_readable_by_all, "all users.*chmod 640"),
         (_a_pipe, "no regular file"),
         (_a_folder, "no regular file"),
     ],
@@ -175,7 +175,7 @@ def test_what_cannot_be_used_is_refused_with_its_cure(
     with pytest.raises(TlsCertificateError, match=sentence):
         server_context(tls / "server.pem", tls / "server.key")
     (result,) = results(tls)
-    assert result.outcome is CheckOutcome.FAIL and "Nobody can watch" in result.sentence
+    assert result.outcome is CheckOutcome.FAIL and "Monitoring is not possible" in result.sentence
 
 
 def results(tls: Path, host: str = "127.0.0.1") -> list[CheckResult]:

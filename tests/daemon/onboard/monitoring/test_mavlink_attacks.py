@@ -15,7 +15,12 @@ from typing import Any
 import pytest
 
 from daemon.configuration.model import SIGNING_STATE, from_mapping
-from daemon.onboard.monitoring.mavlink.senders import PEERS_MAX, STREAMS_MAX, Senders
+from daemon.onboard.monitoring.mavlink.senders import (
+    DATAGRAM_MAX_BYTES,
+    PEERS_MAX,
+    STREAMS_MAX,
+    Senders,
+)
 from daemon.onboard.monitoring.mavlink.signatures import (
     SIGNING_EPOCH_UNIX_NS,
     TICKS_PER_S,
@@ -184,7 +189,7 @@ def test_damaged_bytes_cost_a_bounded_time_and_whole_messages_pass_all_the_same(
     senders = Senders(MavlinkParser())
     mav = dialect.MAVLink(None, srcSystem=255, srcComponent=190)
     complete = bytes(mav.heartbeat_encode(6, 8, 0, 0, 4).pack(mav))
-    costly = (b"\xfd\xff\x00\x00\x00\x00\x00\x00\x00\x00" * 204)[: senders.DATAGRAM_MAX_BYTES]
+    costly = (b"\xfd\xff\x00\x00\x00\x00\x00\x00\x00\x00" * 204)[:DATAGRAM_MAX_BYTES]
     begin = time.process_time()
     for n in range(2000):
         assert senders.messages(costly, (f"{n % 50}", 1), n * 1e-4)[0] == []

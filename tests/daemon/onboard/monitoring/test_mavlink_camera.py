@@ -87,7 +87,7 @@ def signed(key_file: Path) -> Iterator[Flying]:
     flying.close()
 
 
-def test_only_signed_commands_are_obeyed_but_everybody_may_look(signed: Flying) -> None:
+def test_only_signed_commands_are_executed_and_any_client_may_read(signed: Flying) -> None:
     unknown_sender = Station(signed.port)
     assert unknown_sender.request(512, 259) == dialect.MAV_RESULT_ACCEPTED
     assert wait_for(lambda: unknown_sender.receive("CAMERA_INFORMATION"), "what camera it is")

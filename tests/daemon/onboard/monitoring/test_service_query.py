@@ -27,7 +27,9 @@ pytestmark = pytest.mark.trust
 @pytest.fixture
 def planted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Planted]:
     made = Planted(tmp_path, monkeypatch)
-    monkeypatch.setattr("daemon.onboard.preflight.system_check.try_out", _nothing_is_opened)
+    monkeypatch.setattr(
+        "daemon.onboard.preflight.system_check.run_system_check", _nothing_is_opened
+    )
     made.add('[watch]\nport = 0\ncontrol = "c.sock"')
     made.write()
     yield made

@@ -63,7 +63,7 @@ def test_page_api_telemetry_and_commands_are_served_over_tls(
         urllib.request.urlopen(service.address, timeout=30)
     with pytest.raises(urllib.error.HTTPError) as refused:
         urllib.request.urlopen(service.address.replace("https", "http"), timeout=30)
-    assert b"This port speaks TLS: use https://127.0.0.1:" in refused.value.read()
+    assert b"This port requires TLS: use https://127.0.0.1:" in refused.value.read()
     seen = watched(service.address, "--authority", str(tmp_path / "tls/authority.pem"))
     assert seen.exit_code == 0, seen.output
     assert json.loads(seen.stdout)["status"]["ledger"]["triggers"]["triggers"] == 3
@@ -81,7 +81,7 @@ def test_a_token_reaches_a_closed_service_over_tls_only(tmp_path: Path) -> None:
         foreign = watched(service.address, "--token", service.token)
         assert "its certificate is not accepted" in str(foreign.exception)
         plain = watched(service.address.replace("https", "http"))
-        assert "This port speaks TLS" in str(plain.exception)
+        assert "This port requires TLS" in str(plain.exception)
     finally:
         service.end()
 

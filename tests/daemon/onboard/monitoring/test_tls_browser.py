@@ -110,7 +110,7 @@ def test_a_trusted_certificate_gives_service_worker_and_wake_lock_on_another_hos
         trusted = seen(home_folder, (service.address, False), (by_name, False), (plain, False))
         everything = {"secure": True, "wakeLock": True, "serviceWorker": True}
         assert trusted[:2] == [everything, everything]
-        assert trusted[2].strip() == f"This port speaks TLS: use {service.address}"
+        assert trusted[2].strip() == f"This port requires TLS: use {service.address}"
         refused, clicked_through = seen(
             untrusting, (service.address, False), (service.address, True)
         )
