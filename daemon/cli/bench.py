@@ -33,7 +33,7 @@ def bench(
         bool, typer.Option(help="Comparison with cv2.remap and nona + enblend.")
     ] = True,
     threads: Annotated[int, typer.Option(min=1, help="Number of threads of the pipeline.")] = 2,
-    parallel: Annotated[int, typer.Option(min=1, help="Exposures in work at a time.")] = 2,
+    parallel: Annotated[int, typer.Option(min=1, help="Exposures processed in parallel.")] = 2,
     folder: Annotated[
         Path | None, typer.Option(help="Folder of rendered exposures (default: cache).")
     ] = None,

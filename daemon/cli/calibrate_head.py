@@ -31,7 +31,7 @@ def head(
     series: Annotated[Path, typer.Argument(help="Folder with series.json, rig.toml and images.")],
     out: NewFolder = None,
     previous: Annotated[
-        Path | None, typer.Option(help="A calibration of heads to compare with.")
+        Path | None, typer.Option(help="Calibration of heads to compare with.")
     ] = None,
     k3: Annotated[bool, typer.Option("--k3", help="Estimation of K3.")] = False,
     as_json: AsJson = False,

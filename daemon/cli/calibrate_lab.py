@@ -31,7 +31,7 @@ def lab(
     series: Series,
     out: NewFolder = None,
     previous: Annotated[
-        Path | None, typer.Option(help="A laboratory calibration to compare with.")
+        Path | None, typer.Option(help="Laboratory calibration to compare with.")
     ] = None,
     as_json: AsJson = False,
 ) -> None:

@@ -12,14 +12,14 @@ import typer
 from daemon.cli.calibration_output import publish_calibration
 from daemon.cli.options import AsJson, NewFolder
 
-HELP = """Platform calibration: how every head is mounted, from many exposures.
+HELP = """Estimate the mounting of every head from many exposures.
 
-Takes the stitching of exposures that were processed before (`mosaic.json` of Level-2): a flight
-over well textured ground, or laboratory images put into a mission folder. Converging heads: three
-angles of each, by tie points of the overlaps. A rig with a master cone: the turn of every other
-cone against it; where cones fire one after the other, from twelve exposures on. Writes a dated
-folder with rig.toml, report.html and calibration.json; nothing is overwritten, and the new rig file
-counts only where it is configured.
+Uses the stitching of processed exposures (`mosaic.json` of Level-2): a flight over textured ground,
+or laboratory images in a mission folder. For converging heads, three angles of each are estimated
+from tie points. For a rig with a master cone, the rotation of every other cone relative to it is
+estimated; cones that fire in sequence require twelve exposures. Writes a dated folder with
+rig.toml, report.html and calibration.json. The new rig file takes effect only after it is
+configured.
 
 Examples: `syntopic calibrate platform MISSION`,
 `syntopic calibrate platform A B --previous dmc-platform-2026-05-02 --out dmc-platform-2026-11-21`
@@ -31,7 +31,7 @@ def platform(
     out: NewFolder = None,
     previous: Annotated[
         Path | None,
-        typer.Option(help="A platform calibration to compare with; else the rig flown with."),
+        typer.Option(help="Platform calibration to compare with (default: the rig flown)."),
     ] = None,
     as_json: AsJson = False,
 ) -> None:

@@ -13,11 +13,11 @@ from rich.progress import Progress
 from daemon.cli.options import AsJson, NewFolder, Series
 from daemon.terminal.console import Console
 
-HELP = """Radiometric calibration of heads from dark and flat series.
+HELP = """Calibrate heads radiometrically from dark and flat series.
 
-Finds bias, dark signal over temperature and exposure time, gain, its change with the aperture,
-defect pixels, columns and clusters; photon transfer, PRNU, DSNU, dynamic range and linearity in
-the manner of EMVA 1288. The new folder holds one folder of maps per aperture, as `radiometry` of
+Estimates bias, dark signal over temperature and exposure time, gain, its change with the aperture,
+defect pixels, columns and clusters; photon transfer, PRNU, DSNU, dynamic range and linearity
+after EMVA 1288. The new folder holds one folder of maps per aperture, as `radiometry` of
 the configuration takes it, a report and the comparison with a previous calibration.
 
 Examples: `syntopic calibrate radiometric SERIES`, `syntopic calibrate radiometric SERIES --aperture
@@ -31,11 +31,11 @@ def radiometric(
     series: Series,
     out: NewFolder = None,
     previous: Annotated[
-        Path | None, typer.Option(help="A radiometric calibration to compare with.")
+        Path | None, typer.Option(help="Radiometric calibration to compare with.")
     ] = None,
     aperture: Annotated[
         list[float] | None,
-        typer.Option(help="Write maps for this f-number too, by the model; may be repeated."),
+        typer.Option(help="Further f-number for maps from the model; repeatable."),
     ] = None,
     as_json: AsJson = False,
 ) -> None:

@@ -15,11 +15,11 @@ from daemon.cli.options import AsJson, NewFolder
 from daemon.terminal.console import Console
 from daemon.terminal.tables import light_table
 
-HELP = """Relative orientation of oblique heads against the nadir head, averaged over a block.
+HELP = """Estimate the relative orientation of oblique heads to the nadir head, averaged over a block.
 
-PROJECT is an adjustment project (docs/formats.md) whose cameras are named like the rig's cones. Its
-images have angles of their own and the projection centre of their exposure in common; or the
-exposure has one attitude, and the heads are free parameters. Printed in grads and degrees, phi
+PROJECT is an adjustment project (docs/formats.md) whose cameras are named like the rig's cones. The
+images of an exposure share a projection centre and have separate angles; or the exposure has one
+attitude, and the heads are free parameters. Printed in grads and degrees, phi
 first (R = Ry Rx Rz), with standard deviations. Writes a dated folder with rig.toml (orientations
 and lenses), report.html and calibration.json.
 
@@ -30,12 +30,12 @@ Examples: `syntopic calibrate rig block --rig midas`,
 
 def rig(
     project: Annotated[Path, typer.Argument(help="project.toml, or the folder that holds it.")],
-    rig: Annotated[str, typer.Option(help="Shipped rig or rig file that the new one begins with.")],
+    rig: Annotated[str, typer.Option(help="Shipped rig or rig file with initial values.")],
     reference: Annotated[
-        str | None, typer.Option(help="Reference camera; default: the rig's master cone.")
+        str | None, typer.Option(help="Reference camera (default: the rig's master cone).")
     ] = None,
     least_points: Annotated[
-        int, typer.Option(help="Image points an image needs to count.", min=4)
+        int, typer.Option(help="Minimum number of points of an image.", min=4)
     ] = 10,
     previous: Annotated[
         Path | None, typer.Option(help="Folder of the calibration to compare with.")

@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-HELP = """Make a local authority and a TLS certificate for this machine.
+HELP = """Create a local authority and a TLS certificate for this machine.
 
 The certificate has the machine's names (mDNS and host name), its addresses, and those given with
 --name. Install the authority on tablets and ground stations once (docs/tls.md); run the command

@@ -21,17 +21,17 @@ if TYPE_CHECKING:
     from daemon.onboard.preflight.check_results import CheckResult
     from processing.rig import Rig
 
-HELP = """Validate a configuration, build what `run` builds, and prove each device with one datum.
+HELP = """Validate a configuration, build the service, and verify each device with one datum.
 
 Prerequisites, pipeline, kernels, page and arming are checked with the functions that `run` uses.
-Nothing is fired without `--fire`: frames and event marks are then proven by one exposure. While the
-service runs, it is queried over its control socket, and no device is opened. The exit status is 0 when
-all passes, 1 when something fails, 2 when the configuration is refused, and 3 when nothing fails
-and something is waited for, such as a receiver that searches.
+Only with `--fire` one exposure is fired to verify frames and event marks. While the
+service runs, it is queried over its control socket, and no device is opened. The exit status is 0 if
+all checks pass, 1 if one fails, 2 if the configuration is refused, and 3 if none fails and one is
+waiting, such as a receiver that searches.
 
 With `--find`, detect the protocols at serial ports, tcp://host:port, udpin://host:port (those
 given, or all serial ports and the usual addresses): protocol, speed, and the configuration for it.
-With `--find-heads`, which GigE Vision, USB3 Vision and V4L2 heads there are, and the same.
+With `--find-heads`, search for GigE Vision, USB3 Vision and V4L2 heads.
 
 Examples: `syntopic check flights/sim/service.toml`, `syntopic check service.toml --fire --json`,
 `syntopic check --find`, `syntopic check --find /dev/ttyUSB0 tcp://10.0.0.5:3001`
@@ -49,14 +49,12 @@ def check(
     find: Annotated[
         bool, typer.Option("--find", help="Detection of protocol and speed at ports.")
     ] = False,
-    heads: Annotated[
-        bool, typer.Option("--find-heads", help="Find out which heads there are.")
-    ] = False,
+    heads: Annotated[bool, typer.Option("--find-heads", help="Search for heads.")] = False,
     listen_only: Annotated[
-        bool, typer.Option("--listen-only", help="With --find, send nothing to any port.")
+        bool, typer.Option("--listen-only", help="With --find: no transmission to any port.")
     ] = False,
     fire: Annotated[
-        bool, typer.Option("--fire", help="Fire one exposure to prove frames and event marks.")
+        bool, typer.Option("--fire", help="One exposure to verify frames and event marks.")
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:

@@ -50,7 +50,7 @@ TABLE: Final = {
             "run", _IN_FLIGHT, "Run the onboard service until SIGTERM or until the plan is flown."
         ),
         _command(
-            "check", _IN_FLIGHT, "Check a configuration and prove each device with one datum."
+            "check", _IN_FLIGHT, "Check a configuration and verify each device with one datum."
         ),
         _command("monitor", _IN_FLIGHT, "Monitor a flight from a terminal."),
         _command("send", _IN_FLIGHT, "Send a command to a running service."),

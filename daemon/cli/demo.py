@@ -50,9 +50,9 @@ class DemoError(RuntimeError):
 
 
 def demo(
-    rig: Annotated[str, typer.Option(help="A rig.")] = "ultracam-x-mini",
-    exposures: Annotated[int, typer.Option(help="How many exposures to fly.", min=1)] = 12,
-    dc: Annotated[float, typer.Option(help="Temperature above calibration, K.")] = 12.0,
+    rig: Annotated[str, typer.Option(help="Rig.")] = "ultracam-x-mini",
+    exposures: Annotated[int, typer.Option(help="Number of exposures.", min=1)] = 12,
+    dc: Annotated[float, typer.Option(help="Temperature above calibration in K.")] = 12.0,
     displace: Annotated[
         str | None,
         typer.Option(
@@ -61,9 +61,9 @@ def demo(
         ),
     ] = None,
     receiver: Annotated[
-        str, typer.Option(help="ublox, novatel, septentrio, nmea, or mavlink (an autopilot).")
+        str, typer.Option(help="Receiver: ublox, novatel, septentrio, nmea or mavlink.")
     ] = "ublox",
-    seed: Annotated[int, typer.Option(help="Everything random follows from it.")] = 1,
+    seed: Annotated[int, typer.Option(help="Seed for all random generators.")] = 1,
     out: Annotated[Path, typer.Option(help="Folder of the flights.")] = Path("flights"),
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:

@@ -12,9 +12,9 @@ import typer
 from daemon.terminal.console import Console
 from daemon.terminal.tables import light_table
 
-HELP = """Say what an event of the service means, what causes it and what helps.
+HELP = """Explain an event of the service: meaning, cause and corrective action.
 
-Without a name all are listed; NAME may be part of one.
+Without NAME all events are listed. NAME may be part of a name.
 
 Examples: `syntopic explain lost`, `syntopic explain arming`, `syntopic explain --json`
 """
@@ -22,8 +22,10 @@ Examples: `syntopic explain lost`, `syntopic explain arming`, `syntopic explain 
 
 def explain(
     name: Annotated[str, typer.Argument(help="An event, or part of its name.")] = "",
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object.")] = False,
-    markdown: Annotated[bool, typer.Option("--markdown", help="The page docs/events.md.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    markdown: Annotated[
+        bool, typer.Option("--markdown", help="Output as the page docs/events.md.")
+    ] = False,
 ) -> None:
     from daemon.onboard.flight.event_table import TABLE, as_markdown, entry_of
 

@@ -14,10 +14,10 @@ from daemon.terminal.console import Console
 from daemon.terminal.tables import light_table
 from drivers.base.extras import require
 
-ORIENTATION_HELP = """Exterior orientation of every cone of every exposure, at its own mid-exposure.
+ORIENTATION_HELP = """Compute the exterior orientation of every cone of every exposure, at mid-exposure.
 
-From the navigation of the flight, or from a post-processed trajectory; each trajectory gets a
-folder of its own. Written are CSV, PAT-B, BINGO's angles, footprints (GeoJSON) and STAC items.
+The source is the navigation of the flight or a post-processed trajectory; each trajectory has its
+own folder. Writes CSV, PAT-B, angles for BINGO, footprints (GeoJSON) and STAC items.
 
 Examples: `syntopic orient MISSION`, `syntopic orient MISSION --trajectory sbet.out`,
 `syntopic orient MISSION --mount boresight-2026-11-21/mount.toml`
@@ -34,19 +34,19 @@ Examples: `syntopic export pictures MISSION --trajectory sbet.out`,
 `syntopic export pictures MISSION --as jpeg --only 12`
 """
 
-CERTIFICATE_HELP = """The camera of the images as a calibration certificate: JSON and a page.
+CERTIFICATE_HELP = """Export the camera of the images as a calibration certificate: JSON and HTML.
 
-The virtual camera of stitched images, or each head where heads are images of their own: principal
-distance, principal point with axes and signs, pixel size, serial numbers, what it is valid for.
+Describes the virtual camera of stitched images, or each head with separate images: principal
+distance, principal point with axes and signs, pixel size, serial numbers, validity.
 
 Example: `syntopic export certificate MISSION`
 """
 
 app = typer.Typer(
-    help="""Write what others need into the mission's export folder.
+    help="""Export a mission for other programs.
 
-An exposure that cannot be read is listed at the end with its cause; the others are written, and the
-exit status is 1.
+Unreadable exposures are listed at the end with the cause. The others are written, and the exit
+status is 1.
 
 Examples: `syntopic export raw MISSION`, `syntopic export orientation MISSION --crs EPSG:25833`
 """,
@@ -57,7 +57,7 @@ Examples: `syntopic export raw MISSION`, `syntopic export orientation MISSION --
 
 @app.callback()
 def export() -> None:
-    """Write what others need into the mission's export folder."""
+    """Export a mission for other programs."""
 
 
 @app.command()
@@ -121,14 +121,16 @@ def foxglove(
 @app.command(help=PICTURES_HELP)
 def pictures(
     mission: Annotated[Path, typer.Argument(help="Mission folder with Level-2.")],
-    kind: Annotated[str, typer.Option("--as", help="cog or jpeg.")] = "cog",
+    kind: Annotated[str, typer.Option("--as", help="Format: cog or jpeg.")] = "cog",
     trajectory: Annotated[
         Path | None, typer.Option(help="Post-processed trajectory: SBET, or .csv.")
     ] = None,
-    mount: Annotated[Path | None, typer.Option(help="TOML with the [mount] to use.")] = None,
-    crs: Annotated[str | None, typer.Option(help="Such as EPSG:25833; default: UTM zone.")] = None,
+    mount: Annotated[Path | None, typer.Option(help="TOML file with the [mount].")] = None,
+    crs: Annotated[
+        str | None, typer.Option(help="CRS, such as EPSG:25833 (default: UTM zone).")
+    ] = None,
     only: Annotated[
-        list[int] | None, typer.Option(help="An exposure's number; repeatable.")
+        list[int] | None, typer.Option(help="Number of an exposure; repeatable.")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
@@ -198,13 +200,11 @@ def orientation(
         Path | None, typer.Option(help="Post-processed trajectory: SBET, or .csv.")
     ] = None,
     crs: Annotated[
-        str | None, typer.Option(help="Such as EPSG:25833 or EPSG:25833+7837; default: UTM zone.")
+        str | None, typer.Option(help="CRS, such as EPSG:25833+7837 (default: UTM zone).")
     ] = None,
-    receiver: Annotated[
-        str | None, typer.Option(help="Whose navigation, where there were several.")
-    ] = None,
+    receiver: Annotated[str | None, typer.Option(help="Navigator, if there are several.")] = None,
     mount: Annotated[
-        Path | None, typer.Option(help="TOML with the [mount] to use, of calibrate boresight.")
+        Path | None, typer.Option(help="TOML file with the [mount], from calibrate boresight.")
     ] = None,
     dem: Annotated[
         Path | None, typer.Option(help="Height model for footprints: GeoTIFF or .asc.")

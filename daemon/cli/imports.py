@@ -12,7 +12,7 @@ from rich.progress import Progress
 from daemon.terminal.console import Console
 
 app = typer.Typer(
-    help="""Bring in exposures of other cameras as a mission folder for `syntopic process`.
+    help="""Import exposures of other cameras as a mission folder for `syntopic process`.
 
 Example: `syntopic import rededge 0000SET --out field-7`
 """,
@@ -28,8 +28,10 @@ def imports() -> None:
 
 @app.command()
 def rededge(
-    folder: Annotated[Path, typer.Argument(help="Folder with IMG_0000_1.tif ..., searched below.")],
-    out: Annotated[Path, typer.Option(help="Mission folder to be written.")],
+    folder: Annotated[
+        Path, typer.Argument(help="Folder with IMG_0000_1.tif ..., searched recursively.")
+    ],
+    out: Annotated[Path, typer.Option(help="New mission folder.")],
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Import MicaSense RedEdge images; lens and radiance calibration come from their tags.

@@ -14,30 +14,30 @@ from daemon.terminal.console import Console
 if TYPE_CHECKING:
     from daemon.onboard.installation import InstallationReport
 
-HELP = """Lay out the service: unit, user, folders, device rules, kernel settings, compiled kernels.
+HELP = """Install the service: unit, user, folders, device rules, kernel settings, compiled kernels.
 
-Give the configuration it will fly with; it stays where it is and is validated first. Nothing edited
-by hand is overwritten. `--root` stages the files into an image instead.
+The configuration is validated first and stays in its place. Files edited by hand are not
+overwritten. `--root` writes the files into an image instead.
 
 Examples: `sudo /opt/syntopic/bin/syntopic install`, `syntopic install --root image/`
 """
-UNINSTALL_HELP = """Stop the service and remove what `syntopic install` laid out.
+UNINSTALL_HELP = """Stop the service and remove the files of `syntopic install`.
 
-Missions, the configuration, the user and files edited by hand stay.
+Missions, the configuration, the user and files edited by hand remain.
 
 Example: `sudo /opt/syntopic/bin/syntopic uninstall`
 """
 
-Root = Annotated[Path, typer.Option(help="Root of an image, instead of this machine.")]
+Root = Annotated[Path, typer.Option(help="Root folder of an image (default: this machine).")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 
 
 def install(
-    config: Annotated[Path, typer.Argument(help="Configuration the service will run with.")] = Path(
+    config: Annotated[Path, typer.Argument(help="Configuration of the service.")] = Path(
         "/etc/syntopic/service.toml"
     ),
     root: Root = Path("/"),
-    replace: Annotated[bool, typer.Option(help="Also overwrite what was edited by hand.")] = False,
+    replace: Annotated[bool, typer.Option(help="Overwriting of files edited by hand.")] = False,
     as_json: AsJson = False,
 ) -> None:
     from daemon.configuration.model import load

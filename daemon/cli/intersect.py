@@ -15,11 +15,11 @@ from daemon.terminal.console import Console
 from daemon.terminal.tables import light_table
 from drivers.base.extras import require
 
-HELP = """Ground points from places measured in two or more oriented images, with their accuracy.
+HELP = """Compute ground points from measurements in two or more oriented images, with accuracy.
 
 MEASURED is a table: image (as `syntopic orient` names it, such as 000012_5), point, column_px,
 row_px of the Level-2 image, sigma_px. Images are oriented by trajectory, boresight and the rig's
-mounting angles; what these are uncertain by is carried into the points with its correlations.
+mounting angles; their uncertainty is propagated into the points with its correlations.
 
 Example: `syntopic intersect MISSION measured.csv --trajectory sbet.out --out points.csv`
 """
@@ -33,19 +33,20 @@ COLUMNS = (
 
 def intersect(
     mission: Annotated[Path, typer.Argument(help="Mission folder.")],
-    measured: Annotated[Path, typer.Argument(help="Places in the images, CSV.")],
+    measured: Annotated[Path, typer.Argument(help="Image measurements (CSV).")],
     trajectory: Trajectory = None,
     mount: MountFile = None,
     crs: Crs = None,
     image_sigma: Annotated[
-        float, typer.Option(help="Of a place without sigma_px, px.", min=1e-3)
+        float, typer.Option(help="Standard deviation without sigma_px, in px.", min=1e-3)
     ] = 0.5,
     position_sigma: PositionSigma = (0.05, 0.05, 0.08),
     attitude_sigma: AttitudeSigma = (5.0, 5.0, 8.0),
     boresight_sigma: Annotated[
-        tuple[float, float, float], typer.Option(help="Common to all exposures, mdeg.")
+        tuple[float, float, float],
+        typer.Option(help="Standard deviation common to all exposures in mdeg."),
     ] = (1.5, 1.5, 3.0),
-    out: Annotated[Path | None, typer.Option(help="Table of the points; must be new.")] = None,
+    out: Annotated[Path | None, typer.Option(help="New table of the points.")] = None,
     as_json: AsJson = False,
 ) -> None:
     require("geodesy")

@@ -23,11 +23,11 @@ from daemon.terminal.tables import light_table
 if TYPE_CHECKING:
     from daemon.onboard.monitoring.client.mdns_browser import AnnouncedService
 
-HELP = """Watch a flight from a terminal: phase, ledger, faults, the last exposures.
+HELP = """Monitor a flight from a terminal: phase, ledger, faults, the last exposures.
 
-Without an address the services that announce themselves are listed; a single one is watched. What
-is announced determines neither TLS nor the receiver of a token: https:// or --tls requires TLS,
-and a token is sent only to an address that was given.
+Without an address announced services are listed; a single one is monitored. An
+announcement determines neither TLS nor the receiver of a token: https:// or --tls requires TLS,
+and a token is sent only to a given address.
 
 Examples: `syntopic monitor`, `syntopic monitor 10.0.0.5:8470 --bytes-per-s 4000`,
 `syntopic monitor https://camera1.local:8470 --authority authority.pem`
@@ -107,14 +107,14 @@ def monitor(
         str, typer.Option(envvar="SYNTOPIC_TOKEN", help="Access token, if reading requires one.")
     ] = "",
     bytes_per_s: Annotated[
-        float, typer.Option(help="Budget of a thin link.", min=1000, max=1.5e6)
+        float, typer.Option(help="Budget of a slow link in bytes per second.", min=1000, max=1.5e6)
     ] = 1e6,
-    tls: Annotated[bool, typer.Option(help="Require TLS, as https:// does.")] = False,
+    tls: Annotated[bool, typer.Option(help="TLS, as with https://.")] = False,
     authority: Annotated[
-        Path | None, typer.Option(help="PEM file of the authority to trust (default: system's).")
+        Path | None, typer.Option(help="PEM file of the trusted authority (default: system's).")
     ] = None,
     token_without_tls: Annotated[
-        bool, typer.Option("--token-without-tls", help="Send the token unencrypted, too.")
+        bool, typer.Option("--token-without-tls", help="Permission to send the token unencrypted.")
     ] = False,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print the state once, as one JSON object.")

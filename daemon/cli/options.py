@@ -19,13 +19,15 @@ NewFolder = Annotated[
 ]
 
 Trajectory = Annotated[Path | None, typer.Option(help="Post-processed trajectory: SBET, or .csv.")]
-MountFile = Annotated[Path | None, typer.Option(help="TOML with the [mount] to use.")]
-Crs = Annotated[str | None, typer.Option(help="Such as EPSG:25833; default: UTM zone.")]
+MountFile = Annotated[Path | None, typer.Option(help="TOML file with the [mount].")]
+Crs = Annotated[str | None, typer.Option(help="CRS, such as EPSG:25833 (default: UTM zone).")]
 PositionSigma = Annotated[
-    tuple[float, float, float], typer.Option(help="Of the trajectory, m: east north up.")
+    tuple[float, float, float],
+    typer.Option(help="Standard deviation of positions in m: east north up."),
 ]
 AttitudeSigma = Annotated[
-    tuple[float, float, float], typer.Option(help="Roll, pitch, heading, mdeg.")
+    tuple[float, float, float],
+    typer.Option(help="Standard deviation of roll, pitch, heading in mdeg."),
 ]
 
 

@@ -37,11 +37,13 @@ Examples: `syntopic pansharpen MISSION`, `syntopic pansharpen MISSION --only 3 -
 def pansharpen(
     mission: Annotated[Path, typer.Argument(help="Mission folder.")],
     only: Annotated[
-        list[int] | None, typer.Option(help="An exposure's number; repeatable.")
+        list[int] | None, typer.Option(help="Number of an exposure; repeatable.")
     ] = None,
-    image: Annotated[list[str] | None, typer.Option(help="rgb or cir; repeatable.")] = None,
-    bits: Annotated[list[int] | None, typer.Option(help="16 or 8; repeatable.")] = None,
-    threads: Annotated[int, typer.Option(help="Cores to use.", min=1)] = 2,
+    image: Annotated[list[str] | None, typer.Option(help="Image: rgb or cir; repeatable.")] = None,
+    bits: Annotated[
+        list[int] | None, typer.Option(help="Bits per sample: 16 or 8; repeatable.")
+    ] = None,
+    threads: Annotated[int, typer.Option(help="Number of threads.", min=1)] = 2,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     import cv2

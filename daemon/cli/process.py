@@ -38,15 +38,15 @@ Examples: `syntopic process MISSION`, `syntopic process MISSION --only 3 --metho
 def process(
     mission: Annotated[Path, typer.Argument(help="Mission folder.")],
     only: Annotated[
-        list[int] | None, typer.Option(help="An exposure's number; repeatable.")
+        list[int] | None, typer.Option(help="Number of an exposure; repeatable.")
     ] = None,
-    method: Annotated[str, typer.Option(help="free or fixed.")] = "free",
+    method: Annotated[str, typer.Option(help="Method: free or fixed.")] = "free",
     interpolation: Annotated[
         str, typer.Option(help=f"Interpolation kernel: {', '.join(INTERPOLATIONS)}.")
     ] = DEFAULT_INTERPOLATION,
     rig_file: Annotated[
         Path | None,
-        typer.Option("--rig", help="Rig file of another calibration than the one flown."),
+        typer.Option("--rig", help="Rig file (default: the one flown)."),
     ] = None,
     radiometry: Annotated[
         Path | None, typer.Option(help="Folder of radiometric calibrations.")
@@ -55,9 +55,9 @@ def process(
         Path | None, typer.Option(help="Height model (default: that of the flight).")
     ] = None,
     baselines: Annotated[
-        bool, typer.Option(help="Also solve the fixed method, with and without TDM.")
+        bool, typer.Option(help="Comparison with the fixed method, with and without TDM.")
     ] = False,
-    threads: Annotated[int, typer.Option(help="Cores to use.")] = 2,
+    threads: Annotated[int, typer.Option(help="Number of threads.")] = 2,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     os.environ.setdefault("NUMBA_NUM_THREADS", str(threads))

@@ -14,11 +14,11 @@ from daemon.terminal.tables import light_table
 
 HELP = """List the segments of the plan that must be flown again.
 
-A point is covered where as many images as the overlaps need hold valid pixels of it in every band.
+A point is covered if enough images for the overlaps have valid pixels of it in every band.
 
-The plan is GeoJSON, KML or QGroundControl's .plan. The mission may still be flying. Written are a
-GeoJSON, a KML and a MAVLink mission of the segments. The exit status is 1 while there are any. An
-exposure whose record cannot be read counts as not flown, and is listed at the end.
+The plan is GeoJSON, KML or QGroundControl's .plan. The mission may be in flight. Writes a
+GeoJSON, a KML and a MAVLink mission of the segments. The exit status is 1 if there are any. An
+exposure with an unreadable record counts as not flown and is listed at the end.
 
 Examples: `syntopic reflights MISSION`, `syntopic reflights MISSION --plan block.geojson`
 """
@@ -26,11 +26,9 @@ Examples: `syntopic reflights MISSION`, `syntopic reflights MISSION --plan block
 
 def reflights(
     mission: Annotated[Path, typer.Argument(help="Mission folder.")],
-    plan: Annotated[
-        Path | None, typer.Option(help="The plan; that of the mission, where it has one.")
-    ] = None,
+    plan: Annotated[Path | None, typer.Option(help="Plan (default: that of the mission).")] = None,
     elevation: Annotated[
-        Path | None, typer.Option(help="Height model; that in the mission folder if omitted.")
+        Path | None, typer.Option(help="Height model (default: that of the mission).")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:

@@ -18,12 +18,12 @@ from daemon.mission.layout import Mission, MissionError
 from daemon.terminal.console import Console
 from daemon.terminal.tables import light_table
 
-HELP = """Feed what a mission recorded through the same code again, and compare.
+HELP = """Replay a recorded mission through the code and compare the results.
 
-Bytes of receivers and probes go through their codecs, frames and marks through matching and ledger,
-Level-0 through the pipeline, with one exposure in work and with two. Records are compared as
+Bytes of receivers and probes pass their codecs, frames and marks pass matching and ledger, and
+Level-0 passes the pipeline, with one and with two parallel exposures. Records are compared as
 canonical JSON, images by the hash of their decoded pixels. Nothing is written. The exit status is
-1 where anything differs.
+1 if anything differs.
 
 Examples: `syntopic replay MISSION`, `syntopic replay MISSION --records-only --json`,
 `syntopic replay MISSION --elevation terrain.asc`
@@ -34,16 +34,19 @@ SENTENCES_SHOWN = 20
 def replay(
     mission: Annotated[Path, typer.Argument(help="Mission folder.")],
     parallel: Annotated[
-        list[int] | None, typer.Option(help="Exposures in work; repeatable. 1 and 2 if not given.")
+        list[int] | None, typer.Option(help="Parallel exposures; repeatable (default: 1 and 2).")
     ] = None,
     only: Annotated[
-        list[int] | None, typer.Option(help="Images of this exposure only; repeatable.")
+        list[int] | None,
+        typer.Option(help="Number of an exposure whose images are compared; repeatable."),
     ] = None,
-    records_only: Annotated[bool, typer.Option(help="Leave the images out.")] = False,
+    records_only: Annotated[bool, typer.Option(help="Comparison without images.")] = False,
     radiometry: Annotated[
-        Path | None, typer.Option(help="Folder of radiometric calibrations, if it was moved.")
+        Path | None, typer.Option(help="Folder of radiometric calibrations (default: as recorded).")
     ] = None,
-    elevation: Annotated[Path | None, typer.Option(help="Height model, if it was moved.")] = None,
+    elevation: Annotated[
+        Path | None, typer.Option(help="Height model (default: as recorded).")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     folder = Mission.open(mission)

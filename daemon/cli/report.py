@@ -26,7 +26,7 @@ Examples: `syntopic report MISSION --bundle`, `syntopic report MISSION --out FOL
 
 def report(
     mission: Annotated[Path, typer.Argument(help="Mission folder.")],
-    bundle: Annotated[bool, typer.Option("--bundle", help="Also what support needs.")] = False,
+    bundle: Annotated[bool, typer.Option("--bundle", help="Support bundle in addition.")] = False,
     out: Annotated[
         Path | None, typer.Option(help="Folder to write into (default: the mission's export).")
     ] = None,

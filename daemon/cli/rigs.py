@@ -14,7 +14,7 @@ from daemon.terminal.tables import light_table
 from processing.rig import Rig, find_rig, load_rig, shipped_rigs
 
 app = typer.Typer(
-    help="""List the rigs that come with Syntopic, or show what a rig file means.
+    help="""List the shipped rigs, or describe a rig file.
 
 Examples: `syntopic rigs`, `syntopic rigs show ultracam-x`
 """,
@@ -54,7 +54,7 @@ def rigs(
 def show(
     name: Annotated[str, typer.Argument(help="Name of a shipped rig, or a rig file.")],
     drawing: Annotated[
-        Path | None, typer.Option(help="Draw the focal planes into this file (SVG).")
+        Path | None, typer.Option(help="New drawing of the focal planes (SVG).")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:

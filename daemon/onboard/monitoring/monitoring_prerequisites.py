@@ -64,7 +64,7 @@ def listen(host: str, port: int) -> socket.socket:
         listening.close()
         raise WatchError(
             f"port {port} of {host} cannot be used ({error.strerror or error}); end the program "
-            "that holds it, or configure another ([watch] port). Nobody can watch"
+            "that holds it, or configure another ([watch] port). Monitoring is not possible"
         ) from error
     return listening
 
