@@ -163,8 +163,8 @@ def _a_folder(tls: Path) -> None:
         (_other_key_of_the_same_kind, "is not the key of"),
         (_encrypted, "is encrypted.*openssl pkey"),
         (_readable_by_all, "all users.*chmod 640"),
-        (_a_pipe, "no regular file"),
-        (_a_folder, "no regular file"),
+        (_a_pipe, "not a regular file"),
+        (_a_folder, "not a regular file"),
     ],
 )
 @pytest.mark.timeout(20)
@@ -224,7 +224,7 @@ def test_a_certificate_for_another_machine_or_another_purpose_is_found(tls: Path
     assert [result.outcome for result in results(tls)] == [CheckOutcome.PASS, CheckOutcome.PASS]
     self_signed(tls, "extendedKeyUsage=clientAuth")
     (result,) = results(tls)
-    assert result.outcome is CheckOutcome.FAIL and "no certificate for a server" in result.sentence
+    assert result.outcome is CheckOutcome.FAIL and "is not a server certificate" in result.sentence
 
 
 def test_expired_and_soon_expiring_certificates_are_found(tls: Path) -> None:

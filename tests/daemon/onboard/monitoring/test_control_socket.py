@@ -228,7 +228,7 @@ def test_a_socket_left_by_a_killed_service_is_taken_over_and_a_file_is_not(tmp_p
         dead.bind(str(path))
     assert with_socket(Service(), path, lambda: send_command(path, "start", {}))[0]
     path.write_text("precious")
-    with pytest.raises(ControlError, match="no socket"):
+    with pytest.raises(ControlError, match="not a socket"):
         with_socket(Service(), path, lambda: None)
     assert path.read_text() == "precious"
 

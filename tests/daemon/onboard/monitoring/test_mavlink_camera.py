@@ -184,7 +184,7 @@ def test_damaged_messages_are_counted_and_the_next_is_understood() -> None:
     [
         ({"connect": "tcp:host:1"}, "udpout:HOST:PORT"),
         ({"connect": "udpin:host:port"}, "udpout:HOST:PORT"),
-        ({"commands": "signed"}, "no signing_key"),
+        ({"commands": "signed"}, "signing_key is missing"),
         ({"component_id": 99}, "greater than or equal to 100"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Settings under which a token would travel in the clear are refused."""
+"""Settings under which a token would be sent without encryption are refused."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ FILE = Path("x")
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "192.168.1.5", "::", "fd00::1"])
 def test_tokens_leave_the_machine_with_tls_only(host: str) -> None:
-    with pytest.raises(ValidationError, match="travel in the clear"):
+    with pytest.raises(ValidationError, match="without encryption"):
         WatchSection(host=host, tokens=FILE)
     WatchSection(host=host, tokens=FILE, tls_certificate=FILE, tls_key=FILE)
     WatchSection(host=host)  # watching alone needs none

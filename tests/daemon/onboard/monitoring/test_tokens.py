@@ -40,7 +40,7 @@ def test_a_name_has_one_token_and_odd_names_none(tmp_path: Path) -> None:
     for name in ("", "a b", "a]\n[root", "x" * 65):
         with pytest.raises(TokenError):
             add_token(path, name, "observer")
-    with pytest.raises(TokenError, match="nobody"):
+    with pytest.raises(TokenError, match="no token has the name"):
         remove_token(path, "pilot")
 
 
