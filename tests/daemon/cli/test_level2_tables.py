@@ -9,7 +9,7 @@ from rich.console import Console
 from daemon.cli.level2_tables import print_reports
 
 
-def test_beneath_the_table_stands_why_an_exposure_is_not_good() -> None:
+def test_reasons_of_exposures_that_are_not_good_follow_the_table() -> None:
     findings = [
         {"verdict": "good", "sentence": "Simulated hardware: not a survey."},
         {"verdict": "usable", "sentence": "Head SU10 sent no image."},

@@ -13,7 +13,7 @@ from daemon.cli import app
 SHOW = ["rigs", "show", "ultracam-l-mini"]
 
 
-def test_nothing_is_written_unless_a_drawing_is_asked_for(
+def test_nothing_is_written_unless_a_drawing_is_requested(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -23,7 +23,7 @@ def test_nothing_is_written_unless_a_drawing_is_asked_for(
     assert not list(tmp_path.iterdir())
 
 
-def test_a_drawing_lies_where_it_was_asked_for(tmp_path: Path) -> None:
+def test_a_drawing_is_written_to_the_given_file(tmp_path: Path) -> None:
     drawing = tmp_path / "rig.svg"
     result = CliRunner().invoke(app, [*SHOW, "--drawing", str(drawing), "--json"])
     assert json.loads(result.stdout)["drawing"] == str(drawing)

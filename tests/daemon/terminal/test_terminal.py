@@ -1,4 +1,4 @@
-"""Names of others in a terminal and on a page: seen, never obeyed."""
+"""Foreign text in a terminal and on a page is shown, never executed."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def printed(*renderables: object) -> str:
 
 
 @pytest.mark.trust
-def test_markup_and_control_characters_are_shown_and_not_obeyed() -> None:
+def test_markup_and_control_characters_are_shown_and_not_executed() -> None:
     table = Table("what", title=HOSTILE)
     table.add_row(HOSTILE)
     table.add_row(Text(HOSTILE))
@@ -42,7 +42,7 @@ def test_markup_and_control_characters_are_shown_and_not_obeyed() -> None:
         assert all(c.isprintable() or c == "\n" for c in shown), ascii(shown)
 
 
-def test_what_can_be_seen_stays_as_it_is() -> None:
+def test_printable_text_is_unchanged() -> None:
     for text in ("Überflug 7", "שדה", "道路", "a\tb\n"):
         assert visible(text) == text
 

@@ -109,7 +109,7 @@ def test_errors_are_problems(client: TestClient) -> None:
     assert client.delete("/api/v1/state").status_code == 405
 
 
-def test_nobody_commands_without_a_token_that_may(camera: Camera, client: TestClient) -> None:
+def test_commands_require_an_authorized_token(camera: Camera, client: TestClient) -> None:
     assert client.post("/api/v1/commands/start").status_code == 401
     assert client.post("/api/v1/commands/start", headers=bearer("guess")).status_code == 401
     answer = client.post("/api/v1/commands/start", headers=bearer(camera.pilot))
@@ -130,7 +130,7 @@ def test_nobody_commands_without_a_token_that_may(camera: Camera, client: TestCl
 
 @pytest.mark.trust
 @pytest.mark.parametrize("name", get_args(CommandName))
-def test_each_command_is_obeyed_from_its_role_on(
+def test_each_command_is_executed_from_its_role_upwards(
     camera: Camera, client: TestClient, name: str
 ) -> None:
     assert name in COMMAND_ROLES
@@ -190,7 +190,9 @@ def test_a_closed_service_shows_nothing_without_a_token(camera: Camera) -> None:
         assert client.get("/").status_code == 200  # the page itself holds nothing
 
 
-def test_the_services_refusal_comes_back_in_its_words(camera: Camera, client: TestClient) -> None:
+def test_the_refusal_of_the_service_is_returned_unchanged(
+    camera: Camera, client: TestClient
+) -> None:
     camera.refusal = "missing: head SU02; override to fly without"
     answer = client.post("/api/v1/commands/start", headers=bearer(camera.operator))
     assert answer.status_code == 409
@@ -219,7 +221,9 @@ def test_a_fault_is_acknowledged(camera: Camera, client: TestClient) -> None:
     assert client.get("/api/v1/faults").json() == []
 
 
-def test_telemetry_begins_with_everything_and_goes_on(camera: Camera, client: TestClient) -> None:
+def test_telemetry_begins_with_the_complete_state_and_continues(
+    camera: Camera, client: TestClient
+) -> None:
     for event in flight_events.exposure(1):
         camera.state.apply(event)
     with client.websocket_connect("/api/v1/telemetry?form=json") as socket:
@@ -263,7 +267,7 @@ def test_metrics_speak_prometheus(camera: Camera, client: TestClient) -> None:
     assert samples["syntopic_phase", (("phase", "flying"),)] == 1
 
 
-def test_the_page_is_small_and_asks_nobody_else(client: TestClient) -> None:
+def test_the_page_is_small_and_requests_no_other_host(client: TestClient) -> None:
     page = client.get("/")
     assert page.status_code == 200
     assert "default-src 'self'" in page.headers["Content-Security-Policy"]

@@ -106,7 +106,7 @@ def test_a_command_is_given_in_the_name_the_kernel_knows(tmp_path: Path) -> None
     assert refused == (False, "as asked")
 
 
-def test_the_socket_is_for_owner_and_group_and_goes_with_the_service(tmp_path: Path) -> None:
+def test_the_socket_is_for_owner_and_group_and_removed_with_the_service(tmp_path: Path) -> None:
     path = tmp_path / "control.sock"
     mode = with_socket(Service(), path, lambda: stat.S_IMODE(path.stat().st_mode))
     assert mode == 0o660
@@ -243,7 +243,7 @@ def test_a_second_service_does_not_take_the_socket_of_the_first(tmp_path: Path) 
         with_socket(Service(), path, second)
 
 
-def test_nobody_listening_and_no_such_group_end_in_sentences(tmp_path: Path) -> None:
+def test_a_missing_listener_and_an_unknown_group_are_reported(tmp_path: Path) -> None:
     with pytest.raises(ControlError, match="does the service run"):
         send_command(tmp_path / "none.sock", "start", {})
     service = Service()

@@ -100,7 +100,7 @@ def test_an_image_that_is_refly_leaves_a_hole_unless_only_its_overlap_is(
         assert [one[0] for one in kinds(Coverage(state))] == lines
 
 
-def test_without_a_plan_nothing_is_asked(tmp_path: Path) -> None:
+def test_without_a_plan_nothing_is_computed(tmp_path: Path) -> None:
     state = FlightState("syntopic")
     coverage = Coverage(state)
     assert coverage.advice_task() is None

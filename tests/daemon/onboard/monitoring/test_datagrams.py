@@ -1,4 +1,4 @@
-"""Over a link that loses a third, is slow, late and away for minutes, a watcher still converges.
+"""A client converges over a link with one third loss, delay and outages of minutes.
 
 The link is emulated on a clock of its own: loss, delay, bandwidth with a queue, outages.
 """
@@ -25,7 +25,7 @@ from tests.daemon.onboard.monitoring import flight_events
 
 @dataclass
 class Relay:
-    """A lossy link: what goes in at a time comes out later, or not at all."""
+    """A lossy link: datagrams are delayed or lost."""
 
     loss: float
     delay_s: float
@@ -106,7 +106,7 @@ def test_a_thin_lossy_link_with_outages_ends_up_with_the_same_state() -> None:
     assert watcher.rejected_count == 0
 
 
-def test_a_fault_in_an_outage_is_seen_soon_after_it() -> None:
+def test_a_fault_during_an_outage_is_received_soon_after_it() -> None:
     relay = Relay(loss=0.3, delay_s=0.6, bytes_per_s=4000, outages_s=((20.0, 80.0),))
     _, _, seen = fly(relay, 100.0, exposures=30, faults_s={"SU02": 40.0})
     assert 80.0 <= seen["SU02"] <= 85.0
@@ -118,7 +118,7 @@ def test_a_late_client_receives_the_earlier_state() -> None:
     assert len(watcher.exposures) == len(state.exposures()) == 60
 
 
-def test_a_fault_that_is_over_goes() -> None:
+def test_a_fault_that_is_over_disappears() -> None:
     state, sender, watcher = FlightState("x"), DatagramScheduler(1e6), DatagramReceiver()
     state.apply(flight_events.mission())
     state.apply(flight_events.lost("SU02"))

@@ -15,7 +15,7 @@ def state_of(*events: dict[str, object]) -> FlightState:
     return state
 
 
-def test_an_exposure_goes_from_trigger_to_verdict() -> None:
+def test_an_exposure_proceeds_from_trigger_to_verdict() -> None:
     steps = []
     state = state_of(flight_events.mission())
     for event in flight_events.exposure(7):
@@ -43,7 +43,7 @@ def test_a_fault_that_passed_stays_until_it_is_acknowledged() -> None:
     assert state.faults() == []
 
 
-def test_a_fault_that_stands_stays_even_when_it_is_acknowledged() -> None:
+def test_an_active_fault_remains_after_it_is_acknowledged() -> None:
     state = state_of(flight_events.lost("SU02"))
     assert state.acknowledge("device SU02")
     (fault,) = state.faults()
@@ -53,7 +53,7 @@ def test_a_fault_that_stands_stays_even_when_it_is_acknowledged() -> None:
     assert not state.acknowledge("device SU02")
 
 
-def test_a_watcher_that_asks_for_what_changed_misses_nothing() -> None:
+def test_a_client_that_requests_changes_misses_nothing() -> None:
     state = state_of(flight_events.mission())
     seen: dict[int, dict[str, object]] = {}
     cursor = 0
@@ -81,7 +81,7 @@ def test_it_never_grows_beyond_its_bounds() -> None:
     assert state.brief()["verdicts"]["good"] == EXPOSURES_MAX + 499
 
 
-def test_events_nobody_knows_are_listed_and_harm_nothing() -> None:
+def test_unknown_events_are_listed_and_have_no_effect() -> None:
     state = state_of({"event": "new-thing", "what": [1, {"deep": None}]}, {})
     assert [event.get("event") for event in state.changed("events", 0)] == ["new-thing", None]
 

@@ -1,4 +1,4 @@
-"""Whoever stalls a TLS handshake, or speaks no TLS, keeps nobody else out."""
+"""A client that stalls a TLS handshake, or uses no TLS, blocks no other client."""
 
 from __future__ import annotations
 

@@ -264,7 +264,7 @@ def test_damaged_timestamps_are_not_taken_for_none(tmp_path: Path, content: byte
         Signatures(KEY, tmp_path / "state")
 
 
-def test_the_state_lies_below_the_missions_unless_configured(tmp_path: Path) -> None:
+def test_the_state_is_stored_below_the_missions_unless_configured(tmp_path: Path) -> None:
     text = copy.deepcopy(GOOD)
     text["watch"] = {"mavlink": {"commands": "signed", "signing_key": "key"}}
     for given, expected in ((None, tmp_path / "missions" / SIGNING_STATE), ("s", tmp_path / "s")):
@@ -443,7 +443,7 @@ def test_twenty_other_addresses_do_not_starve_an_operators_heartbeats(
         operator.close()
 
 
-def test_who_was_there_first_stays_and_who_falls_silent_makes_room() -> None:
+def test_earlier_senders_stay_and_silent_ones_are_replaced() -> None:
     senders = Senders(MavlinkParser())
     assert senders.register(("operator", 1), 0.0, is_signed=False)
     for n in range(100):

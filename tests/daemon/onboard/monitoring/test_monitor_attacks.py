@@ -156,7 +156,7 @@ def test_what_a_service_answers_is_printed_without_control_sequences() -> None:
     assert "status 410" in sentence and len(sentence) < 400
 
 
-def test_a_token_goes_into_a_header_and_follows_no_redirect_and_no_proxy(
+def test_a_token_is_sent_in_a_header_and_follows_no_redirect_and_no_proxy(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     thief = Impostor(record())
@@ -181,7 +181,7 @@ def test_a_token_goes_into_a_header_and_follows_no_redirect_and_no_proxy(
         assert request.headers["Authorization"] == "Bearer syn_secret"
 
 
-def test_a_token_goes_unencrypted_to_this_machine_only() -> None:
+def test_a_token_is_sent_unencrypted_to_this_machine_only() -> None:
     access = AccessOptions("syn_secret")
     for address in ("127.0.0.1:1", "127.9.9.9:1", "[::1]:1", "localhost:1", "https://10.0.0.5"):
         check_token_transport(parse_service_address(address), access)

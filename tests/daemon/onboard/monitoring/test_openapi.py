@@ -1,4 +1,4 @@
-"""schemathesis, which we did not write, asks the API everything its OpenAPI document allows."""
+"""schemathesis sends requests that the OpenAPI document allows to the API."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def camera(tmp_path_factory: pytest.TempPathFactory) -> Camera:
     return camera
 
 
-def test_whatever_is_asked_the_answer_keeps_to_the_document(camera: Camera) -> None:
+def test_every_response_follows_the_openapi_document(camera: Camera) -> None:
     app = create_app(camera.state, camera.gateway, AccessSettings(camera.tokens))
     operations = list(schemathesis.openapi.from_asgi("/openapi.json", app).get_all_operations())
     assert len(operations) >= 11

@@ -215,7 +215,7 @@ def test_a_fault_is_seen_within_two_seconds_and_acknowledged_with_a_token(
     assert "SU02 does not answer; look at its cable." in browser.text("#faults")
     service.emit(flight_events.recovered("SU02"))
     browser.wait_for("document.querySelector('#faults li.cleared') !== null", WITHIN_S)
-    # Nobody has shown a token yet: the page asks for one, and nothing is commanded.
+    # Without a token the page requests one and sends no command.
     browser.click("#faults button")
     browser.wait_for("document.querySelector('#ask-token').open", WITHIN_S)
     browser.evaluate(f"document.querySelector('#token').value = {json.dumps(service.token)}")
@@ -392,10 +392,10 @@ def test_what_was_absent_at_the_start_and_came_stands_no_longer(
     browser.wait_for(f"{standing} === ''", WITHIN_S)
 
 
-def test_what_is_shown_without_a_link_is_marked_and_forgotten_when_another_flight_is_watched(
+def test_values_without_a_connection_are_marked_and_cleared_for_another_flight(
     folder: Path, browser: Browser, tmp_path: Path
 ) -> None:
-    """Looking needs a token here; the page asks for it, and shows images with it."""
+    """Reading requires a token; the page requests it, and shows images with it."""
     closed = Service(tmp_path, anonymous_read=False)
     try:
         closed.emit(flight_events.mission(str(folder / "mission")))

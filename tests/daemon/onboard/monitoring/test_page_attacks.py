@@ -482,7 +482,7 @@ def test_names_and_proxies_of_the_configuration_count(tmp_path: Path) -> None:
         # Counted for the client that the proxy names, not for the proxy or what the client claims.
         other = "X-Forwarded-For: 198.51.100.1, 198.51.100.2"
         assert page.request(command("guess", other), "127.0.0.9")[0] == 401
-        # Somebody who is no proxy names nobody.
+        # A client that is not a proxy cannot name another client.
         assert page.request(command("guess", forwarded), ATTACKER)[0] == 401
     finally:
         page.end()

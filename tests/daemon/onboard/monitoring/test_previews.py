@@ -42,7 +42,7 @@ def fly(state: FlightState, number: int) -> None:
         state.apply(event)
 
 
-def test_a_watcher_with_a_kilobyte_a_second_gets_the_verdict_first_and_then_the_picture(
+def test_a_client_with_a_kilobyte_per_second_receives_verdict_then_picture(
     state: FlightState,
 ) -> None:
     fly(state, 1)

@@ -1,4 +1,4 @@
-"""While the service runs, `syntopic check` asks it and opens nothing."""
+"""While the service runs, `syntopic check` queries it and opens no device."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def flying() -> Service:
     return service
 
 
-def test_the_running_service_is_asked_over_its_control_socket(planted: Planted) -> None:
+def test_the_running_service_is_queried_over_its_control_socket(planted: Planted) -> None:
     configuration, rig = load(planted.config)
     mission = create_mission(configuration, rig, planted.config)
     service = flying()

@@ -1,4 +1,4 @@
-"""Under any budget a watcher ends up with the service's state, and what matters comes first."""
+"""Under any budget a client receives the state of the service, the essential parts first."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def fly(state: FlightState, numbers: range) -> None:
 
 
 @pytest.mark.parametrize("bytes_per_s", [1000, 4000, 1e9])
-def test_every_watcher_converges_within_its_budget(bytes_per_s: float) -> None:
+def test_every_client_converges_within_its_budget(bytes_per_s: float) -> None:
     state = FlightState("syntopic test")
     state.apply(flight_events.mission())
     subscription = Subscription(bytes_per_s)

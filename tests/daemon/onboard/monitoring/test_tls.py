@@ -132,7 +132,7 @@ def certificate_events(service: Service) -> list[Any]:
     return [one for one in service.events if one.get("event") == "tls-certificate"]
 
 
-def test_a_key_that_everybody_may_read_is_not_served(tmp_path: Path) -> None:
+def test_a_key_readable_by_all_users_is_not_served(tmp_path: Path) -> None:
     issue_certificate(tmp_path / "tls")
     (tmp_path / "tls/server.key").chmod(0o644)
     settings = WatchSection(

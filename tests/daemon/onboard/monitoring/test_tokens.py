@@ -44,7 +44,7 @@ def test_a_name_has_one_token_and_odd_names_none(tmp_path: Path) -> None:
         remove_token(path, "pilot")
 
 
-def test_a_file_open_to_everybody_or_damaged_is_refused(tmp_path: Path) -> None:
+def test_a_file_readable_by_all_users_or_damaged_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "tokens.toml"
     add_token(path, "operator", "operator")
     path.chmod(0o644)

@@ -83,7 +83,7 @@ async def stall(port: int, release: asyncio.Event) -> None:
     writer.close()
 
 
-def test_stalled_watchers_cost_the_others_nothing(watch: tuple[ChildProcess, int]) -> None:
+def test_stalled_clients_do_not_delay_the_others(watch: tuple[ChildProcess, int]) -> None:
     child, port = watch
     assert child.try_send(ServiceEvent(flight_events.mission()))
     before_kb = resident_kb(child.process.pid or 0)
