@@ -1,5 +1,5 @@
-"""Emulated devices that speak the real protocols, and the world they look at.
+"""Emulated devices with the real protocols, and the world that they observe.
 
 Projection and codecs are written here a second time, from the specifications: an emulator that
-shared the pipeline's code would agree with its mistakes.
+shared the pipeline's code would repeat its errors.
 """

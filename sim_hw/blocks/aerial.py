@@ -1,4 +1,4 @@
-"""A block of aerial images as an aerotriangulation meets it: measured, navigated, surveyed, true.
+"""A block of aerial images for aerial triangulation: measurements, navigation, control, truth.
 
 Nothing is rendered: image coordinates are where the true camera sees ground points, by projection
 code of the emulator's own, plus noise and a systematic pattern that no calibration knows.
@@ -49,7 +49,7 @@ class ImageFormat:
 
 @dataclass(frozen=True)
 class MeasurementErrors:
-    """Standard deviations of what is measured, and the size of what nobody knows.
+    """Standard deviations of the measurements, and the size of the unknown systematic errors.
 
     Attributes:
         image_mm: image coordinates.

@@ -1,7 +1,7 @@
 """A flight over control that determines boresight, lever arm and time offset, with its truth.
 
 Nothing is rendered: image coordinates are where the true camera sees ground points. The inertial
-unit sits askew, its antenna apart from the camera, and its clock is late; poses and their
+unit has a boresight angle, a lever arm and a time offset; poses and their
 derivatives are the emulator's own.
 """
 

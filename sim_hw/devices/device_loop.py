@@ -15,7 +15,7 @@ from typing import Protocol
 from sim_hw.world.world_clock import NS_PER_S
 
 DRAIN_S = 0.05
-"""Longest wait before the host, the closing and the wire are looked after again."""
+"""Longest wait between two checks of the host, of `close` and of the faults."""
 UNPLUGGED_POLL_S = 0.02
 
 ByteFilter = Callable[[bytes, int], bytes]
@@ -24,7 +24,7 @@ with nothing, every 50 ms at the latest, so that it may keep bytes and let them 
 
 
 class DeviceLine(Protocol):
-    """The device's end of what joins it to a host. Nothing here blocks on a host."""
+    """The device's end of its connection to a host. No method blocks on a host."""
 
     @property
     def port(self) -> str:
@@ -34,7 +34,7 @@ class DeviceLine(Protocol):
     def is_open_by_a_host(self) -> bool: ...
 
     def write(self, data: bytes) -> int:
-        """Send; how many bytes found a place."""
+        """Send; the number of bytes accepted."""
 
     def read(self, timeout_s: float) -> bytes:
         """What the host has written; b"" if nothing came within the timeout."""
@@ -132,7 +132,7 @@ class LineDevice:
             self._send(self.on_received(received))
             return
         if not self._line.is_open_by_a_host:
-            # A line that nobody has open answers at once that there is nothing.
+            # A closed line returns at once without data.
             self._stop.wait(min(timeout_s, UNPLUGGED_POLL_S))
         self._send(self.on_idle() if timeout_s >= idle_timeout_s else b"")
 

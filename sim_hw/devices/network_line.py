@@ -1,6 +1,6 @@
 """The device's end of a network connection: a TCP server, or a UDP sender that receives answers.
 
-They stand in for a pseudo-terminal, see `sim_hw.devices.device_loop.Line`.
+They replace a pseudo-terminal, see `sim_hw.devices.device_loop.DeviceLine`.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ class TcpLine:
 class UdpLine:
     """Sends datagrams to one address, as an autopilot does to its ground station.
 
-    A host that writes to it from another address becomes the receiver. `port` is what the host has to
+    A host that writes from another address becomes the receiver. `port` is what the host has to
     listen at.
     """
 

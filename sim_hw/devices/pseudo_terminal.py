@@ -14,7 +14,7 @@ _READ_BYTES = 4096
 class PseudoTerminal:
     """A raw pseudo-terminal; `port` is the path a host program opens as its serial port.
 
-    Nothing here ever blocks on a host that does not read. Bytes for a port that nobody has open are
+    No method blocks on a host that does not read. Bytes for a port that is not open are
     lost, as on a cable that is plugged into nothing.
     """
 

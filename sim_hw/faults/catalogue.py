@@ -1,6 +1,6 @@
 """The names of the faults: what each does, to which devices, and its default duration.
 
-Names only. Where they are read from is in `plan`, how they are carried out in `channel`.
+Names only. `plan` reads them, `channel` applies them.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The effect of one device's faults on its messages: pure functions of the instants passed in.
 
-The same channel stands behind the sockets and pseudo-terminals of the wire emulators and behind
-the devices of the fake clock. What a message is, bytes or a frame, only `Damage` knows.
+The same channel is used behind the sockets and pseudo-terminals of the wire emulators and behind
+the devices of the fake clock. Only `Damage` depends on the type of a message, bytes or a frame.
 """
 
 from __future__ import annotations
@@ -233,7 +233,7 @@ class Channel(Generic[T]):
             return due
 
     def _sent(self, message: T, now_ns: int, topic: str, what: str) -> list[Delivery[T]]:
-        # Here `silent` suppresses some topics; a device that is completely silent does not get here.
+        # Here `silent` suppresses some topics; a silent device does not get here.
         if self._take("silent", now_ns, topic, what) is not None:
             return []
         last = self._last.get(topic)

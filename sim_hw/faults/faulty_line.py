@@ -1,4 +1,4 @@
-"""Faults of emulated devices on a line: what stands between a device and its host.
+"""Faults of emulated devices on a line, applied between a device and its host.
 
 Called from the device's own thread with everything it sends, and with nothing every 50 ms, so that
 delayed bytes can be released later and unsolicited bytes can be added.

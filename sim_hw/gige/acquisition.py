@@ -337,7 +337,7 @@ class Acquisition:
         self._send_what_is_due()
 
     def _hand_over(self, pending: _Pending, taken: ExposedFrame) -> None:
-        """To the stream, where somebody wants it."""
+        """Pass the frame to the stream, if it has a receiver."""
         destination = self.destination()
         with self._lock:
             if destination is None or pending.acquisition != self._acquisition:

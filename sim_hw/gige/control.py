@@ -1,6 +1,6 @@
 """The control channel of a head: privilege, heartbeat, reading and writing of registers.
 
-A pure answering machine, packet in and packet out; sockets and threads are in `head`.
+Pure functions from request packet to answer packet; sockets and threads are in `gige_head`.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The GenICam description of a head: XML, schema 1.1, made from the table of features.
 
-A controller fetches it from the head's memory and learns from it which register means what.
+A controller reads it from the head's memory to find the registers of the features.
 """
 
 from __future__ import annotations

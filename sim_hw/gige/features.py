@@ -1,7 +1,7 @@
 """The features of an emulated head: one table from which registers and GenICam XML both follow.
 
 Names are those of the SFNC (Standard Features Naming Convention); `TdiShifts` is the maker's own.
-What a feature does is in `head`.
+The effect of a feature is in `gige_head`.
 """
 
 from __future__ import annotations

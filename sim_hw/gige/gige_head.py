@@ -1,6 +1,6 @@
-"""An emulated GigE Vision head: registers, control, acquisition and stream put together.
+"""An emulated GigE Vision head: registers, control, acquisition and stream combined.
 
-What the sensor sees is asked from `expose`; nothing here knows of cones, flights or scenes.
+`expose` supplies the frames; this module is independent of cones, flights and scenes.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """GVCP on the wire: commands in, acknowledgements out (GigE Vision 2.0, section 13 to 18).
 
-Only bytes and their meaning; who may do what is in `control`.
+Encoding only; `control` checks the privileges.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """GVSP on the wire: one frame as a table of datagrams that the kernel sends in batches.
 
 Header, slice of the image and slice of the chunk data are gathered by the kernel (sendmmsg), so
-that pixels are never copied and packets never built one by one. Who sends when is in `stream`.
+that pixels are never copied and packets never built one by one. `stream` decides when to send.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What can be wrong with a head and its connection, by name and reproducible."""
+"""Faults of a head and its connection, by name and reproducible."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""How fast a head sends, so that an ordinary receiver on this machine loses nothing.
+"""The send rate of a head at which an ordinary receiver on this machine loses no packet.
 
-The arithmetic only; `stream` does the waiting.
+Computation only; `stream` waits.
 """
 
 from __future__ import annotations

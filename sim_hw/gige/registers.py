@@ -1,6 +1,6 @@
 """The register memory of an emulated head: what may be read, what may be written, and its bounds.
 
-It knows addresses, lengths and limits; what a write sets in motion is in `control` and `head`.
+It holds addresses, lengths and limits; `control` and `gige_head` act on writes.
 """
 
 from __future__ import annotations

@@ -38,7 +38,7 @@ class ControlServer:
         """Bind and answer.
 
         Raises:
-            OSError: the address is not this host's, or somebody else answers there.
+            OSError: the address is not this host's, or it is in use.
         """
         try:
             self._bind()

@@ -1,6 +1,6 @@
-"""`python -m sim_hw.laboratory.calibration_field RIG`: a rig before an emulated 3D calibration field.
+"""`python -m sim_hw.laboratory.calibration_field RIG`: a rig in front of an emulated 3D calibration field.
 
-Some hundred bright targets in a room, surveyed with errors; the rig looks at them from many places,
+Some hundred bright targets, surveyed with errors; the rig images them from many positions,
 turned and tilted. Frames hold discs with photon and read noise. The truth: every sensor displaced,
 turned, scaled and skewed, every cone turned and shifted against the rig file. Projection code of
 its own.

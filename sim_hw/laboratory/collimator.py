@@ -1,8 +1,8 @@
-"""`python -m sim_hw.laboratory.collimator RIG`: a head before an emulated collimator.
+"""`python -m sim_hw.laboratory.collimator RIG`: a head in front of an emulated collimator.
 
 A collimator on an arm shows one target at infinity under known angles; the head stands in a holder
 that is turned between series. Each image is a cut-out around the target, drawn through the true
-lens, which has more than ten parameters can say. Projection code of its own.
+lens, whose distortion exceeds the ten-parameter model. Projection code of its own.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ LENS_SPREAD: Final = {
 
 @dataclass(frozen=True)
 class TrueHead:
-    """The true head. `place` is the true position of the sensor in the layer, as in the rig file."""
+    """The true head. `place` is the true position of the sensor in its layer."""
 
     cone: Cone
     sensor: Sensor

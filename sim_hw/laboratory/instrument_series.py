@@ -1,4 +1,4 @@
-"""A laboratory series as the emulated instruments leave it on disk, and the command that takes one.
+"""A laboratory series as the emulated instruments write it, and the command that records one.
 
 The images and their metadata come from the instruments: `sphere`, `collimator`,
 `calibration_field`.

@@ -1,7 +1,7 @@
-"""The emulated rig on a clock of the caller's: no threads, no sockets, no pixels, no waiting.
+"""The emulated rig on the caller's clock: no threads, no sockets, no pixels, no waiting.
 
-Trigger unit, heads, receiver and probes say the same things as on the wire and have the same
-faults; a flight of hours takes seconds. What was true is known here, and only here.
+Trigger unit, heads, receiver and probes send the same messages as on the wire and have the same
+faults; a flight of hours takes seconds. Only this module knows the truth.
 """
 
 from __future__ import annotations
@@ -336,7 +336,7 @@ class DiscreteEventRig:
         self._answer(f"PULSEBUS 1 {self.rig.name} {outputs}", now_ns)
 
     def execute(self, line: bytes, now_ns: int) -> None:
-        """A line of the program; it is not received where the cable is out. See docs/pulse-bus.md."""
+        """A line of the program; not received if the cable is out. See docs/pulse-bus.md."""
         if not self.trigger.is_connected(now_ns):
             return
         match line.decode().split():

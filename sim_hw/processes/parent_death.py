@@ -1,4 +1,4 @@
-"""An emulator must not outlive whoever started it."""
+"""Ends an emulator process when its parent process ends."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which receivers and probes an emulated rig can fly with, by kind, and on what line each is.
+"""The receivers and probes of an emulated rig, by kind, and the line of each.
 
 The messages of each kind are in its own file.
 """

@@ -1,4 +1,4 @@
-"""What emulated GNSS receivers have in common: epochs, the receiver's own clock, strobe edges.
+"""Base of the emulated GNSS receivers: epochs, the receiver's own clock, strobe edges.
 
 The messages of each kind of receiver are in its own file.
 """

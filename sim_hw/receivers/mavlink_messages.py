@@ -1,4 +1,4 @@
-"""MAVLink 2 messages as bytes, both ways: of an autopilot, and what it is asked.
+"""MAVLink 2 messages as bytes: those of an autopilot and the requests to it.
 
 Written from the common message set (https://mavlink.io/en/messages/common.html) and the guide on
 serialization: field order on the wire, CRC seed and truncation all follow from the definitions
@@ -133,7 +133,7 @@ class MessageDefinition:
 
 @dataclass(frozen=True)
 class ReceivedMessage:
-    """A message somebody sent."""
+    """A received message."""
 
     name: str
     system: int

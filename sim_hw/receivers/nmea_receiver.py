@@ -1,6 +1,6 @@
 """An emulated receiver that speaks NMEA 0183 only, with attitude and event marks.
 
-What its sentences look like is in `nmea_sentences`; epochs and edges are those of every receiver.
+Its sentences are encoded in `nmea_sentences`; epochs and edges are those of every receiver.
 """
 
 from __future__ import annotations

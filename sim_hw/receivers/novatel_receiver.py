@@ -1,6 +1,6 @@
 """An emulated NovAtel OEM7 receiver with SPAN: binary logs, marks with time and with solution.
 
-What its logs look like is in `novatel_messages`; epochs and edges are those of every receiver.
+Its logs are encoded in `novatel_messages`; epochs and edges are those of every receiver.
 """
 
 from __future__ import annotations

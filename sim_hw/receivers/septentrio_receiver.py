@@ -1,6 +1,6 @@
 """An emulated Septentrio receiver: SBF with position, attitude and external events.
 
-What its blocks look like is in `septentrio_messages`; epochs and edges are those of every receiver.
+Its blocks are encoded in `septentrio_messages`; epochs and edges are those of every receiver.
 """
 
 from __future__ import annotations

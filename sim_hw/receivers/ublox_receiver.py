@@ -1,6 +1,6 @@
 """An emulated u-blox receiver with event input.
 
-What its messages look like is in `ublox_messages`; epochs and edges are those of every receiver.
+Its messages are encoded in `ublox_messages`; epochs and edges are those of every receiver.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""How the UTC of an emulated autopilot errs: jitter of each message, and steps."""
+"""Errors of an emulated autopilot's UTC: jitter of each message, and steps."""
 
 from __future__ import annotations
 

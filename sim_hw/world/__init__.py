@@ -1,1 +1,1 @@
-"""What there is to see and how it is seen: flight, ground, true camera, light, truth."""
+"""The emulated world: flight, ground, true camera, light, truth."""

@@ -1,4 +1,4 @@
-"""A cloud between camera and ground: bright, soft, and nearer than what it hides.
+"""A cloud between camera and ground: bright, soft, and nearer than the ground.
 
 Because it is nearer, cones at different positions see it shifted against the ground. Its
 shadow is not emulated.

@@ -1,7 +1,7 @@
-"""The sensor behind the lens: what its pixels make of the light, with every fault they have.
+"""The sensor: conversion of irradiance to counts, with all defects of its pixels.
 
 Responsivity, vignetting, dark signal, defects, time-delay integration, noise and the converter.
-Where the light comes from is in `rendering`; how a laboratory would measure all this is in
+`rendering` computes the irradiance; the laboratory measurements are in
 `laboratory`.
 """
 

@@ -1,7 +1,7 @@
-"""Where the emulated aircraft is: lines, turns, wind, and the tremor of a stabilised mount.
+"""Position and attitude of the emulated aircraft: lines, turns, wind, mount vibration.
 
-A pure function of time, from a plan and a seed. What the camera sees from there is in
-`rendering`; when it is asked to look is in `simulator`.
+A pure function of time, from a plan and a seed. The images are computed in
+`rendering`; the trigger times are in `simulator`.
 
 Local system: east, north, up in metres, tangent to the ellipsoid at the plan's origin, up = 0 at
 the mean height of the terrain. Body axes x forward, y right, z down.
@@ -181,7 +181,7 @@ class SimulatedFlight:
         return float(north), float(east), float(-up)
 
     def attitude_rad(self, pose: Pose) -> tuple[float, float, float]:
-        """Roll, pitch and heading against the local level at the aircraft, as an IMU reports them."""
+        """Roll, pitch and heading against the local level at the aircraft, as an IMU has them."""
         east, north, up = self._local_from_enu(pose) @ pose.enu_from_body
         return (
             math.atan2(-up[1], -up[2]),

@@ -1,8 +1,8 @@
-"""Grounds that are hard to stitch over: each made from what its surface does to light.
+"""Grounds that are difficult to stitch, each defined by the reflection of its surface.
 
 Radiances are relative to the white of an ordinary landscape (a bright roof, reflectance about one
-half), in the four bands of a scene. Ordinary landscapes are quilted in `scene`; what moves is in
-`traffic`, what hangs between camera and ground in `cloud`.
+half), in the four bands of a scene. Ordinary landscapes are quilted in `scene`; cars are in
+`traffic`, clouds in `cloud`.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""What a sensor sees: rays through the true camera onto the ground, and the light that comes back.
+"""Irradiance of a sensor: rays through the true camera onto the ground, and its radiance.
 
 The mapping is computed exactly on a coarse grid and interpolated; the scene is a spline, read
-with six by six taps at unrounded positions. What a sensor makes of the light is in `electronics`.
+with six by six taps at unrounded positions. The conversion to counts is in `electronics`.
 """
 
 from __future__ import annotations

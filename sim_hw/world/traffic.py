@@ -1,7 +1,7 @@
-"""Cars on the motorways of a scene: they are elsewhere at every instant a cone looks.
+"""Cars on the motorways of a scene; they move between the exposures of the cones.
 
 A cone that fires 80 mm of flight later sees a car at 30 m/s some centimetres further on. The road
-under them is painted in `grounds`.
+under them is painted in `ground_types`.
 """
 
 from __future__ import annotations

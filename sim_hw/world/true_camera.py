@@ -1,4 +1,4 @@
-"""The true camera: where every sensor really sits, how warm it is, and where its pixels look.
+"""The true camera: true position and temperature of every sensor, and the rays of its pixels.
 
 Projection code of its own, written from the definitions of the rig file and sharing nothing with
 the pipeline's. The electronics behind the pixels are in `electronics`.

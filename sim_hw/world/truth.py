@@ -1,6 +1,6 @@
-"""What is really so, written down: every true parameter, and per exposure the exact geometry.
+"""The truth on disk: every true parameter, and the exact geometry of each exposure.
 
-Nobody but the judge and tests may read these files. How they are compared is in `judge`.
+Only `truth_comparison` and tests may read these files.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""The emulated world put together: rig, plan, flight, terrain, true camera, temperatures, scene.
+"""The emulated world: rig, plan, flight, terrain, true camera, temperatures, scene.
 
 Everything follows from `WorldSettings`, so that each process builds the same world from the same
-few numbers. Nothing here moves: time comes in from outside.
+few numbers. The caller supplies the time.
 """
 
 from __future__ import annotations
