@@ -1,4 +1,4 @@
-"""What every head has, whatever it is reached through: frames in slots of the caller's memory."""
+"""Base of all heads: frames in slots of the caller's memory."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from drivers.timescales.clock import Clock
 
 
 class HeadDevice(DeviceDriver):
-    """A head whose frames land in memory of the caller's.
+    """A head whose frames are written to the caller's memory.
 
     One thread at a time calls `bind` and `run`; `recycle`, `trigger`, `close` and `statistics` are
     for any thread.
@@ -55,7 +55,7 @@ class HeadDevice(DeviceDriver):
             "the configuration and start again"
         )
 
-    # For a driver to say
+    # Overridden by drivers
 
     def _slot_returned(self, slot: int) -> None:
         """A slot came back. Called with `_slots` held."""
@@ -66,7 +66,7 @@ class HeadDevice(DeviceDriver):
     def _emit_opened(self) -> None:
         self.emitter.emit("opened", self._opened_sentence())
 
-    # For a driver to use
+    # Used by drivers
 
     def _mark_in_use(self, slot: int) -> None:
         """Note that a slot goes to the caller with its frame."""
@@ -74,7 +74,7 @@ class HeadDevice(DeviceDriver):
             self._slots_in_use.add(slot)
 
     def _free_slot(self) -> int | None:
-        """The next slot that nobody has; None, counted and told, where all are taken."""
+        """The next free slot; None, counted and reported, if all are in use."""
         with self._slots:
             free = [
                 slot for slot in range(self._memory.slot_count) if slot not in self._slots_in_use

@@ -1,6 +1,6 @@
-"""What a receiver's fix is worth for a flight, in words, and when it is worth an event.
+"""Description of a receiver's fix for the operator, and events on its changes.
 
-What a fix and its satellites are is said by each decoder (`drivers.receivers.message_decoder`).
+Each decoder determines fix and satellites (`drivers.receivers.message_decoder`).
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from drivers.contract import POSITION_FIXES, NavSample
 from drivers.timescales.clock import Clock
 
 LOST_FOR_NS: Final = 2_000_000_000
-"""A fix that is lost for less is no news."""
+"""Shorter losses of the fix are not reported."""
 
 
 def missing_for_flight(sample: NavSample) -> str | None:
@@ -62,11 +62,11 @@ class FixMonitor:
         self._is_searching = False
 
     def reset(self) -> None:
-        """The line was opened again: what holds is reported again."""
+        """The line was reopened: the present state is reported again."""
         self._lost_ns, self._is_searching = None, False
 
     def update(self, fix: str | None, satellites: int | None) -> None:
-        """Note the receiver's last word about its fix; None before any."""
+        """Note the receiver's latest fix status; None before the first."""
         if fix is None:
             return
         now_ns = self._clock.mono_ns()

@@ -1,6 +1,6 @@
-"""What the decoders of all receivers have in common: counting, and surviving what is fed to them.
+"""Base of the decoders of all receivers: counting, and tolerance of invalid input.
 
-How bytes are cut into messages is said by each protocol's framer, what they mean by each decoder;
+The framer of each protocol separates messages, and its decoder interprets them;
 the arithmetic of time is in `drivers.timescales.gps_time`.
 """
 
@@ -35,8 +35,8 @@ class Framer(Protocol):
 class MessageDecoder:
     """Bytes in, records out, no I/O and no clock. Nothing that is fed raises.
 
-    A protocol says in `on_message` what a whole message means, in `unreadable` which exceptions
-    mean that one makes no sense, and in `bad_counter` how those are called in the statistics.
+    A protocol converts a complete message in `on_message`. `decode_errors` lists the exceptions that
+    mean an invalid message, and `bad_counter` is the name of their counter.
     """
 
     decode_errors: tuple[type[Exception], ...] = (ValueError,)
@@ -54,13 +54,13 @@ class MessageDecoder:
         self._gps_ns: int | None = None
         """GPS time of the last navigation epoch whose time could be trusted."""
         self.fix: str | None = None
-        """The receiver's last word about its fix, as in NavSample; None before any."""
+        """The receiver's latest fix status, as in NavSample; None before the first."""
         self.satellites: int | None = None
-        """Satellites in use; None where the receiver has not said."""
+        """Satellites in use; None if the receiver has not reported them."""
 
     @abstractmethod
     def on_message(self, message: bytes, mono_ns: int) -> list[Nav]:
-        """Records that one whole message makes; one of `unreadable` where it makes no sense."""
+        """Records that one whole message makes; raises one of `decode_errors` if it is invalid."""
 
     @property
     def leap_seconds(self) -> int | None:
@@ -88,7 +88,7 @@ class MessageDecoder:
         return self._framer.pending
 
     def reset(self) -> None:
-        """The line was opened anew: forget what was half received."""
+        """The line was reopened: discard incomplete messages."""
         self._framer.reset()
         self.fix = self.satellites = None
 

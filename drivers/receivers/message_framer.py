@@ -1,6 +1,6 @@
 """Whole messages out of a stream of bytes, for protocols with a sync, a length and a checksum.
 
-What a candidate's length and checksum are is said by each protocol. The result does not depend on
+Each protocol defines length and checksum of a candidate. The result does not depend on
 how the bytes were cut into pieces on arrival.
 """
 
@@ -10,13 +10,13 @@ import re
 from collections.abc import Callable
 
 SizeOf = Callable[[bytes, int], int | None]
-"""Size of the message that would begin there; 0 if none can, None if that cannot be said yet."""
+"""Size of the message that would begin there; 0 if none can, None if that is not known yet."""
 
 
 class MessageFramer:
     """Cuts whole, checksummed messages out of a stream.
 
-    `starts` are the bytes a message can begin with, `fits` says whether a whole message's checksum
+    `starts` are the bytes a message can begin with, `fits` checks whether a complete message's checksum
     is right. A damaged message costs itself only: the search goes on behind its first byte, and a
     candidate that holds another whole message is given up at once rather than waited for.
     `size_of` bounds what is ever kept.

@@ -1,4 +1,4 @@
-"""What receivers have in common that send by themselves on a line: listening and saying who spoke.
+"""Base of receivers that send unrequested on a line: listening and identification.
 
 What the bytes mean is in the decoder of each protocol; opening, reconnecting and silence are in
 `drivers.transport.serial_device`.
@@ -77,7 +77,7 @@ class StreamingNavigator(SerialDevice):
         return self.baudrate, self.parity
 
     def identify(self, line: SerialLine) -> Mapping[str, str]:
-        """Listen until a required message comes, `silence_s` at most; what was heard."""
+        """Listen until a required message comes, `silence_s` at most; returns the identity."""
         deadline_ns = self.clock.mono_ns() + round(self.silence_s * 1e9)
         came = 0
         while self.clock.mono_ns() < deadline_ns and not self._closing.is_set():

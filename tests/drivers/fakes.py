@@ -1,4 +1,4 @@
-"""A clock and a serial port that do what a test says."""
+"""A clock and a serial port that are controlled by a test."""
 
 from __future__ import annotations
 

@@ -87,7 +87,7 @@ def read_by_us(recording: Path) -> tuple[str, list[NavSample]]:
 
 
 def read_through_gpsd(recording: Path, *, patience: float = 1.0) -> list[NavSample]:
-    """What our reading of reports makes of the real gpsd that hears the recording at once.
+    """What our reading of reports makes of the real gpsd that receives the recording at once.
 
     Args:
         patience: factor of the waits, for a busy machine.

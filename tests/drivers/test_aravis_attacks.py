@@ -267,7 +267,7 @@ def test_pending_acknowledgements_of_others_do_not_keep_a_lost_head_away() -> No
 
 
 def accepted_by(udp: socket.socket) -> set[str]:
-    """Who of head and stranger gets through to a socket."""
+    """Which of head and unknown sender reaches a socket."""
     udp.settimeout(0.2)
     for address in (HEAD, ATTACKER_ADDRESS):
         with attacker_socket(address) as sender:

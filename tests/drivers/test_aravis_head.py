@@ -128,7 +128,7 @@ class Pair:
         self.emulated.line(time.monotonic_ns(), count)
 
     def start_on_host_ns(self, frame: Frame) -> int:
-        """Start of exposure as the program reckons it: device time through the latch."""
+        """Start of exposure as the program computes it: device time through the latch."""
         assert frame.device_ns is not None
         assert frame.device_clock_ns is not None
         assert frame.device_clock_mono_ns is not None

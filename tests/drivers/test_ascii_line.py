@@ -119,7 +119,7 @@ def test_a_command_is_sent_at_its_interval() -> None:
 
 
 @pytest.mark.parametrize(
-    ("said", "cure"),
+    ("received", "hint"),
     [
         (b"", "nothing came"),
         (b"T1=", "no complete line came"),
@@ -127,25 +127,25 @@ def test_a_command_is_sent_at_its_interval() -> None:
         (b"T1=1 T2=?\n", "no reading of G"),
     ],
 )
-def test_binding_states_what_is_wrong(said: bytes, cure: str) -> None:
-    left = [said]
+def test_binding_states_what_is_wrong(received: bytes, hint: str) -> None:
+    left = [received]
     device = thermometer(FakeClock(), lambda port: left.pop() if left else b"")
-    with pytest.raises(DeviceError, match=cure):
+    with pytest.raises(DeviceError, match=hint):
         device.bind()
 
 
 def test_contradicting_settings_are_refused_with_a_sentence() -> None:
-    def said(**more: object) -> str:
+    def problems_of(**more: object) -> str:
         section = {"port": "/dev/probes", "pattern": TWO, "channels": ["0", "G"], **more}
         return "\n".join(AsciiLineThermometer.problems(section))
 
-    assert said() == ""
-    assert "(?P<x>'; it does not compile" in said(pattern="(?P<x>")
-    assert "pattern has 0 named groups; 2 are needed" in said(pattern=r"T=\d+")
-    assert "channels names 0 twice" in said(channels=["0", "0"])
-    assert "channel_labels is given; only" in said(channel_labels=["a", "b"])
-    assert "has 1 labels; channels has 2" in said(pattern=ONE, channel_labels=["a"])
-    assert "at least twice interval_s = 20" in said(command="T?", interval_s=10.0)
+    assert problems_of() == ""
+    assert "(?P<x>'; it does not compile" in problems_of(pattern="(?P<x>")
+    assert "pattern has 0 named groups; 2 are needed" in problems_of(pattern=r"T=\d+")
+    assert "channels names 0 twice" in problems_of(channels=["0", "0"])
+    assert "channel_labels is given; only" in problems_of(channel_labels=["a", "b"])
+    assert "has 1 labels; channels has 2" in problems_of(pattern=ONE, channel_labels=["a"])
+    assert "at least twice interval_s = 20" in problems_of(command="T?", interval_s=10.0)
 
 
 def test_an_instrument_on_a_real_line_is_bound_and_read() -> None:

@@ -1,4 +1,4 @@
-"""Finding devices: protocol and speed, over lines that garble what is heard at a wrong speed."""
+"""Finding devices: protocol and speed, over lines that garble data at a wrong baud rate."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ from tests.sim_hw.receiver_state import state_at
 from tests.system.demo_mission import syntopic
 
 DEVICES: dict[str, tuple[Callable[[], LineDevice], str, int]] = {
-    # The u-blox sends NMEA beside its own: it is a u-blox all the same.
+    # The u-blox sends NMEA in addition to its own: it is a u-blox all the same.
     "ublox": (lambda: UbloxReceiver(_clock(), state_at, rate_hz=1.0), "ublox", 38_400),
     "novatel": (lambda: NovatelReceiver(_clock(), state_at, rate_hz=1.0), "novatel", 230_400),
     "septentrio": (lambda: SeptentrioReceiver(_clock(), state_at, rate_hz=1.0), "septentrio",
@@ -94,7 +94,7 @@ def test_every_device_is_found_with_its_protocol_and_its_speed() -> None:
             on_progress=lambda port, sentence: progress.setdefault(port, []).append(sentence),
         )
         speeds = {kind: set(relay.speeds) for kind, relay in relays.items()}
-    assert speeds["nmea"] >= {115_200, 9_600}, "it was heard at a wrong speed, too"
+    assert speeds["nmea"] >= {115_200, 9_600}, "data arrived at a wrong baud rate, too"
     by_kind = dict(zip(relays, found, strict=True))
     for kind, (_, driver, baudrate) in DEVICES.items():
         one = by_kind[kind]

@@ -42,7 +42,7 @@ PAIRS = {
     "nmea": (NmeaReceiver, NmeaNavigator),
 }
 MARKS_WITHIN_NS = {"ublox": 0, "novatel": 1, "septentrio": 1, "nmea": 500}
-"""The resolution of each protocol: NMEA tells microseconds."""
+"""The resolution of each protocol: NMEA resolves microseconds."""
 PLACE_WITHIN_M = {"ublox": 0.02, "novatel": 1e-3, "septentrio": 1e-3, "nmea": 0.06}
 
 

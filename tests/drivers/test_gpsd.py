@@ -253,7 +253,7 @@ def test_a_gpsd_that_ends_is_found_again_and_watched_again() -> None:
     [
         (lines({"class": "DEVICES", "devices": []}), "", "has no receiver; name its port"),
         (b"", "/dev/ttyS9", "no receiver /dev/ttyS9; it has /dev/ttyACM0"),
-        (b"", "", "said nothing in 0.5 s"),
+        (b"", "", "sent nothing in 0.5 s"),
     ],
 )
 def test_binding_states_what_is_wrong_with_the_gpsd(script: bytes, device: str, cure: str) -> None:

@@ -39,7 +39,7 @@ NO_GEOID: Final = (
     "GGA comes without the undulation: only a height above the geoid was received. gpsd computes "
     "the undulation from a grid of its own; ours is the setting `undulation_m`"
 )
-GSA_2D: Final = "GSA says two dimensions: the height is held, not measured. gpsd passes it on"
+GSA_2D: Final = "GSA reports two dimensions: the height is held, not measured. gpsd passes it on"
 RMC_FIRST: Final = (
     "an epoch of RMC or GLL alone has no height; gpsd goes on with the mode of the epoch before"
 )

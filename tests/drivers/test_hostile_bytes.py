@@ -35,7 +35,7 @@ EPOCHS = 20
 
 @dataclass(frozen=True)
 class Protocol:
-    """A decoder, what its receiver says, and what it may keep of a message that is not whole."""
+    """A decoder, the data of its receiver, and the limit of bytes kept of an incomplete message."""
 
     decoder: Callable[[str], MessageDecoder]
     source: Callable[[], bytes]

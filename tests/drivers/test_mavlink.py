@@ -201,7 +201,7 @@ def test_after_the_line_was_reopened_another_autopilot_may_be_there() -> None:
     decoder, _ = decode(bus.heartbeat() + bus.system_time())
     assert len(decoder.feed(other.heartbeat() + other.position() + bus.position(), 0)) == 1
     decoder.reset()
-    assert len(decoder.feed(bus.position(), 0)) == 1, "until a heartbeat says otherwise"
+    assert len(decoder.feed(bus.position(), 0)) == 1, "until a heartbeat shows otherwise"
     assert len(decoder.feed(other.heartbeat() + other.position(), 0)) == 1
     assert decoder.system == 7
 

@@ -39,7 +39,7 @@ class At:
     utc_sigma_ns: int
 
 
-def said(
+def system_times(
     clock: BootClock, jitter: UtcJitter | None, seed: int, ppm: float = 10.0, count: int = MESSAGES
 ) -> Iterator[At]:
     """SYSTEM_TIME once a second for a while; truth is the autopilot's UTC without its jitter."""
@@ -67,7 +67,7 @@ def over_seeds(jitter: UtcJitter | None) -> tuple[list[At], int]:
     found, steps = [], 0
     for seed in range(SEEDS):
         clock = BootClock()
-        found += list(said(clock, jitter, seed))[FROM:]
+        found += list(system_times(clock, jitter, seed))[FROM:]
         steps += clock.steps
     return found, steps
 
@@ -96,7 +96,7 @@ def test_the_stated_sigma_of_the_autopilots_time_is_true_over_seeds(
 @pytest.mark.trust
 def test_a_recorded_autopilots_jitter_never_ends_in_microseconds() -> None:
     clock = BootClock()
-    for at in said(clock, ARDUPILOT, 5, count=1500):
+    for at in system_times(clock, ARDUPILOT, 5, count=1500):
         assert at.sigma_ns > 280_000
         assert at.utc_sigma_ns > 3 * MS
     assert clock.steps <= 2
@@ -109,7 +109,7 @@ def test_a_step_of_utc_is_noticed_within_some_messages_counted_and_measured(step
     for seed in range(20):
         clock = BootClock()
         jitter = UtcJitter(step_every_s=60.0, step_ns=step_ns)
-        for n, at in enumerate(said(clock, jitter, seed, count=100)):
+        for n, at in enumerate(system_times(clock, jitter, seed, count=100)):
             if n == 64:
                 followed += abs(at.error_ns) < 40 * MS
         noticed += clock.steps == 1
@@ -122,7 +122,7 @@ def test_a_step_of_utc_is_noticed_within_some_messages_counted_and_measured(step
 
 def test_one_message_far_off_is_doubted_and_no_step() -> None:
     clock = BootClock()
-    before = list(said(clock, EVEN, 3, count=40))[-1]
+    before = list(system_times(clock, EVEN, 3, count=40))[-1]
     boot_ms = 754_000 + 40_000
     clock.add_system_time(UNIX_US + 40_000_000 + 200_000, boot_ms)
     assert clock.steps == 0
@@ -189,8 +189,8 @@ def test_attitude_is_read_from_angles_where_no_quaternion_comes() -> None:
         return bus.pack_message(dialect.MAVLink_attitude_message(boot_ms, *values))
 
     begun = bus.heartbeat() + bus.system_time()
-    said = begun + angles(BOOT_MS - 20, -2.0) + bus.position() + angles(BOOT_MS + 20, 2.0)
-    (sample,) = decode(said)[1]
+    data = begun + angles(BOOT_MS - 20, -2.0) + bus.position() + angles(BOOT_MS + 20, 2.0)
+    (sample,) = decode(data)[1]
     assert isinstance(sample, NavSample)
     assert sample.heading_rad is not None
     assert abs(math.remainder(sample.heading_rad, math.tau)) < 1e-3

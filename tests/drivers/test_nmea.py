@@ -193,7 +193,7 @@ def test_every_recorded_sentence_is_that_of_pynmeagps_and_its_time_that_of_ubx(p
     ggas = [m for m in lines if m.msgID == "GGA"]
     assert decoder.seen["GGA"] == len(ggas)
     assert decoder.seen["RMC"] == sum(m.msgID == "RMC" for m in lines)
-    # Whether the last epoch is told depends on where the recording ends.
+    # Whether the last epoch is emitted depends on where the recording ends.
     assert len(ggas) - 1 <= len(got) <= len(ggas)
     for sample, gga in zip(got, ggas, strict=False):
         assert sample.latitude_deg == pytest.approx(gga.lat, abs=2e-9)
@@ -208,10 +208,10 @@ def test_every_recorded_sentence_is_that_of_pynmeagps_and_its_time_that_of_ubx(p
 def test_binding_states_what_was_received_or_what_to_switch_on() -> None:
     clock = FakeClock()
 
-    def bind(said: bytes) -> str:
+    def bind(received: bytes) -> str:
         def answer(_: FakePort) -> bytes:
-            clock.now_ns += 10**8 if said else 0
-            return said
+            clock.now_ns += 10**8 if received else 0
+            return received
 
         port = FakePort(clock, answer)
         navigator = NmeaNavigator("n", {"port": "x"}, clock=clock, open_port=lambda *_: port)

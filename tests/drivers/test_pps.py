@@ -75,7 +75,7 @@ def test_structures_and_requests_are_those_of_the_kernels_header(tmp_path: Path)
 
 
 class ScriptedSource:
-    """A source that says what it was told to, then nothing; OSError entries are raised.
+    """A source that returns given edges, then nothing; OSError entries are raised.
 
     `unwaited` is what it answers who does not wait.
     """
@@ -136,7 +136,7 @@ def device(wall: FakeWallClock, **settings: object) -> PpsDevice:
 
 
 def events_until(sequence: int, pps: PpsDevice) -> list[Record]:
-    """What a driver tells in its thread up to that edge; it is closed then, and has ended."""
+    """The records of a driver up to that edge; the driver is closed then, and has ended."""
     got: list[Record] = []
     seen = threading.Event()
 

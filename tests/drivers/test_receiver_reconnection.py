@@ -1,4 +1,4 @@
-"""Cables pulled and power lost: noticed in time, told in words, and healed without anybody's help.
+"""Pulled cables and power loss are detected in time, reported, and recovered automatically.
 
 All kinds at once, each with its driver on an emulated receiver; the others are not disturbed.
 """
@@ -41,7 +41,7 @@ KINDS: dict[str, type[EmulatedReceiver]] = {
 
 @dataclass
 class Pair:
-    """A receiver, its cable, its driver, and what the driver said."""
+    """A receiver, its cable, its driver, and what the driver reported."""
 
     kind: str
     receiver: Any
@@ -136,9 +136,9 @@ def test_an_autopilot_that_falls_silent_and_restarts_is_received_again_at_the_ri
         wait_for(lambda: pair.samples() >= 3, "the autopilot to begin")
         silent.set()
         autopilot.restart()
-        wait_for(lambda: "silent" in pair.recorder.event_names, "its silence to be told")
+        wait_for(lambda: "silent" in pair.recorder.event_names, "its silence to be reported")
         silent.clear()
-        wait_for(lambda: "recovered" in pair.recorder.event_names, "it to be heard again")
+        wait_for(lambda: "recovered" in pair.recorder.event_names, "it to be received again")
         had = pair.samples()
         wait_for(lambda: pair.samples() >= had + 12, "its navigation")
         autopilot.mark(given_ns := clock.gps_ns(time.monotonic_ns()) + 50_000_000)

@@ -2,7 +2,7 @@
 
 What the drivers make of the recordings is held message by message against offsets written down
 here, which share no code with them: u-blox M8 (UBX-13003221) and OEM7 (OM-20000169). Where else a
-recording is held against another decoder is said in `LOGS`.
+recording is compared with another decoder is stated in `LOGS`.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ def test_positions_times_and_counts_of_a_ublox_log(name: str, frames: int, sampl
         fix_type, satellites = payload[20], payload[23]
         lon, lat, height_mm, _, h_acc_mm, v_acc_mm = struct.unpack_from("<iiiiII", payload, 24)
         velocity_mm_s = struct.unpack_from("<iii", payload, 48)
-        # The receiver's UTC is off GPS by some nanoseconds beside the leap seconds.
+        # The receiver's UTC is off GPS by some nanoseconds in addition to the leap seconds.
         assert abs(sample.gps_ns - times[itow_ms]) <= 10
         assert sample.latitude_deg == pytest.approx(lat * 1e-7, abs=1e-12)
         assert sample.longitude_deg == pytest.approx(lon * 1e-7, abs=1e-12)

@@ -83,12 +83,12 @@ def run(*pieces: bytes) -> tuple[NmeaNavigator, RecordingSink]:
     return navigator, recorder
 
 
-@pytest.mark.parametrize(("said", "satellites"), [(COLD, 0), (CLOCK_ONLY, 2)])
+@pytest.mark.parametrize(("received", "satellites"), [(COLD, 0), (CLOCK_ONLY, 2)])
 def test_a_receiver_that_was_switched_on_a_moment_ago_is_not_damaged(
-    said: bytes, satellites: int
+    received: bytes, satellites: int
 ) -> None:
     decoder = NmeaDecoder("gnss")
-    assert decoder.feed(said * 3, 0) == []
+    assert decoder.feed(received * 3, 0) == []
     assert (decoder.bad_messages, decoder.bad_bytes) == (0, 0)
     decoder.feed(sentence("GNZDA,100001.00,21,11,2026,00,00"), 0)
     assert (decoder.fix, decoder.satellites, decoder.bad_messages) == ("none", satellites, 0)
@@ -166,7 +166,7 @@ def epoch_gga(time: str) -> str:
 
 
 @pytest.mark.parametrize(
-    ("decoder", "said", "satellites"),
+    ("decoder", "received", "satellites"),
     [
         (UbxDecoder("a"), nav_pvt(0, (2026, 11, 21, 10, 0, 0), fix_type=0, flags=0), 17),
         (SbfDecoder("a"), septentrio.pvt(1000, error=1) + septentrio.pvt(1200, error=1), 17),
@@ -175,9 +175,9 @@ def epoch_gga(time: str) -> str:
     ],
 )
 def test_every_decoder_knows_that_its_receiver_searches(
-    decoder: MessageDecoder, said: bytes, satellites: int
+    decoder: MessageDecoder, received: bytes, satellites: int
 ) -> None:
-    decoder.feed(said, 0)
+    decoder.feed(received, 0)
     assert (decoder.fix, decoder.satellites, decoder.bad_messages) == ("none", satellites, 0)
 
 

@@ -68,7 +68,7 @@ def test_a_port_that_cannot_be_opened_is_tried_after_02_04_08_up_to_5_s() -> Non
     clock = FakeClock()
     recorder = _run_until(_echo_device(clock), clock, 20)
     assert clock.waits_s[:7] == [0.2, 0.4, 0.8, 1.6, 3.2, 5.0, 5.0]
-    assert recorder.event_names == ["lost"], "the operator is told once, not every time"
+    assert recorder.event_names == ["lost"], "the loss is reported once, not every time"
     assert "check the cable" in recorder.events[0].sentence
 
 
@@ -89,7 +89,7 @@ def test_silence_is_noticed_after_the_stated_time_and_its_end_too() -> None:
     assert silent.is_fault
     assert not recovered.is_fault
     assert "polly" in silent.sentence
-    assert quiet.closed, "a silent port is opened anew"
+    assert quiet.closed, "a silent port is reopened"
 
 
 def test_noise_is_no_sign_of_life() -> None:

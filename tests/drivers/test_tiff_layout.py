@@ -40,17 +40,17 @@ REFUSED = [
 ]
 
 
-@pytest.mark.parametrize(("options", "says"), REFUSED)
-def test_a_tag_that_changes_the_meaning_is_refused(tmp_path, options, says):
+@pytest.mark.parametrize(("options", "message"), REFUSED)
+def test_a_tag_that_changes_the_meaning_is_refused(tmp_path, options, message):
     path = written(tmp_path / "SU30.tif", **options)
     for read in (
         lambda: read_frame(path, width_px=64, height_px=48),
         lambda: read_tiff(path),
         lambda: check_tiff(path, width_px=64, height_px=48),
     ):
-        with pytest.raises(RasterError, match=f"SU30.tif: .*{says}"):
+        with pytest.raises(RasterError, match=f"SU30.tif: .*{message}"):
             read()
-    with pytest.raises(FrameFileError, match=says):
+    with pytest.raises(FrameFileError, match=message):
         read_folder_frame(path, max_nbytes=1 << 20)
 
 

@@ -108,7 +108,7 @@ def test_a_recording_played_over_a_line_comes_out_complete() -> None:
 
 
 @pytest.mark.parametrize(
-    ("said", "cure"),
+    ("received", "cure"),
     [
         (b"", "nothing came"),
         (b"$GNRMC,,V,,,,,,,,,,N*4D\r\n" * 5, "sends text only"),
@@ -116,11 +116,11 @@ def test_a_recording_played_over_a_line_comes_out_complete() -> None:
         (frame(0x01, 0x35, bytes(8)), "sent no NAV-PVT"),
     ],
 )
-def test_binding_states_what_is_wrong_with_the_receiver(said: bytes, cure: str) -> None:
+def test_binding_states_what_is_wrong_with_the_receiver(received: bytes, cure: str) -> None:
     with PtyLine() as line:
         navigator = UbloxNavigator("gnss", {"port": line.near, "silence_s": 0.5})
-        if said:
-            threading.Timer(0.1, line.inject, (said,)).start()
+        if received:
+            threading.Timer(0.1, line.inject, (received,)).start()
         with pytest.raises(DeviceError, match=cure):
             navigator.bind()
 

@@ -197,7 +197,7 @@ def test_what_is_read_and_written_is_complete_datagrams_of_the_sender() -> None:
         port.sender.lock()
         other_socket.sendto(b"and me", ("127.0.0.1", number))
         assert speaker.write(b"again") == 5
-        assert port.read(5) == b"again", "a stranger's datagram takes nobody's turn"
+        assert port.read(5) == b"again", "an unknown sender's datagram delays no other one"
         assert port.write(b"welcome") == 7
         assert speaker.read(7) == b"welcome"
     with pytest.raises(DeviceError, match="no other program listens there"):

@@ -1,4 +1,4 @@
-"""A V4L2 head's exposure time and gain are changed while it runs, or it says why not."""
+"""A V4L2 head's exposure time and gain are changed while it runs, or the reason is reported."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A serial cable with a speed of its own: what a host hears that listens at another one.
+"""A serial cable with a speed of its own: what a host receives that listens at another one.
 
 A pseudo-terminal carries bytes whatever speed was set. Here they go through the levels of a real
 line: sent bit by bit at the device's speed and sampled at the host's, both ways.

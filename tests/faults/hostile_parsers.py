@@ -392,7 +392,7 @@ def gvcp_answers() -> Parser:
 
     def receive(_: int) -> bytes:
         if not sent:
-            raise TimeoutError("a head that says no more")
+            raise TimeoutError("a head that sends no more")
         return sent.pop()
 
     channel.recv.side_effect = receive

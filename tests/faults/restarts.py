@@ -52,11 +52,11 @@ class StatedTimes:
 
 
 SILENCE_S = 6.0
-"""A machine that runs the tests beside other programs may starve a device for seconds."""
+"""A machine that runs the tests in parallel with other programs may starve a device for seconds."""
 SERIAL = StatedTimes(detected_s=SILENCE_S, back_s=5.0 + 3.0)
 """`silence_s` of the receivers; the longest back-off and a second of listening."""
 HEAD = StatedTimes(detected_s=4.5, back_s=5.0 + 2.5 + 3.0)
-"""Two seconds of suspicion beside a check every two; the longest back-off, and opening."""
+"""Two seconds of grace plus a check every two; the longest back-off, and opening."""
 TRIGGER = StatedTimes(detected_s=EXPOSE_EVERY_S + 0.5, back_s=EXPOSE_EVERY_S + 1.0)
 """It is asked twice a second here and answers within half of one."""
 
@@ -75,7 +75,7 @@ class Device:
     received_s: list[float] = field(default_factory=list)
     events: list[tuple[float, DeviceEvent]] = field(default_factory=list)
     down: list[tuple[float, float]] = field(default_factory=list)
-    """When it was killed, and when it said again that it is ready."""
+    """When it was killed, and when it reported again that it is ready."""
 
     def sink(self, record: Record) -> None:
         now_s = time.monotonic()
@@ -199,7 +199,7 @@ def _popen(device: Device) -> subprocess.Popen[str]:
 
 
 def start_process(device: Device) -> None:
-    """Start the device and wait until it says that it is ready."""
+    """Start the device and wait until it reports that it is ready."""
     process = SPAWNER.submit(_popen, device).result(READY_WITHIN_S)
     assert process.stdout is not None
     device.process = process
@@ -259,13 +259,13 @@ def _expose(started_devices: list[Device], stop: threading.Event) -> None:
     heads = [device for device in started_devices if device.kind == "head"]
     while not stop.wait(EXPOSE_EVERY_S):
         for head in heads:
-            # A head that is lost cannot be triggered; that it is, its driver says.
+            # A head that is lost cannot be triggered; its driver reports the loss.
             with suppress(DeviceError):
                 head.driver.trigger()
 
 
 def wait_until_all_speak(started_devices: list[Device], within_s: float) -> float:
-    """Wait until every device was heard from now on; how long that took."""
+    """Wait until every device was received from now on; returns the time that took."""
     began_s = time.monotonic()
     waiting = list(started_devices)
     while waiting:
@@ -340,7 +340,7 @@ def _spread(values_s: list[float]) -> str:
 
 
 def figures(device: Device) -> Figures:
-    """What its driver said and delivered around every kill."""
+    """What its driver reported and delivered around every kill."""
     found = Figures(len(device.down), [], 0, [], [])
     excused: list[tuple[float, float]] = []
     for killed_s, ready_s in device.down:

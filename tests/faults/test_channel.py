@@ -1,4 +1,4 @@
-"""What each fault does to what a device says, on a clock of the test's own."""
+"""The effect of each fault on the data of a device, on the test's own clock."""
 
 from __future__ import annotations
 

@@ -40,10 +40,10 @@ FAULTS = (
     hit("lost", "receiver/mark", 8),
     hit("late", "SU10", 8, LATE_S),
     hit("lost", "N", 10),
-    # Positions are held up, so that the clock is doubted, while marks are counted anew: pulse 12.
+    # Positions are held up, so that the clock is doubted, while marks are counted again: pulse 12.
     lasting("late", "receiver/navigation", 26.0, 8.0, 2.0),
     lasting("counter-reset", "receiver", 27.0, 1.0),
-    # Without its marks the clock coasts, from pulse 18 on; it says so after ten seconds.
+    # Without its marks the clock coasts, from pulse 18 on; it is reported after ten seconds.
     lasting("lost", "receiver/mark", 44.0, 16.0),
 )
 FLAGGED = {

@@ -27,7 +27,7 @@ EXPOSURE_US = 500.0
 
 
 def expose(request: ExposureRequest) -> NDArray[np.uint16]:
-    """Every pixel says which pulse it was exposed by."""
+    """Every pixel contains the number of its pulse."""
     return np.full((HEIGHT_PX, WIDTH_PX), request.pulse_count, np.uint16)
 
 

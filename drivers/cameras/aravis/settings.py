@@ -13,7 +13,7 @@ class AravisSettings(Configured):
     """The settings of `drivers.cameras.aravis.aravis_head.AravisHead`."""
 
     address = Setting(
-        "", required=True, help="IP address of the head, or its name as arv-tool says"
+        "", required=True, help="IP address of the head, or its name as printed by arv-tool"
     )
     serial = Setting("", help="serial number the head must have; empty takes any")
     width_px = Setting(0, minimum=0, help="columns; 0 takes what the head is set to")

@@ -25,12 +25,12 @@ _DIGITS: Final = re.compile(r"(\d+)")
 
 
 class FrameFileError(Exception):
-    """A file that is no frame; the message says what was found. Internal to this driver."""
+    """A file is no frame; the message contains the reason. Internal to this driver."""
 
 
 @dataclass(frozen=True)
 class FrameFile:
-    """A frame as it lies in its file.
+    """A frame and its metadata, as read from its file.
 
     `pixels` has shape (height, width), uint16. The rest is what the head knew when the frame was
     captured, from a Level-0 file of ours; None and empty for files of others.

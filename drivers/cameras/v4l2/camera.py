@@ -79,13 +79,13 @@ class V4l2Camera:
         }
 
     def exposure_time_us(self, values: Mapping[str, float | int | str]) -> float | None:
-        """The exposure time among control values; what is configured where no control tells it."""
+        """The exposure time among control values; the configured one if no control reports it."""
         if self._exposure is not None and self._exposure.name in values:
             return float(values[self._exposure.name]) * self._exposure_unit_us
         return self._settings.exposure_time_us or None
 
     def temperature_c(self) -> float | None:
-        """What the head's own thermometer says; None where it has none."""
+        """The reading of the head's own thermometer; None if it has none."""
         name = self._settings.temperature_control
         if not name:
             return None
@@ -242,7 +242,7 @@ class V4l2Camera:
             self._exposure_unit_us = self._unit_of(self._exposure, by_id)
             if not self._exposure_unit_us:
                 refusals.append(
-                    f"exposure_unit_us is 0, and the head does not tell the unit of its control "
+                    f"exposure_unit_us is 0, and the head does not report the unit of its control "
                     f"{self._exposure.name}; give it (the time of a line, as a rule)"
                 )
 

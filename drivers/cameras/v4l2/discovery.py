@@ -17,7 +17,7 @@ SYSFS: Final = Path("/sys/class/video4linux")
 
 @dataclass(frozen=True)
 class FoundNode:
-    """A capture node; `problem` says why nothing more is known of it."""
+    """A capture node; `problem` is the reason why it cannot be queried."""
 
     path: str
     card: str = ""
@@ -53,7 +53,7 @@ def capture_nodes() -> list[FoundNode]:
 
 
 def path_of(device: str) -> str | None:
-    """The node of a path, or of a bus as v4l2-ctl says; None where there is none now."""
+    """The node of a path, or of a bus as printed by v4l2-ctl; None if there is none."""
     if device.startswith("/"):
         return device if Path(device).exists() else None
     return next((node.path for node in capture_nodes() if node.bus == device), None)

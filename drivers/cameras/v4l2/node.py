@@ -73,7 +73,7 @@ class Control:
 class FilledBuffer:
     """A buffer the kernel has filled.
 
-    `stamp_ns` is CLOCK_MONOTONIC, None where the kernel says that its stamp is of another clock.
+    `stamp_ns` is CLOCK_MONOTONIC, None if the kernel reports another clock.
     """
 
     index: int

@@ -12,7 +12,7 @@ RESTART_THRESHOLD: Final = 1 << 31
 
 @dataclass(frozen=True)
 class SequenceCount:
-    """What a sequence number says: the frame's count from 1, and how many were lost before it."""
+    """The frame's count from 1, and the number of frames lost before it."""
 
     counter: int
     missing: int
@@ -34,7 +34,7 @@ class SequenceCounter:
         self._counter = 0
 
     def advance(self, sequence: int) -> SequenceCount:
-        """The next frame's number. A step back goes on counting by one, since nobody knows more."""
+        """The next frame's number. A step back goes on counting by one, since the true count is unknown."""
         if self._last is None:
             # A stream starts at 0; what is missing before the first frame was lost.
             step = (sequence + 1) % MODULUS

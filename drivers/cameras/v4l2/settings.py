@@ -18,7 +18,7 @@ class V4l2Settings(Configured):
     device = Setting(
         "",
         required=True,
-        help="path of the node, best below /dev/v4l, or its bus as v4l2-ctl says",
+        help="path of the node, best below /dev/v4l, or its bus as printed by v4l2-ctl",
     )
     serial = Setting("", help="serial number the head must have (USB); empty takes any")
     width_px = Setting(0, minimum=0, help="columns; 0 takes what the head is set to")
@@ -50,7 +50,7 @@ class V4l2Settings(Configured):
     controls = Setting(
         tuple[str, ...](), help="further controls to be set, each name=number, in this order"
     )
-    temperature_control = Setting("", help="control that tells the head's temperature")
+    temperature_control = Setting("", help="control that reports the head's temperature")
     temperature_unit_c = Setting(1.0, minimum=1e-6, maximum=1000, help="unit of that control, degC")
     trigger_source = Setting("line", choices=("line", "software"), help="what starts an exposure")
     trigger_control = Setting("", help="button control that is pressed for a software trigger")
@@ -68,7 +68,7 @@ class V4l2Settings(Configured):
         0.0,
         minimum=0,
         maximum=3600,
-        help="a free-running head is opened anew without a frame for so long; 0 for triggered ones",
+        help="time without a frame after which a free-running head is reopened; 0 for triggered ones",
     )
     check_interval_s = Setting(
         2.0, minimum=0.2, maximum=60, help="time between looks at the head's controls and health"
@@ -83,7 +83,7 @@ class V4l2Settings(Configured):
                 "give both or neither"
             )
         found += [
-            f"controls has {text!r}; name=number as in 'trigger_mode=1', the name as v4l2-ctl says"
+            f"controls has {text!r}; name=number as in 'trigger_mode=1', the name as printed by v4l2-ctl"
             for text in values["controls"]
             if not ASSIGNMENT.fullmatch(text)
         ]

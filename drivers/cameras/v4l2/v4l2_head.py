@@ -1,4 +1,4 @@
-"""A V4L2 head: opened, streamed from, lost, and opened again.
+"""A V4L2 head: opening, streaming, loss and reconnection.
 
 What can be set is in `drivers.cameras.v4l2.settings`, how it is set in
 `drivers.cameras.v4l2.camera`.
@@ -30,12 +30,12 @@ QUEUE_ATTEMPTS: Final = 20
 
 
 class V4l2HeadLostError(Exception):
-    """The head is gone or its stream broken; internal."""
+    """The head is lost or its stream failed; internal."""
 
 
 @dataclass
 class _Session:
-    """An opened head, from finding to losing it."""
+    """An opened head, from opening to closing or loss."""
 
     camera: V4l2Camera
     settings: dict[str, float | int | str]
@@ -132,7 +132,7 @@ class V4l2Head(V4l2Settings, HeadDevice):
             ) from None
         self._adjusted = (exposure_time_us, gain_db)
 
-    # Finding
+    # Opening
 
     def _open_device(self) -> None:
         if self._session is not None or self._closing.is_set():
@@ -197,7 +197,7 @@ class V4l2Head(V4l2Settings, HeadDevice):
             self.emitter.emit(
                 "lost",
                 f"The head {self.name} at {self.device} was lost ({reason}). Check its power and "
-                "cable; it is opened again by itself.",
+                "cable; it is reopened automatically.",
                 fault=True,
             )
         self._release_device()
@@ -332,7 +332,7 @@ class V4l2Head(V4l2Settings, HeadDevice):
             else:
                 del session.unqueued_buffers[index]
 
-    # Letting go
+    # Closing
 
     def _release_device(self) -> None:
         with self._slots:

@@ -1,4 +1,4 @@
-"""A gpsd as navigator: the connection to it, and what is wrong where it says nothing.
+"""A gpsd as navigator: the connection, and the diagnosis if it sends nothing.
 
 What its reports mean is in `drivers.receivers.gpsd.reports`; reconnecting and counting in
 `drivers.transport.serial_device`, for which a connection is a line like any other.
@@ -23,7 +23,7 @@ def open_gpsd(path: str, baudrate: int, parity: str) -> TcpPort:
     """Connect to host:port; a connection has neither speed nor parity.
 
     Raises:
-        DeviceError: nobody listens there; the sentence says what to do.
+        DeviceError: the address does not answer; the message contains the remedy.
     """
     try:
         return open_tcp_port(SCHEME + path)
@@ -75,7 +75,7 @@ class GpsdNavigator(SerialDevice):
         return 0, "N"
 
     def identify(self, line: SerialLine) -> Mapping[str, str]:
-        """Listen until a TPV comes, `silence_s` at most; who was heard."""
+        """Listen until a TPV comes, `silence_s` at most; returns the identity."""
         reports = self.reports
         deadline_ns = self.clock.mono_ns() + round(self.silence_s * 1e9)
         before = reports.seen["TPV"]
@@ -106,7 +106,7 @@ class GpsdNavigator(SerialDevice):
             )
         raise DeviceError(
             f"{self.name}: the receiver {', '.join(reports.devices)} of the gpsd at {self.port} "
-            f"said nothing in {self.silence_s:g} s; check its power and its baud rate"
+            f"sent nothing in {self.silence_s:g} s; check its power and its baud rate"
         )
 
     def connected(self) -> None:
@@ -136,7 +136,7 @@ class GpsdNavigator(SerialDevice):
             )
         if reports.error:
             self.emitter.emit_throttled(
-                "refused", f"The gpsd {self.name} at {self.port} says: {reports.error}."
+                "refused", f"The gpsd {self.name} at {self.port} reports: {reports.error}."
             )
             reports.error = ""
         return samples

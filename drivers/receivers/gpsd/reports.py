@@ -1,4 +1,4 @@
-"""What gpsd's reports say: JSON lines to navigation samples.
+"""Conversion of gpsd's reports, JSON lines, to navigation samples.
 
 The connection is in `drivers.receivers.gpsd.navigator`. No line raises, whatever it holds.
 """
@@ -37,7 +37,7 @@ class GpsdReports:
     """Takes a gpsd's lines and gives a NavSample for every TPV that has time and position.
 
     `seen` counts reports by class, `bad_messages` what is no report; `release` and `devices` are
-    what the gpsd says of itself. Where `device` is given only its reports count.
+    what the gpsd reports about itself. If `device` is set, only its reports are used.
 
     Source: gpsd_json(5), protocol 3.14.
     """

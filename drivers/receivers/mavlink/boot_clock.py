@@ -71,7 +71,7 @@ class BootClock:
         self._doubt_ns = 0.0
 
     def add_system_time(self, unix_us: int, boot_ms: int) -> None:
-        """A SYSTEM_TIME came; without UTC (before the first fix) it says nothing."""
+        """Add a SYSTEM_TIME; without UTC (before the first fix) it is ignored."""
         if unix_us < UNIX_FROM_US:
             return
         # Time since start is cut to milliseconds: half of one is added on the average.

@@ -104,7 +104,7 @@ class MavlinkDecoder(MessageDecoder):
 
     @property
     def leap_seconds(self) -> int | None:
-        """Those in force at the autopilot's UTC, by the table: MAVLink does not tell them."""
+        """Those in force at the autopilot's UTC, by the table: MAVLink does not send them."""
         return self.clock.leap_seconds
 
     def reset(self) -> None:
@@ -112,7 +112,7 @@ class MavlinkDecoder(MessageDecoder):
         self._held = None
         self._sequence = None
         self._attitudes.clear()
-        # It may be another one that is there now; until a heartbeat says so, it is the same.
+        # It may be another autopilot; until a heartbeat shows that, it is taken for the same one.
         self.autopilot = None
 
     def on_message(self, message: bytes, mono_ns: int) -> list[Nav]:
@@ -263,7 +263,7 @@ class MavlinkDecoder(MessageDecoder):
             (gps.alt_ellipsoid - gps.alt) * 1e-3 if gps.alt_ellipsoid else self._undulation_m
         )
         if self._boot_ms - received_ms > GPS_MAX_AGE_MS:
-            # How well it is known by now nobody says.
+            # Its present accuracy is unknown.
             return "dead-reckoning", None, (None, None, None), undulation_m
         horizontal_m, vertical_m, speed_mps = (
             value * 1e-3 if value else None for value in (gps.h_acc, gps.v_acc, gps.vel_acc)

@@ -25,10 +25,10 @@ from drivers.transport.serial_device import (
 
 SECOND_NS: Final = 1_000_000_000
 COMPANION: Final = 191
-"""MAV_COMP_ID_ONBOARD_COMPUTER: who we are on the autopilot's bus."""
+"""MAV_COMP_ID_ONBOARD_COMPUTER: component ID of this program on the autopilot's bus."""
 REQUEST_INTERVAL_NS: Final = 5 * SECOND_NS
 ANSWER_TIMEOUT_NS: Final = SECOND_NS
-"""A later answer to TIMESYNC says little, and may be of an autopilot that has restarted."""
+"""A later answer to TIMESYNC is inaccurate, and may be of an autopilot that has restarted."""
 SET_MESSAGE_INTERVAL: Final = 511
 AUTOPILOTS: Final = {3: "ArduPilot", 12: "PX4"}
 
@@ -39,8 +39,8 @@ class MavlinkNavigator(StreamingNavigator):
     """An autopilot that speaks MAVLink 1 or 2.
 
     Yields a NavSample for every GLOBAL_POSITION_INT, an EventMark for every CAMERA_TRIGGER, and a
-    ClockReading for every TIMESYNC that it asked for and was answered. It says by a heartbeat once
-    a second that it is there, as an onboard computer, and asks for the messages it needs that do
+    ClockReading for every answered TIMESYNC request. It announces itself by a heartbeat once
+    a second, as an onboard computer, and requests required messages that do
     not come. It commands nothing else.
 
     Source: MAVLink common message set.
@@ -58,7 +58,7 @@ class MavlinkNavigator(StreamingNavigator):
         help="serial port, tcp://host:port, udpin://host:port (listens) or udpout://host:port",
     )
     system = Setting(
-        0, minimum=0, maximum=255, help="number of the autopilot; 0: the first that is heard"
+        0, minimum=0, maximum=255, help="system ID of the autopilot; 0: the first that is received"
     )
     request = Setting(True, help="ask the autopilot for messages that do not come")
     position_hz = Setting(10.0, minimum=0.1, maximum=400, help="rate of GLOBAL_POSITION_INT")
@@ -114,9 +114,9 @@ class MavlinkNavigator(StreamingNavigator):
     # The port for TIMESYNC
 
     def subscribe_timesync(self, callback: TimesyncListener | None) -> None:
-        """Call `heard` with every TIMESYNC of the autopilot, from the thread that runs the device.
+        """Call `callback` with every TIMESYNC of the autopilot, from the thread that runs the device.
 
-        `heard` returns quickly; None ends it.
+        `callback` must return quickly; None ends the subscription.
         """
         self._timesync_listener = callback
 

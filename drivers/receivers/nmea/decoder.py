@@ -253,7 +253,7 @@ class NmeaDecoder(MessageDecoder):
 
 
 def _kind_of(fields: list[str]) -> str:
-    """A sentence's name without its talker; proprietary ones with what tells them apart."""
+    """A sentence's name without its talker; proprietary ones with their distinguishing field."""
     address = fields[0]
     if address == "PASHR":
         return "PASHR" if fields[1][:1].isdigit() else "PASHR,other"

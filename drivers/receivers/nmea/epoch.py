@@ -1,4 +1,4 @@
-"""What the sentences of one UTC time say together: position, height, fix, sigmas, velocity.
+"""Data of all sentences of one UTC time: position, height, fix, sigmas, velocity.
 
 Taking a sentence apart is in `drivers.receivers.nmea.sentences`, GPS time and samples in
 `drivers.receivers.nmea.decoder`.
@@ -81,7 +81,7 @@ class Epoch:
 
     @property
     def fix(self) -> str:
-        """The worst of what was said of the fix; "none" where nothing was."""
+        """The worst reported fix status; "none" if there is none."""
         for fix_status in ("none", "time", "dead-reckoning"):
             if fix_status in self.fixes:
                 return fix_status
@@ -103,7 +103,7 @@ class Epoch:
         return self.above_geoid_m + undulation_m
 
     def add(self, kind: str, fields: Fields) -> None:
-        """Note what a sentence says.
+        """Add the content of a sentence.
 
         Raises:
             ValueError, IndexError: it makes no sense; the epoch may hold a part of it.
@@ -142,7 +142,7 @@ class Epoch:
         return fix_status not in ("none", "time")
 
     def _mode(self, status: str, mode: str) -> bool:
-        """Status A or V, and the mode indicator where the version has one. See `_say`."""
+        """Status A or V, and the mode indicator where the version has one. See `_add_fix`."""
         return self._add_fix("none" if status != "A" else MODES.get(mode, "fix"))
 
     # Sentences

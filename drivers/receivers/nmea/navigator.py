@@ -16,7 +16,7 @@ from drivers.timescales.gps_time import GPS_EPOCH_DAY
 from drivers.transport.serial_device import Sample, SerialLine
 
 NOT_BEFORE_DAY: Final = datetime.date(2020, 1, 1).toordinal() - GPS_EPOCH_DAY
-"""No flight was earlier: a receiver that says so lost count of the weeks (1024 of them)."""
+"""No flight was earlier: an earlier date means a week number rollover (1024 weeks)."""
 
 UNDATED_MAX: Final = 5
 """So many positions before the first date are normal: it comes once a second."""
@@ -27,7 +27,7 @@ class NmeaNavigator(StreamingNavigator):
 
     Yields a NavSample for every epoch with a fix and an EventMark for every $PTNL,EVT. What a
     receiver does not send is absent, as velocity down is as a rule; a sigma that is not sent is
-    computed from the dilution of precision, and the sample says so.
+    computed from the dilution of precision, and the sample states that.
 
     Source: NMEA 0183 as published in gpsd's "NMEA Revealed"; Trimble's $PTNL,EVT.
     """
@@ -47,7 +47,7 @@ class NmeaNavigator(StreamingNavigator):
         "heights are absent",
     )
     speed_sigma_mps = Setting(
-        0.5, minimum=0.001, maximum=100, help="sigma of velocity, which NMEA does not tell"
+        0.5, minimum=0.001, maximum=100, help="sigma of velocity, which NMEA does not contain"
     )
     mark_accuracy_ns = Setting(
         1000, minimum=1, maximum=1_000_000_000, help="accuracy of an event mark, by the data sheet"

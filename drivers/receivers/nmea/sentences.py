@@ -15,7 +15,7 @@ from typing import Final
 from drivers.timescales.gps_time import GPS_EPOCH_DAY, SECOND_NS
 
 MAX_LENGTH: Final = 256
-"""The standard says 82; receivers of high precision send more."""
+"""The standard limit is 82; receivers of high precision send more."""
 DOP_UNKNOWN_FROM: Final = 50.0
 """Receivers without a fix send 99.99, 50.00 or 0."""
 

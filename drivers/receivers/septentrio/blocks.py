@@ -54,7 +54,7 @@ INS_PART: Final = struct.Struct("<3f")
 class SbfBlock:
     """One block: time stamp on the receiver's clock (None where unknown) and values.
 
-    `values` are those of LAYOUTS, floats None where the receiver says not to use them; `rest` is
+    `values` are those of LAYOUTS, floats None if the receiver marks them "do not use"; `rest` is
     what follows them.
     """
 

@@ -301,11 +301,11 @@ class SbfDecoder(MessageDecoder):
         ]
 
     def _on_event_position(self, rx_ns: int) -> None:
-        """It follows its ExtEvent: one that does not tells of a lost mark, which is counted."""
+        """It follows its ExtEvent; one without an ExtEvent means a lost mark, which is counted."""
         if rx_ns == self._marked_rx_ns:
             return
         self._marked_rx_ns = rx_ns
-        # It says neither its input nor its edge: only where there is one kind is it known.
+        # It contains neither input nor edge: they are known only if there is one kind.
         if len(self._counts) == 1 and not self.counters["marks_other_edge"]:
             self._counts[next(iter(self._counts))] += 1
             self.counters["marks_lost"] += 1

@@ -41,7 +41,7 @@ FIXES: Final = {0: "none", 1: "dead-reckoning", 2: "2d", 3: "3d", 4: "3d", 5: "t
 TIME_BASE_RECEIVER: Final = 0
 TIME_BASE_UTC: Final = 2
 LEAP_SOURCE_DEFAULT: Final = 0
-"""Of NAV-TIMELS: the firmware's own guess. 255, "unknown", is what an M8T says of received ones."""
+"""Of NAV-TIMELS: the firmware's own guess. An M8T reports 255, "unknown", for received ones."""
 ATTITUDE_HISTORY_LENGTH: Final = 64
 ACCURACY_UNKNOWN: Final = 0xFFFFFFFF
 """What hAcc, vAcc and sAcc hold before the receiver can estimate them."""
@@ -195,7 +195,7 @@ class UbxDecoder(MessageDecoder):
             self._gps_ns = gps_ns
             return gps_ns, True
         if self._timegps_ns is not None:
-            # UTC is not resolved yet, but NAV-TIMEGPS has just said week and time of week.
+            # UTC is not resolved yet, but NAV-TIMEGPS has just reported week and time of week.
             gps_ns = gps_near(message.iTOW, self._timegps_ns)
             return gps_ns, abs(gps_ns - self._timegps_ns) < RECENT_NS
         return (both[0] if both else message.iTOW * 1_000_000), False

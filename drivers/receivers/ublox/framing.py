@@ -82,7 +82,7 @@ class UbxFramer:
         return found
 
     def _frame_size(self, buffer: bytes, at: int, *, complete_only: bool) -> int | None:
-        """Size of the frame at a sync; 0 if there is none, None if that cannot be said yet."""
+        """Size of the frame at a sync; 0 if there is none, None if that is not known yet."""
         head = buffer[at : at + 6]
         if len(head) > 2 and head[2] not in CLASSES:
             return 0
