@@ -228,7 +228,7 @@ def _configuration(
 def _fly(
     options: argparse.Namespace, config: Path, bus: Mapping[str, Any], interval_s: float
 ) -> dict[str, Any]:
-    """Run the service to its end, looking at what it stores; what it said."""
+    """Run the service to its end while checking what it stores; returns its output."""
     processor, retention = CpuMeter(), Retention(options.full_check_every)
     flown: dict[str, Any] = {"events": [], "store_s": [], "delay_s": [], "ledger": {}}
     flown |= {"processed": []}
@@ -305,7 +305,7 @@ def _processed(
 
 
 def _of_pipeline(flown: Mapping[str, Any], interval_s: float) -> dict[str, Any]:
-    """Pace and latency of the pipeline beside the capture; empty where it did not run."""
+    """Pace and latency of the pipeline during capture; empty where it did not run."""
     all_of_them = flown["processed"]
     done = [one for one in all_of_them if one["done"]]
     if not done:

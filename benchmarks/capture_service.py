@@ -1,4 +1,4 @@
-"""The onboard service for benchmarks: it tells its processes, and flies with or without a worker.
+"""The onboard service for benchmarks: it reports its processes, and runs with or without a worker.
 
 Without, capture, ledger and Level-0 are as they fly, and there is no pipeline.
 """
@@ -23,7 +23,7 @@ from daemon.onboard.service.startup import ProcessPlan, worker_process
 
 
 class ReportingService(service.Service):
-    """The service as it flies; it tells the numbers of its processes."""
+    """The service as in flight; it also reports the ids of its processes."""
 
     def _start(self, mission: Mission) -> None:
         super()._start(mission)

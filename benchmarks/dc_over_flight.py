@@ -1,7 +1,7 @@
 """`python -m benchmarks.dc_over_flight OUT.svg`: measured and estimated dC over a flight, fig. 1.
 
 Renders emulated mini exposures over real imagery while the camera cools, rests and warms again, and
-one probe sticks; draws dC by the probes beside dC by stitching.
+one probe sticks; plots dC by the probes and dC by stitching.
 
 Source: Ladstädter et al. (2010), fig. 1.
 """

@@ -4,7 +4,7 @@ What is left of missing pixels by the best linear prediction from all other pixe
 follows from the power spectrum of light and noise: the covariance of missing pixels given the rest
 is the inverse of their block of the inverse covariance, which is the spectrum's reciprocal
 transformed (Kolmogorov 1941; Grenander and Rosenblatt, Statistical Analysis of Stationary Time
-Series, 1957). Beside it what the pipeline leaves at defects put into the same frames.
+Series, 1957). Next to it: the error the pipeline leaves at defects put into the same frames.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
 Thousands of outcomes of stitching with one master sensor moved a known way, and of healthy ones for
 false alarms, go through the pipeline's own judgement. What calibration, drift, probes and stitching
 are off by is drawn, the last from the covariance that `benchmarks.uncertainty_consistency` holds;
-some are stitched in full as a control. Beside each figure stands what the best test could reach.
-Then whole flights are judged together, warm ones among them, and at last the probe is wrong
+some are stitched in full as a control. Next to each figure is the bound of the best test.
+Then complete flights are evaluated together, warm ones among them, and at last the probe is wrong
 instead.
 """
 
@@ -80,7 +80,7 @@ class Power:
 
 @dataclass(frozen=True)
 class FlightPower:
-    """Shares of `flights` of which a step was told, and of the right sensor (or as alternative)."""
+    """Shares of `flights` with a reported step, and with the right sensor (or as alternative)."""
 
     flight: str
     length_px: float
@@ -92,7 +92,7 @@ class FlightPower:
 
 @dataclass(frozen=True)
 class ProbeMisreading:
-    """What is said where the master cone's probe reads `off_k` too much and no sensor has moved.
+    """The verdict where the master cone's probe reads `off_k` too much and no sensor has moved.
 
     Shares of `exposures`, or of `flights` from whose middle on it does: a sensor accused alone,
     sensor or probe, the probe named.
@@ -111,7 +111,7 @@ class ProbeMisreading:
 
 @dataclass(frozen=True)
 class Camera:
-    """Where master sensors are against their calibration: `off_um`, and `um_per_k` beside TDM."""
+    """Displacements of master sensors: `off_um`, and `um_per_k` in addition to TDM."""
 
     off_um: dict[str, Array]
     um_per_k: dict[str, Array]
@@ -171,7 +171,7 @@ def main() -> None:
             f"| {p.dc_k:g} | {p.length_px:.2f} | {p.exposures} | {p.found:.1%} | {p.named:.1%} "
             f"| {p.named_uniquely:.1%} | {p.ideal_found:.1%} | {p.ideal_named:.1%} |"
         )
-    print("\n| flight | moved px | flights | told | the right sensor | named alone |")
+    print("\n| flight | moved px | flights | reported | the right sensor | named alone |")
     print("|---|---|---|---|---|---|")
     for f in flights:
         print(
@@ -246,7 +246,7 @@ class Outcomes:
         return replace(mosaic, values=values), temperatures
 
     def evaluate(self, dc_k: float, moved: str | None, shift_px: tuple[float, float]) -> Validity:
-        """One exposure of a camera drawn anew."""
+        """One exposure of a newly drawn camera."""
         mosaic, temperatures = self.stitched(self.camera(), dc_k, moved, shift_px)
         return evaluate_master(self.rig, mosaic, temperatures)
 
@@ -322,7 +322,7 @@ class Outcomes:
         return alarms
 
     def power(self, *, dc_k: float, length_px: float, exposures: int) -> Power:
-        """Move one of the master sensors, in turn, in a direction drawn anew each time."""
+        """Move one of the master sensors, in turn, in a direction drawn each time."""
         tally = _Tally()
         masters = [s.name for s in self.rig.cone(self.rig.master_cone).sensors]
         for k in range(exposures):

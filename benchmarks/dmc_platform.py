@@ -1,8 +1,9 @@
 """`python -m benchmarks.dmc_platform`: are the nine angles of converging heads as good as stated?
 
-Fifty cameras whose mounting, places and drift are off their calibration by what the rig file says.
-Tie points are drawn where the emulator's true camera sees the same ground, with Gaussian noise; the
-turns found are held against the true ones, the common turn taken out (nine of twelve angles).
+Fifty cameras whose mounting, places and drift are off their calibration within the tolerances of
+the rig file. Tie points are drawn where the emulator's true camera sees the same ground, with
+Gaussian noise; the turns found are held against the true ones, the common turn taken out (nine of
+twelve angles).
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Mutations of `processing` that alter no outcome, for `benchmarks.mutation_sample`.
 
-Each is named as that prints it, without its line; the value says why no outcome differs.
+Each is named as that module prints it, without its line; the value is why no outcome differs.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ EQUIVALENT: dict[str, str] = {
     "processing/mosaic/weights.py: "
     "for w, group in zip(normalised, groups, strict=True):: True -> False": _SAME_LENGTHS,
     "processing/geometry/topology.py: _RIGS: Final = 8: 8 -> 9": "size of a cache",
-    "processing/geometry/topology.py: whole = round(exact or 0.0): 0.0 -> 1.0": (
+    "processing/geometry/topology.py: rounded = round(exact or 0.0): 0.0 -> 1.0": (
         "without an exact ratio the result is None whatever is rounded"
     ),
     "processing/mosaic/readout_slips.py: "

@@ -255,7 +255,7 @@ class FastFlight:
         for probe, register in zip(self.rig.probes, reply.registers, strict=True):
             value_c = None if register == 0x7FFF else register / 10
             if value_c not in (None, PROBE_C):
-                self.score.add_example(f"probe {probe} said {value_c}, it is {PROBE_C}")
+                self.score.add_example(f"probe {probe} reported {value_c}, it is {PROBE_C}")
                 self.score.imbalances += 1
             self.flight.temperature(TemperatureSample(probe, value_c, now_ns))
 
@@ -306,7 +306,7 @@ class FastFlight:
     # What the service does
 
     def _fire(self, order: Order) -> None:
-        """Order a pulse and tell the flight what came of it; see `daemon.onboard.capture`."""
+        """Order a pulse and report its outcome to the flight; see `daemon.onboard.capture`."""
         self._ordered_ns[order.number] = order.mono_ns
         try:
             if order.delays_ns != self._programmed:

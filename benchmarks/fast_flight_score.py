@@ -33,7 +33,7 @@ class PulseTruth:
 
 @dataclass
 class Score:
-    """How the records of a flight compare with the truth; counts of pairs unless said otherwise."""
+    """Records of a flight against the truth; counts of pairs unless stated otherwise."""
 
     exposures: int = 0
     sealed: int = 0
@@ -71,10 +71,10 @@ class Score:
 
 @dataclass(frozen=True)
 class Comparison:
-    """The records of a flight beside the truth, and the score to be filled.
+    """The records of a flight, the truth, and the score to be filled.
 
-    `truth` is by exposure; `stored_pixels` says by number of the record and head which exposure's
-    pixels were stored; `open_s` are the seconds each exposure was open.
+    `truth` is by exposure; `stored_pixels` is the exposure whose pixels were
+    stored, by number of the record and head; `open_s` are the seconds each exposure was open.
     """
 
     clockwork: DiscreteEventRig

@@ -1,7 +1,7 @@
 """`python -m benchmarks.hard_scenes`: scenes that are hard to stitch, through the pipeline, judged.
 
 Each is rendered for `ultracam-x-mini` at a dC of 12 K and held against the truth: the image is
-right, or its report says that it is not to be trusted.
+right, or its report states that it is not to be trusted.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """`python -m benchmarks.matching_phases`: matching over all sub-pixel phases, in x and in y.
 
 Band-limited textures are moved exactly, in the frequency domain, exposed with photon noise, read
-noise and converter, and matched as Level-1 words. Told are the mean error of every phase, blunders
-left out, and the predicted sigma against the true one.
+noise and converter, and matched as Level-1 words. Reported are the mean error of every phase,
+blunders left out, and the predicted sigma against the true one.
 """
 
 from __future__ import annotations

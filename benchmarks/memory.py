@@ -1,6 +1,6 @@
 """`python -m benchmarks.memory RIG`: what the pipeline holds in memory, exposure by exposure.
 
-The exposure of `syntopic bench` goes through two lanes, as in the service, again and again; the
+The exposure of `syntopic bench` is processed repeatedly, two at a time as in the service; the
 memory the process owns (PSS) is read after each. Nothing is written.
 """
 
@@ -27,7 +27,7 @@ from processing.quality.report import Flag
 from processing.rig import find_rig, load_rig
 
 WARM_UP_EXPOSURES = 4
-"""Exposures until each lane has touched all of its buffers, twice."""
+"""Exposures until each pipeline has used all of its buffers twice."""
 
 
 def main() -> None:
@@ -46,7 +46,7 @@ def main() -> None:
         "rig": found.name,
         "exposures": options.exposures,
         "parallel": options.parallel,
-        "settled_mib": round(warmed_up, 1),
+        "warmed_up_mib": round(warmed_up, 1),
         "last_mib": round(seen[-1], 1),
         "most_mib": round(max(seen), 1),
         "tenths_mib": [

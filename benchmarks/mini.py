@@ -1,7 +1,7 @@
 """`python -m benchmarks.mini`: the pipeline and the writer on an emulated mini exposure.
 
-Flies three exposures to have real frames, then times the pipeline beside a plain copy of the bytes
-it reads and writes, and the Level-0 writer beside a plain write + fsync of the same bytes.
+Flies three exposures to have real frames, then times the pipeline and a plain copy of the bytes
+it reads and writes, and the Level-0 writer and a plain write + fsync of the same bytes.
 """
 
 from __future__ import annotations

@@ -35,10 +35,10 @@ COPIED = ("daemon", "drivers", "processing", "sim_hw", "tests", "benchmarks", "d
 DECIDING = (
     "daemon/onboard/flight/*.py",
     "daemon/onboard/timing/*.py",
-    "daemon/mission/*.py",
+    "daemon/mission/**/*.py",
     "daemon/planning/*.py",
-    "drivers/*/decoder.py",
-    "drivers/*/framing.py",
+    "drivers/**/decoder.py",
+    "drivers/**/framing.py",
     "drivers/receivers/nmea/sentences.py",
     "drivers/receivers/gpsd/reports.py",
     "drivers/receivers/message_framer.py",
@@ -67,15 +67,15 @@ EQUIVALENT: dict[str, str] = {
     'daemon/mission/catalog/catalog.py: code = getattr(error, "sqlite_errorcode", 0) & 0xFF: 0 -> 1': (
         "neither 0 nor 1 (SQLITE_ERROR) is busy or locked"
     ),
-    "daemon/onboard/flight/ledger.py: self._in_storage[Storage.VOLATILE] += 1: += -> -=": (
+    "daemon/onboard/flight/ledger.py: self._in_storage[StorageState.VOLATILE] += 1: += -> -=": (
         "the number of volatile exposures is never read"
     ),
-    "daemon/onboard/flight/ledger.py: self._in_storage[Storage.VOLATILE] += 1: 1 -> 2": (
+    "daemon/onboard/flight/ledger.py: self._in_storage[StorageState.VOLATILE] += 1: 1 -> 2": (
         "the number of volatile exposures is never read"
     ),
     "daemon/onboard/timing/gps_clock.py: COARSE_SIGMA_NS: Final = round((ARRIVAL_MAX_NS - ARRIVAL_MIN_NS)"
     " / math.sqrt(12)): - -> +": "ARRIVAL_MIN_NS is 0",
-    "daemon/onboard/timing/gps_clock.py: second = math.ceil((max(behind) + ARRIVAL_MIN_NS) / SECOND_NS): "
+    "daemon/onboard/timing/gps_clock.py: second = math.ceil((max(offsets_ns) + ARRIVAL_MIN_NS) / SECOND_NS): "
     "+ -> -": "ARRIVAL_MIN_NS is 0",
     "daemon/onboard/timing/gps_clock.py: (r, min(1.0, limit * s / max(abs(r - middle), 1e-9)) / s**2): "
     "1e-9 -> 1.5000000000000002e-09": (
@@ -209,11 +209,11 @@ def nearest_tests(module: str, importers: dict[str, set[str]]) -> list[str]:
         return (not named, test not in direct, Path(test).parent != folder, test)
 
     of_folder = {str(p.relative_to(ROOT)) for p in (ROOT / folder).glob("test_*.py")}
-    driver = Path(module).parts[1] if module.startswith("drivers/") else None
+    driver = Path(module).parent.name if module.startswith("drivers/") else None
     of_driver = {
         str(p.relative_to(ROOT))
         for p in ROOT.glob("tests/drivers/test_*.py")
-        if driver and driver.removesuffix(".py") in p.stem
+        if driver and driver in p.stem
     }
     candidates = {t for t in direct | of_folder | of_driver if "/system/" not in t}
     return sorted(candidates, key=distance)

@@ -140,7 +140,7 @@ def errors_of(
 
 
 def with_random_rotations(rig_file: Path, out: Path, *, seed: int, sigma_rad: float) -> Path:
-    """A rig file whose cones, but the master's, are turned otherwise: every angle drawn anew."""
+    """A rig file whose cones, except the master's, have newly drawn angles."""
     random = np.random.default_rng([seed, 11])
     text = rig_file.read_text(encoding="utf-8")
     cones = text.split("\n[[cone]]\n")

@@ -74,7 +74,7 @@ def write_block(folder: Path, *, seed: int = 1) -> None:
 
 
 def _named_as_projects_are(network: Network) -> Network:
-    """Attitudes of single images carry the name that tells the writer so."""
+    """Attitudes of single images carry the name by which the writer recognizes them."""
     names = tuple(f"image {name}" for name in network.attitudes.names)
     return replace(network, attitudes=replace(network.attitudes, names=names))
 

@@ -46,7 +46,7 @@ class RingPlan:
 
 
 def build_ring(rig_name: str, frames: Path | None, folder: Path) -> None:
-    """Lay the ring of every sensor beside each other: `SENSOR.raw`, three frames each.
+    """Write the ring of every sensor to one folder: `SENSOR.raw`, three frames each.
 
     Args:
         rig_name: a shipped rig or a rig file.
@@ -83,7 +83,7 @@ def build_ring(rig_name: str, frames: Path | None, folder: Path) -> None:
 
 
 def number_of(frame: NDArray[np.uint16]) -> int | None:
-    """The exposure a frame says it is of, from 1; None where it is no frame of the ring."""
+    """Exposure number in a frame's header, from 1; None where it is no frame of the ring."""
     head = frame.reshape(-1)[:HEADER_PX]
     if not np.array_equal(head[: len(MARK)], MARK):
         return None
@@ -112,7 +112,7 @@ class RingSensor:
 
 
 def serve(plan: RingPlan, pipe: Connection) -> None:
-    """Body of a process of heads: until the pipe closes; says what was counted at the end."""
+    """Body of a process of heads: until the pipe closes; sends its counts at the end."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     terminate_with_parent()
     rig = find_rig(plan.rig)
@@ -151,8 +151,7 @@ def serve(plan: RingPlan, pipe: Connection) -> None:
 def main() -> None:
     """Body of the emulator: `python -m benchmarks.ring_heads`, a JSON object as argument.
 
-    Says where everything answers, ends when its standard input closes, and says then what was
-    counted.
+    Prints all addresses, ends when its standard input closes, and then prints its counts.
     """
     request = json.loads(sys.argv[1])
     rig = find_rig(request["rig"])

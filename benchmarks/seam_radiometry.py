@@ -2,8 +2,8 @@
 
 Even light and real imagery go through the emulated electronics and back through the laboratory's
 calibration and the balance of the heads; then both sides of every seam are compared before they are
-faded into each other, in squares of 32 px along its whole length. Also told is how far interpolated
-defects are from the light that was there.
+faded into each other, in squares of 32 px along its whole length. Also reported is how far
+interpolated defects are from the light that was there.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ MIN_COLUMN_PX = 64
 """Length from which spoilt pixels above each other are a defect column."""
 DUST = 12
 DUST_PX = 3
-"""Grains on every sensor beside its own defects, and the side of one."""
+"""Grains on every sensor in addition to its own defects, and the side of one."""
 GAIN_CHANGE = 0.01
 BLACK_CHANGE_DN = 2.0
 """What heads may have changed by since the laboratory saw them (standard deviations)."""

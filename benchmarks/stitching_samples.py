@@ -1,4 +1,4 @@
-"""Stitched exposures beside the truth, rendered or drawn: what statistics are tested on.
+"""Stitched exposures with their truth, rendered or drawn: samples to test statistics on.
 
 A rendered trial goes from light to image through electronics and pipeline. A drawn one takes the
 tie points from where the emulator's true camera sees the same ground and gives them the errors that

@@ -1,7 +1,7 @@
 """The time chain as physics has it: oscillators, latches, round trips. No code of the estimator.
 
-Everything is drawn anew for every run: how good the host's crystal is, how warm it gets, how long
-interrupts and the ways to the trigger unit take. What a run is told is what hardware would say.
+Everything is drawn for every run: how good the host's crystal is, how warm it gets, how long
+interrupts and the ways to the trigger unit take. A run gets what hardware would report.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class Oscillator:
         self._phase_ns = np.concatenate([[0.0], np.cumsum(rate) * STEP_S * 1e9])
 
     def reads(self, true_s: float) -> float:
-        """What the clock says at a true time, ns since the start."""
+        """Reading of the clock at a true time, ns since the start."""
         at = true_s / STEP_S
         return true_s * 1e9 + float(np.interp(at, np.arange(len(self._phase_ns)), self._phase_ns))
 
@@ -103,7 +103,7 @@ class Host:
 def receiver_stamp(
     rng: np.random.Generator, true_s: float, accuracy_ns: float, resolution_ns: float
 ) -> int:
-    """What a receiver says of an edge: noise, and the grid of its counter."""
+    """A receiver's reading of an edge: noise, and the grid of its counter."""
     noisy_ns = true_s * 1e9 + rng.normal(0.0, accuracy_ns)
     return round(math.floor(noisy_ns / resolution_ns + 0.5) * resolution_ns)
 

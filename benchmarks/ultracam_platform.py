@@ -1,9 +1,10 @@
 """`python -m benchmarks.ultracam_platform`: cones turned against the master's, from whole flights.
 
-Cameras whose mounting, places and drift are off their calibration by what the rig file says, each
-flown there and back. Tie points are drawn where the emulator's true cones see the same ground at
-their own instants, with noise and bias of matching; the turns that `syntopic calibrate platform`
-finds are held against the true ones. `--calibration` compares one from rendered frames instead.
+Cameras whose mounting, places and drift are off their calibration within the tolerances of the rig
+file, each flown there and back. Tie points are drawn where the emulator's true cones see the same
+ground at their own instants, with noise and bias of matching; the turns that `syntopic calibrate
+platform` finds are held against the true ones. `--calibration` compares one from rendered frames
+instead.
 """
 
 from __future__ import annotations

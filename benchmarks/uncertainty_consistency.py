@@ -1,4 +1,4 @@
-"""`python -m benchmarks.uncertainty_consistency`: is the mosaic as accurate as it says, and no more?
+"""`python -m benchmarks.uncertainty_consistency`: compare stated accuracy with true errors.
 
 Stitches exposures rendered by the emulator and exposures whose tie points are drawn with the errors
 measured on the rendered ones, and holds every error against the covariance stated for it. Truth,

@@ -82,6 +82,9 @@ ALLOWED: Final[dict[tuple[str, str], str]] = {
     ("sim_hw/world/ground_types.py", "lanes"): "lanes of a road",
     ("daemon/onboard/flight/decisions.py", "foreseen"): "a key of recorded flight logs",
     ("tests/daemon/onboard/flight/test_decisions.py", "foreseen"): "a key of recorded flight logs",
+    ("daemon/mission/log/flight_log.py", "tell"): "method of a binary stream",
+    ("daemon/mission/mirror/mirrored_log.py", "tell"): "method of a binary stream",
+    ("daemon/postflight/replay/flight_replay.py", "foreseen"): "key of recorded decisions",
 }
 
 _WORD: Final = re.compile(r"[A-Za-z]+")

@@ -79,7 +79,7 @@ def draw(
 class Outcome:
     """What became of a case, ready for JSON.
 
-    `result` is `found`, `right` (nothing is said, and the image is right), `covered` (below the
+    `result` is `found`, `right` (no finding, and the image is right), `covered` (below the
     limit, places are within what is stated), `silent` (wrong beyond what is stated, and good) or
     `misled` (found, but only the innocent are named).
     """

@@ -31,7 +31,7 @@ BLOCKS: Final = 8
 MIN_PIXELS: Final = 12
 CHECK: Final = (5, 5)
 DARK: Final = 0.02
-"""Radiance below which a relative error says nothing."""
+"""Radiance below which a relative error is meaningless."""
 
 
 @dataclass(frozen=True)

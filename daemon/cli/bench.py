@@ -87,7 +87,7 @@ def _print(result: dict[str, Any]) -> None:
     )
     side = result["side_by_side"]
     console.print(
-        f"{side['parallel']} at a time: realtime_factor {result['realtime_factor']:.2f}, "
+        f"{side['parallel_exposures']} at a time: realtime_factor {result['realtime_factor']:.2f}, "
         f"{side['seconds_per_exposure']:.2f} s and {side['cpu_s_per_exposure']:.2f} CPU s an "
         f"exposure, {side['latency']['median_s']:.2f} s from frames to files"
     )

@@ -1,6 +1,6 @@
 """Canonical JSON: the one way a record is written, and a strict reader for records of others.
 
-What the records mean is told by the modules that own them; the hash chain over exposure records
+The modules that own the records define their meaning; the hash chain over exposure records
 is in `daemon.mission.verification.chain`.
 """
 
@@ -50,7 +50,7 @@ def canonical_bytes(content: Mapping[str, Any]) -> bytes:
 
     Raises:
         RecordError: a value that JSON cannot hold exactly (NaN, infinity, an integer beyond 2^53,
-            a lone surrogate, an object); the sentence names its key.
+            an unpaired surrogate, an object); the sentence names its key.
     """
     problems: list[str] = []
     plain = _plain(content, "", problems)

@@ -16,7 +16,7 @@ from drivers.contract import Velocity
 TimeSource = Literal["event-mark", "pps", "interpolated", "host", "none"]
 RecordState = Literal["complete", "degraded", "lost"]
 MissingFrames = tuple[tuple[str, str], ...]
-"""What an exposure lacks and why: (sensor, cause) pairs."""
+"""Missing frames of an exposure: (sensor, cause) pairs."""
 
 EXPOSURE_FORMAT = 1
 TIME_SOURCES: tuple[str, ...] = get_args(TimeSource)
@@ -98,7 +98,7 @@ class NavigationRecord:
 class CaptureRecord:
     """What is known when the pixels become durable: enough to seal the exposure after a crash.
 
-    Written as `capture.json` beside the frames. `trigger_mono_ns` counts on the CLOCK_MONOTONIC
+    Written as `capture.json` next to the frames. `trigger_mono_ns` counts on the CLOCK_MONOTONIC
     of the boot `boot_id`.
     """
 
@@ -123,7 +123,7 @@ class CaptureRecord:
 class Exposure:
     """The sealed record of an exposure, `exposure.json`.
 
-    `mark_gps_ns` is the instant of the rig's strobe, from the source `mark_source` says; `flags`
+    `mark_gps_ns` is the instant of the rig's strobe, from the source `mark_source`; `flags`
     is the bit set of `processing.quality.report.Flag` as far as capture knows it. `time_budget_ns`
     are the standard deviations that make up that of the least certain frame, by what they come
     from. `disks` are the ids of the disks on which its frames were durable when it was stored;
@@ -374,7 +374,7 @@ def _temperature(fields: Fields) -> TemperatureRecord:
 
 
 def _missing(fields: Fields) -> tuple[str, str]:
-    pair = (fields.text("sensor"), fields.text("cause", "not said"))
+    pair = (fields.text("sensor"), fields.text("cause", "not stated"))
     fields.refuse_unknown()
     return pair
 

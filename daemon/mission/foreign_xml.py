@@ -10,7 +10,7 @@ DEPTH_MAX = 100
 
 
 class XmlError(ValueError):
-    """XML that cannot be used; the sentence says what was found."""
+    """XML that cannot be used; the message states what was found."""
 
 
 def parse_xml(data: bytes, *, elements_max: int) -> ElementTree.Element:

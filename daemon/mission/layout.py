@@ -36,7 +36,7 @@ CURRENT_FILE = "current-mission.json"
 MISSION_FORMAT = 2
 """From 2 on a mission is created with its chain file and the hash of its flight plan."""
 DISCARDED = ".discarded"
-"""In L0: what recovery set aside because nobody was ever told that it is stored."""
+"""In L0: what recovery set aside because it was never reported as stored."""
 
 _EXPOSURE_FOLDER = re.compile(r"[0-9]{6,12}")
 
@@ -74,7 +74,7 @@ class Mission:
         if not plain_name(rig_name):
             raise MissionError(f"rig name {rig_name!r}: letters, digits, '_' and '-' make an id")
         if started_utc.tzinfo is None:
-            raise MissionError("the start of a mission is told in UTC; give a time with its zone")
+            raise MissionError("the start of a mission is in UTC; give a time with its zone")
         durable.make_directories(root)
         if (flying := cls.current(root)) is not None:
             raise MissionError(f"mission {flying.id} is not closed; continue or close it first")
@@ -158,7 +158,7 @@ class Mission:
         try:
             return cls.open(root / mission_id)
         except MissionError as error:
-            raise MissionError(f"{marker}: {error}; remove the file to start anew") from error
+            raise MissionError(f"{marker}: {error}; remove the file to start again") from error
 
     @property
     def root(self) -> Path:
@@ -207,7 +207,7 @@ class Mission:
 
     @property
     def is_simulated(self) -> bool:
-        """Whether mission.json says that the hardware is emulated; False where there is none."""
+        """Whether mission.json states that the hardware is emulated; False where there is none."""
         return self.about().get("simulated") is True
 
     @property
@@ -277,7 +277,7 @@ class Mission:
         """A number no folder bears or bore, whole, begun or set aside; the first is 1.
 
         A trigger whose frames never came leaves no folder: `daemon.mission.verification.recovery`
-        knows of it from the log, and its report says the number to go on with.
+        knows of it from the log, and its report contains the number to continue with.
         """
         return 1 + max((number for number in self._used_numbers()), default=0)
 
@@ -347,7 +347,7 @@ def _first_special_file(folder: Path, *, checks_subfolders: bool) -> str | None:
         try:
             entries = list(os.scandir(waiting.pop()))
         except OSError:
-            continue  # being replaced, or not to be read; whoever reads it says so
+            continue  # being replaced, or unreadable; its reader reports that
         for entry in entries:
             if entry.is_dir(follow_symlinks=False):
                 waiting += [entry.path] if checks_subfolders else []

@@ -1,6 +1,6 @@
 """One writer per mission: a lock file that names its holder.
 
-The kernel's lock (flock) decides; it ends with its process, however that dies. What the file says
+The kernel's lock (flock) decides; it ends with its process, however that dies. The file's content
 is only for the sentence that refuses a second writer.
 """
 
@@ -27,7 +27,7 @@ _ATTEMPTS, _BETWEEN_ATTEMPTS_S = 5, 0.01
 
 
 class MissionError(DaemonError):
-    """A mission folder that cannot be created, opened or used; the sentence says what to do."""
+    """A mission folder that cannot be created, opened or used; the message states what to do."""
 
 
 @contextmanager

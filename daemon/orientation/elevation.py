@@ -1,8 +1,8 @@
 """Height models from files: ESRI ASCII grids, and GeoTIFFs where rasterio is installed.
 
-A model is taken in the coordinate and height system of the orientation it is used with; what says
-otherwise is refused, never reprojected by guess. A model comes from others: GDAL sees one open
-plain file, reads it as GeoTIFF only, and looks at nothing next to it.
+A model is taken in the coordinate and height system of the orientation it is used with; a model
+in another system is refused, never reprojected by guess. A model comes from others: GDAL sees one
+open plain file, reads it as GeoTIFF only, and looks at nothing next to it.
 """
 
 from __future__ import annotations
@@ -160,7 +160,9 @@ def _check_raster(path: Path, raster: Any) -> None:
         )
     block = math.prod(raster.block_shapes[0])
     if block > max(raster.height * raster.width, 1 << 20):
-        raise ElevationError(f"{path}: one of its blocks says {block} cells; that is more than all")
+        raise ElevationError(
+            f"{path}: one of its blocks states {block} cells; that is more than all"
+        )
 
 
 def _check_cells(path: Path, rows: int, columns: int) -> None:

@@ -93,14 +93,14 @@ class MissingOrientation:
 
 
 class NavigationSource(Protocol):
-    """Tells navigation at an instant: a trajectory, or one record's."""
+    """Source of navigation at an instant: a trajectory, or one record's."""
 
     def at(self, gps_ns: int) -> NavigationRecord | None:
         """None where nothing is known about that instant."""
 
 
 class PositionTransform(Protocol):
-    """Tells where a place is in the coordinate system wanted."""
+    """Transform of a place to the requested coordinate system."""
 
     def place(self, latitude_deg: float, longitude_deg: float, height_m: float) -> ProjectedPoint:
         """See `daemon.orientation.georeference.Georeference.place`."""

@@ -25,7 +25,7 @@ STEP_DEG = 1e-3
 
 
 class GeoreferenceError(DaemonError):
-    """A coordinate system that cannot be served; the sentence says what is missing."""
+    """A coordinate system that cannot be served; the message states what is missing."""
 
 
 @dataclass(frozen=True)
@@ -157,7 +157,7 @@ def _missing_grids(name: str, unavailable: Sequence[object]) -> str:
             files = ", ".join(grid.short_name for grid in grids)
             commands = "; ".join(f"pyproj sync --file {grid.short_name}" for grid in grids)
             return (
-                f"{name}: PROJ lacks {files}, without which heights or positions would be wrong "
+                f"{name}: PROJ has no {files}, without which heights or positions would be wrong "
                 f"by metres. Fetch it where there is a network ({commands}), or leave the height "
                 "system out for ellipsoidal heights"
             )

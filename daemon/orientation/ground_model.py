@@ -21,7 +21,7 @@ from processing.rig import Rig
 SAMPLES: Final = 9
 """Of a footprint, along and across."""
 MIN_KNOWN_SHARE: Final = 0.5
-"""Where the model tells of less than this share of the footprint, it is not asked."""
+"""Where the model covers less than this share of the footprint, it is not used."""
 
 
 class GroundModel:

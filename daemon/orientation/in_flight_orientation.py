@@ -1,4 +1,4 @@
-"""Where every head stood and looked, as the exposure's own record tells: known at once, in flight.
+"""Position and attitude of every head, from the exposure's own record: known in flight.
 
 In local east, north, up of each projection centre, so that no coordinate system is needed; with a
 whole trajectory and in a customer's system it is the work of

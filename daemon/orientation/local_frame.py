@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 FRAME_FILE = "frame.json"
-"""Beside a project in such a frame: its `latitude_deg` and `longitude_deg`."""
+"""Next to a project in such a frame: its `latitude_deg` and `longitude_deg`."""
 
 
 class LocalFrame:

@@ -30,7 +30,7 @@ EARLY_TOLERANCE_NS = 100_000_000
 CONTRADICTION_M = 1.0
 CONTRADICTION_MPS2 = 2.0
 CONTRADICTION_SIGMAS = 5
-"""How far two positions may disagree with the way between them, beside their sigmas."""
+"""How far two positions may disagree with the way between them, in addition to their sigmas."""
 CLIMB_RATE_MAX_MPS = 60.0
 """Faster than any aircraft that takes images climbs or sinks."""
 CLIMB_SIGMA_MPS = 3.0
@@ -104,9 +104,10 @@ class Track:
     def at(self, gps_ns: int, mono_ns: int | None = None) -> NavigationRecord | None:
         """Navigation at an instant; None where no sample is within two seconds.
 
-        `mono_ns` is about when that was on the host's clock: it tells which of two times is meant
+        `mono_ns` is about when that was on the host's clock: it distinguishes two times
         where the receiver's has stepped. Samples whose way here would have taken longer than any
-        does, or less than nothing, are of another time. Close to a step there is no telling.
+        does, or less than nothing, are of another time. Close to a step they cannot be
+        distinguished.
         """
         samples = self._samples
         if self._before_step and samples and mono_ns is not None:

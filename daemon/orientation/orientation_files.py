@@ -1,7 +1,7 @@
 """Exterior orientations in the forms that other programs read: CSV, PAT-B, BINGO's angles.
 
-Every set of files comes with one that tells coordinate system, heights, angles and trajectory;
-formats that know no comments have it beside them (`about.txt`).
+One file of every set states coordinate system, heights, angles and trajectory;
+for formats without comments it is a separate file (`about.txt`).
 """
 
 from __future__ import annotations
@@ -167,7 +167,7 @@ def image_extent_mm(rig: Rig, cone: Cone, *, is_virtual: bool) -> tuple[float, f
 def certificate(rig: Rig) -> Mapping[str, object]:
     """The virtual camera as it goes into other programs: a frame camera without distortion.
 
-    Axes and signs are said in words, because every program has its own.
+    Axes and signs are stated in words, because every program has its own.
     """
     virtual = rig.virtual_image
     if virtual is None:

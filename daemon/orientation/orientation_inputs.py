@@ -28,7 +28,7 @@ from processing.rig import Rig, load_rig
 
 
 class OrientationError(DaemonError):
-    """Nothing can be oriented; the sentence says why."""
+    """Nothing can be oriented; the message states why."""
 
 
 @dataclass(frozen=True)

@@ -46,7 +46,7 @@ class TrajectoryError(DaemonError):
 class Trajectory:
     """Samples in the order of time, made when they are asked for: an SBET holds a million.
 
-    `name` tells versions apart: "in-flight", or the file's name and the beginning of its hash.
+    `name` distinguishes versions: "in-flight", or the file's name and the beginning of its hash.
     `instants_ns` is strictly increasing, GPS time, (n,) int64; `sample` gives the i-th.
     """
 
@@ -95,7 +95,7 @@ def flown_trajectory(mission: Mission, receiver: str | None = None) -> Trajector
     if receiver is None or receiver not in found:
         recorded = ", ".join(found) or "none at all"
         raise TrajectoryError(
-            f"{mission.log_dir}: no navigation of {receiver or 'any receiver'}; heard were: {recorded}"
+            f"{mission.log_dir}: no navigation of {receiver or 'any receiver'}; received: {recorded}"
         )
     return _of_samples("in-flight", found[receiver])
 
@@ -104,7 +104,7 @@ def read_trajectory(path: Path, *, around_gps_ns: int) -> Trajectory:
     """A post-processed trajectory: SBET, or CSV with a line of headings (docs/formats.md).
 
     Args:
-        around_gps_ns: any instant of the flight, which tells the week that an SBET leaves out.
+        around_gps_ns: any instant of the flight; it gives the week, which an SBET leaves out.
 
     Raises:
         TrajectoryError: what is not understood, with the place in the file.
@@ -174,7 +174,7 @@ def _csv(path: Path, data: bytes) -> Iterator[NavSample]:
     missing = [name for name in CSV_COLUMNS if name not in headings]
     if missing or not has_instant:
         wanted = missing + ([] if has_instant else ["gps_ns (or gps_week, seconds_of_week)"])
-        raise TrajectoryError(f"{path}: the line of headings lacks {', '.join(wanted)}")
+        raise TrajectoryError(f"{path}: the line of headings has no {', '.join(wanted)}")
     rows = []
     for row in _rows_of(path, lines):
         try:

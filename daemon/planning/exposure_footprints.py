@@ -97,7 +97,7 @@ def _exclusion_reasons(
         yield "lost"
     if quality.get("verdict") == "refly":
         grave = [f["flag"] for f in quality.get("findings", []) if f.get("verdict") == "refly"]
-        # Coverage is counted here; an image beside a gap is as good as any other.
+        # Coverage is counted here; an image next to a gap counts as any other.
         why = dict.fromkeys(flag for flag in grave if flag != "OVERLAP")
         if why or not grave:
             yield f"refly ({', '.join(why) or 'quality'})"

@@ -1,7 +1,7 @@
 """How many images see each point of a planned line's strip, band by band, by valid pixels.
 
 A point of the ground is followed back into each image by the homography of its footprint, over
-relief along the ray to the projection centre; there the image's valid area says whether it is seen.
+relief along the ray to the projection centre. There it is seen if it is in the image's valid area.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ class ExposureFootprint:
     """An exposure as the advisor sees it.
 
     `corners` is its footprint on level ground: left and right behind, right and left ahead; empty
-    where position or attitude are not known. `exclusion_reason` says why it does not count, such as
+    where position or attitude are not known. `exclusion_reason` is why it does not count, such as
     "refly" or "tilted"; empty where it does. `area` is its valid area, None where all of it is
-    valid; `partly` says what the gaps come from. `eye` is the projection centre and its height
+    valid; `partly` names the causes of the gaps. `eye` is the projection centre and its height
     above the level ground, metres; without it relief is left out.
     """
 

@@ -25,7 +25,7 @@ class PlannedLine:
     """A line to be flown from `start` to `end`; `strip` groups lines that continue each other.
 
     Exposures are due every `distance_m` from the start on, or at the places `at_m` (metres from
-    the start, rising) where the plan names them; where it says neither, by the overlap.
+    the start, rising) where the plan names them; where it has neither, by the overlap.
     """
 
     id: str

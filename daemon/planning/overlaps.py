@@ -30,11 +30,11 @@ BEFORE = 3
 """So many numbers back the image before on the line is looked for."""
 
 NEIGHBOUR_WIDTHS = (0.1, 1.3)
-"""How far beside this image, in its widths, one of a neighbouring line lies."""
+"""Across-track distance of an image of a neighbouring line, in widths of this image."""
 
 PARALLEL_RAD = math.radians(30.0)
 MIN_ROW_SHARE = 0.5
-"""A neighbour that has not been flown beside half of this image is not judged."""
+"""A neighbouring line flown next to less than half of this image is not evaluated."""
 
 Array = NDArray[np.float64]
 
@@ -131,7 +131,7 @@ class Overlaps:
     def _share_seen_by_line(
         self, this: _FlownFootprint, images: Sequence[_FlownFootprint]
     ) -> float | None:
-        """The share of this image that a line saw, over the rows it has been flown beside."""
+        """Share of this image that a line saw, over the rows the line has been flown next to."""
         samples = _samples(this.corners)
         reaches = np.concatenate([image.corners @ this.ahead for image in images])
         rows = samples.mean(axis=1) @ this.ahead

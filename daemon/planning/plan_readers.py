@@ -1,7 +1,7 @@
 """Plans of others: GeoJSON, KML, QGroundControl's .plan. Hostile input: limited in every way.
 
 GeoJSON is ours as well: every LineString is a line, its `id` and `strip` are properties, and a
-member `specification` of the collection says what the project asks for (docs/plan.md).
+member `specification` of the collection contains the requirements (docs/plan.md).
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def read_plan(path: Path) -> Plan:
 
 
 def plan_from_bytes(path: Path, data: bytes) -> Plan:
-    """The plan in the bytes of a file; `path` says its kind and names it in the error sentences.
+    """The plan in the bytes of a file; `path` determines its kind and names it in error messages.
 
     Raises:
         PlanError: not of its kind, or without a line.

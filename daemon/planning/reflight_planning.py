@@ -44,7 +44,7 @@ class Hole:
     """Ground that too few images see, in at least one band.
 
     `rings` are its corners, piece by piece. `images` is the least number of images that see a point
-    of it, `needed` how many must see that point. `bands` are those that lack images there; empty
+    of it, `needed` how many must see that point. `bands` are those with too few images there; empty
     where all do.
     """
 
@@ -277,7 +277,7 @@ def _margin_m(image_m: float) -> float:
 
 @dataclass(frozen=True)
 class _LineCoverage:
-    """What is known of a line: `lack` by band and `short` are images that points (n, m) lack."""
+    """Coverage of a line; `band_deficit` and `deficit` are missing images at points (n, m)."""
 
     line: PlannedLine
     strip: LineStrip
@@ -329,7 +329,7 @@ class _LineCoverage:
     def _stations(self, rows: slice) -> tuple[float, float]:
         """From the first to the last station needed, metres; at least one base apart.
 
-        A point that lacks k images gets them from the k stations nearest to it.
+        A point with k missing images gets them from the k stations nearest to it.
         """
         base_m, length_m = self.block.base_m, self.strip.length_m
         at = self.strip.along[rows] / base_m

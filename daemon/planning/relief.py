@@ -61,7 +61,7 @@ def relief_of(plan: PlanSection) -> TerrainRelief | None:
 
 
 def relief_or_reason(plan: PlanSection) -> tuple[TerrainRelief | None, str]:
-    """The relief, or None and the sentence that says why the ground is taken as level.
+    """The relief, or None and the message why the ground is taken as level.
 
     Without a configured height model the sentence is empty.
     """

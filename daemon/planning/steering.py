@@ -50,7 +50,7 @@ class PlanTrigger:
     Args:
         plan: what is to be flown.
         distance_m: between two exposures, for lines that do not say so themselves.
-        corridor_m: how far beside a line it is still flown.
+        corridor_m: how far from a line, across track, it is still flown.
         min_interval_ns: the camera's own; never faster than that.
     """
 
@@ -192,5 +192,5 @@ def places_m(
 
 
 def _distance_key(one: LinePosition) -> tuple[float, float]:
-    """Lines that are being flown before those that are ahead, then the nearest beside."""
+    """Lines being flown before those ahead, then the nearest across track."""
     return max(0.0, -one.along_m, one.along_m - one.length_m), abs(one.across_m)

@@ -29,7 +29,7 @@ from processing.mosaic.stitch_record import StitchRecord, StitchRecordError, sti
 from processing.rig import load_rig
 
 DISPLACEMENTS_FILE = "export/displacements.json"
-"""Where a mission holds what its flight says of displaced sensors."""
+"""File of a mission with its flight's verdict on displaced sensors."""
 
 
 def write_displacements(mission: Path) -> Mapping[str, Any]:
@@ -54,7 +54,7 @@ def flight_displacements(mission: Path) -> dict[str, Any]:
 
 
 def without_steps(exposures: Mapping[str, int]) -> str:
-    """What a flight without steps says, by how many exposures of each cone were judged."""
+    """Message for a flight without steps, by evaluated exposures of each cone."""
     if not exposures:
         return "Not judged: it takes three sensors in the master cone, or two in another PAN cone."
     minimum = 2 * FlightSettings().min_exposures

@@ -1,4 +1,4 @@
-"""The report of a mission: one HTML file that needs nothing beside it.
+"""The report of a mission: one self-contained HTML file.
 
 It draws what the records and quality reports say; nothing is computed here that they do not hold.
 """
@@ -53,7 +53,7 @@ def write_report(
 
     Args:
         mission: the mission folder.
-        ledger: the balance sheet, where the service just told it.
+        ledger: the balance sheet, where the service just emitted it.
         geometry: comparison with an emulator's truth, where there is one.
         out: another folder; nothing is written into the mission then.
     """
@@ -105,7 +105,7 @@ def _coverage(mission: Path) -> dict[str, Any] | None:
 
 
 def _exposure(mission: Mission, number: int) -> tuple[dict[str, Any], list[ExposureFailure]]:
-    """What the page says of an exposure, and what of it cannot be read."""
+    """Content of the page for an exposure, and what of it cannot be read."""
     level2 = mission.level2(number)
     failures: list[ExposureFailure] = []
 

@@ -51,7 +51,7 @@ Progress = Callable[[str, int, int], None]
 
 
 class Level3Error(DaemonError):
-    """Level-2 that cannot be developed; the sentence says which exposure and what to do."""
+    """Level-2 that cannot be pansharpened; the message states which exposure and what to do."""
 
 
 @dataclass(frozen=True)

@@ -54,8 +54,8 @@ class AnyPipeline(Protocol):
 class Processor:
     """Frames of one exposure in, the files of its Level-2 folder out; one exposure at a time.
 
-    `made` gets the pipeline, the exposure, frames, conditions and whom to tell that the frames are
-    read. Pixels in what comes back may be buffers that hold until the next exposure.
+    `made` gets the pipeline, the exposure, frames, conditions and a callback for when the frames
+    are read. Pixels in what comes back may be buffers that hold until the next exposure.
     """
 
     pipeline: AnyPipeline

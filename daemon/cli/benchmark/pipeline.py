@@ -214,7 +214,7 @@ def _side_by_side(
     return {
         "realtime_factor": processor.rig.frame_interval_s / seconds,
         "side_by_side": {
-            "parallel": work.count,
+            "parallel_exposures": work.count,
             "exposures": count,
             "seconds_per_exposure": seconds,
             "cpu_s_per_exposure": (used[last] - used[first]) / count,

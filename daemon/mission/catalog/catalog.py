@@ -32,7 +32,7 @@ BUSY_RETRY_S = 0.01
 
 
 class CatalogError(DaemonError):
-    """An index that cannot be used; the sentence says what to do."""
+    """An index that cannot be used; the message states what to do."""
 
 
 class CatalogBusyError(DaemonError):
@@ -54,7 +54,7 @@ class Row:
 
 @dataclass(frozen=True)
 class IndexedExposure:
-    """What the index says of an exposure's files: hash of its record, and of its frames by sensor.
+    """Index entry of an exposure's files: hash of its record, and of its frames by sensor.
 
     `record_sha256` is empty until the exposure is sealed.
     """

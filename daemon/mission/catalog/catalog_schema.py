@@ -83,7 +83,7 @@ def migrate(connection: sqlite3.Connection) -> None:
     """Bring an older schema to this version: all of it or, where it is interrupted, nothing.
 
     Raises:
-        sqlite3.Error: what is there is not what its version says; nothing was changed.
+        sqlite3.Error: the schema does not match its version; nothing was changed.
     """
     connection.execute("BEGIN IMMEDIATE")
     try:
@@ -99,7 +99,7 @@ def migrate(connection: sqlite3.Connection) -> None:
 
 
 def has_only_tables(connection: sqlite3.Connection) -> bool:
-    """Whether there are tables and indexes only: a view or a trigger of a stranger runs code."""
+    """Whether there are tables and indexes only: a foreign view or trigger would run code."""
     kinds = connection.execute("SELECT DISTINCT type FROM sqlite_schema").fetchall()
     return {kind for (kind,) in kinds} <= {"table", "index"}
 

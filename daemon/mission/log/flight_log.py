@@ -209,9 +209,9 @@ class FlightLog:
 class LogReader:
     """Iterates over the messages of a log, up to its torn end.
 
-    After the iteration `cut_nbytes` says how many bytes at the end could not be read,
+    After the iteration `cut_nbytes` is how many bytes at the end could not be read,
     `is_complete` whether the log was closed in good order, and `bad_checkpoints` how many
-    checkpoints disagree with what is before them. `about` is what the log says of itself, known
+    checkpoints disagree with what is before them. `about` is the log's description of itself, known
     as soon as the first message comes.
     """
 
@@ -353,7 +353,7 @@ def _read_body(file: Any, header: bytes, remaining: int) -> bytes | None:
 
 
 def _unpacked(chunk: Chunk) -> Chunk:
-    """A chunk whose records lie open; ValueError where they are more than it says, or too many."""
+    """A chunk with unpacked records; ValueError where they exceed its stated size or the limit."""
     if not chunk.compression:
         return chunk
     limit = min(chunk.uncompressed_size, RECORD_MAX_NBYTES) + 1
@@ -365,7 +365,7 @@ def _unpacked(chunk: Chunk) -> Chunk:
     else:
         raise ValueError(f"compression {chunk.compression!r}")
     if len(data) != chunk.uncompressed_size:
-        raise ValueError("a chunk is not of the size it says")
+        raise ValueError("a chunk is not of its stated size")
     return replace(chunk, compression="", data=data)
 
 

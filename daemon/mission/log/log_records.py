@@ -188,7 +188,7 @@ _KINDS: Final[Mapping[str, type[Any]]] = {
     "clock": ClockReading,
     "event": DeviceEvent,
 }
-"""By the first word of their topic; the second is what the first field says."""
+"""By the first word of their topic; the second word is the value of the first field."""
 
 _TOPICS: Final = {kind: topic for topic, kind in _KINDS.items()}
 _INSTANTS: Final = frozenset(
@@ -219,7 +219,7 @@ def _reader(kind: type[Any]) -> Callable[[Fields], LoggedRecord]:
         name: next(_TYPE_READERS[key] for key in (name, (name, hint), hint) if key in _TYPE_READERS)
         for name, hint in get_type_hints(kind).items()
     }
-    # A log of an earlier version lacks the fields that came later: those have defaults.
+    # A log of an earlier version has no later fields: those have defaults.
     optional = {one.name for one in fields(kind) if one.default is not MISSING}
     return lambda given: kind(
         **{

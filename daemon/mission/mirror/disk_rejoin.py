@@ -1,7 +1,7 @@
 """A disk that is not in use: looked for, and brought up to date in the background.
 
-It gives way to whatever is being stored. When it has everything, it says at which change that was;
-`daemon.mission.mirror.mirrored` lets it join.
+It gives way to whatever is being stored. When it has everything, it reports at which change that
+was; `daemon.mission.mirror.mirrored` lets it join.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class RejoinSettings:
     """When a disk that is not in use may return.
 
     It is looked for every `poll_s`, after each failure half as often, down to every `retry_max_s`;
-    it needs `required_nbytes` free, besides what it lacks.
+    it needs `required_nbytes` free, in addition to the missing files.
     """
 
     poll_s: float = 5.0
@@ -44,7 +44,7 @@ class RejoiningDisk:
     """Brings a disk up to date, in a thread of its own.
 
     `ready_at` is the change up to which the disk has everything, None while it has not; `problem`
-    says why not, empty where nothing is in the way; `waiting` counts exposures to be copied.
+    is the reason, empty where nothing blocks it; `waiting` counts exposures to be copied.
 
     Args:
         disk: which one; an empty id for one that was not there when the mission was opened.
@@ -54,7 +54,7 @@ class RejoiningDisk:
         is_busy: whether an exposure is being stored, so that copying waits.
         is_free: whether nothing of ours hangs on the disk any more.
         open_log: name of the log being written.
-        first_missing: the first exposure that a disk of this history may lack.
+        first_missing: the first exposure that that may be missing on a disk of this history.
         settings: when it may return.
         delay_s: how long to wait before the first look.
     """

@@ -25,7 +25,7 @@ class Generation:
 
     `token` is random: two disks that went apart may count alike, but never have the same token.
     `disks` are ids (`daemon.mission.store.disk_identity`), `first` is the number of the first
-    exposure that a disk dropped at the beginning of this generation may lack.
+    exposure that that may be missing on a disk dropped at the beginning of this generation.
     """
 
     number: int
@@ -53,7 +53,7 @@ def is_up_to_date_with(history: Generations, other: Generations) -> bool:
 
 
 def first_difference(outdated: Generations, leading: Generations) -> int:
-    """Number of the first exposure that a copy may lack of one that leads."""
+    """Number of the first exposure of the leading copy that may be missing in the other."""
     since = leading[len(outdated) :]
     return min((generation.first for generation in since), default=1)
 

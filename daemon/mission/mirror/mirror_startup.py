@@ -161,7 +161,7 @@ def _named(disk: Disk) -> Disk:
 
 
 def _leading(copies: Mapping[str, Mission]) -> tuple[str, str]:
-    """The label of the copy that leads, and what is to be said where neither does."""
+    """The label of the copy that leads, and the message where neither does."""
     labels = list(copies)
     first = labels[0]
     for label in labels[1:]:

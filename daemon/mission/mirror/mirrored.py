@@ -1,6 +1,6 @@
 """A mission on two disks: what is called stored or sealed is durable on every disk in use.
 
-Each disk works in a lane of its own. One that refuses, or makes no progress while another does, is
+Each disk has a thread of its own. One that refuses, or makes no progress while another does, is
 dropped; that is durable on the others before anything more is acknowledged. A disk that returns is
 brought up to date by `daemon.mission.mirror.disk_rejoin` and joins between two orders.
 """
@@ -273,7 +273,7 @@ class MirroredStorage:
         """Do the same on every disk in use; a disk that refuses where another does not is dropped.
 
         Raises:
-            OSError, StoreError: what the leading disk said, where none did it.
+            OSError, StoreError: the error of the leading disk, where all failed.
         """
         futures = {copy: copy.executor.submit(partial(work, copy)) for copy in self._copies}
         self._wait(futures)

@@ -29,11 +29,11 @@ _NOT_COPIED = frozenset({"L0", "L2", "export", "log", CHAIN_FILE, STATE_FILE})
 
 
 class MirrorError(DaemonError):
-    """Two copies that cannot be brought together; the sentence says why and what to do."""
+    """Two copies that cannot be brought together; the message states why and what to do."""
 
 
 class Resync:
-    """Copies what one copy of a mission lacks. `run` may be called again and again.
+    """Copies what is missing in one copy of a mission. `run` may be called again and again.
 
     Args:
         source: the copy that leads.

@@ -42,7 +42,7 @@ def create_file(path: Path, parts: Sequence[bytes | memoryview], *, mode: int = 
     if descriptor is None:
         return durable.create_file(path, parts, mode=mode)
     try:
-        os.posix_fallocate(descriptor, 0, total)  # a full disk says so before the first byte
+        os.posix_fallocate(descriptor, 0, total)  # a full disk fails before the first byte
         written = _write_all(descriptor, parts)
         os.fsync(descriptor)
     except OSError as error:
@@ -52,7 +52,7 @@ def create_file(path: Path, parts: Sequence[bytes | memoryview], *, mode: int = 
         return written
     finally:
         os.close(descriptor)
-    # Blocks larger than ours, or a file system that only says now that it cannot.
+    # Blocks larger than ours, or a file system that only fails now.
     path.unlink()
     return durable.create_file(path, parts, mode=mode)
 

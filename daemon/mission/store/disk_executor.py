@@ -134,7 +134,7 @@ class DiskExecutor:
 
 
 def _outcome(work: Callable[[], object], future: Future[object]) -> Callable[[], None]:
-    """Do the work; what tells the future of it."""
+    """Do the work; returns the call that sets the future's result."""
     try:
         result = work()
     except Exception as error:  # noqa: BLE001 - it belongs to whoever waits for the result

@@ -1,6 +1,6 @@
 """Which disk lies under a folder: an id in a file at its root, and whether it takes bytes.
 
-An empty mount point looks like an empty disk; the id tells them apart.
+An empty mount point looks like an empty disk; the id distinguishes them.
 """
 
 from __future__ import annotations

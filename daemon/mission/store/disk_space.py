@@ -1,6 +1,6 @@
 """How many exposures the disk still holds, for how long that is, and when it is too few.
 
-It only looks; the line stops by it (`daemon.onboard.service.flight_line`), and the service tells of
+It only measures. The line stops by it (`daemon.onboard.service.flight_line`); the service reports
 it.
 """
 
@@ -80,7 +80,7 @@ class DiskSpaceMonitor:
         return DiskCapacity(exposures, seconds, exposures < self._limits.disk_warn_exposures)
 
     def warning(self) -> str | None:
-        """What to tell the crew when the room has just become low; None at any other time."""
+        """Message to the crew when free space has just become low; None at any other time."""
         capacity = self.check()
         is_first_warning = capacity.is_low and not self._was_low
         self._was_low = capacity.is_low

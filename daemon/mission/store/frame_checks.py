@@ -17,7 +17,7 @@ from processing.rig import Sensor
 EXPOSURE_TIME_MAX_US = 600e6
 TDI_SETTING = "TdiShifts"
 UNSPECIFIC_FORMAT = "Mono16"
-"""What a record says that does not name a pixel format: 16-bit words, whatever is in them."""
+"""Format of a record that names no pixel format: 16-bit words of any content."""
 
 _FORMAT = re.compile(r"(?P<kind>[A-Za-z]+?)(?P<bits>8|1[0-6])(p|P|Packed)?")
 _BAYER = {"BayerRG": "RGGB", "BayerBG": "BGGR", "BayerGR": "GRBG", "BayerGB": "GBRG"}
@@ -31,7 +31,7 @@ def mismatches(
 
     Args:
         number: of the exposure.
-        record: what the exposure's record says of the frame.
+        record: the exposure's record of the frame.
         sensor: of the rig it is processed with.
         frame: as its file holds it.
     """
@@ -97,7 +97,7 @@ def _format_mismatches(pixel_format: str, sensor: Sensor) -> Iterator[str]:
 
 
 def _description_mismatches(number: int, record: FrameRecord, frame: DecodedFrame) -> Iterator[str]:
-    """What the file itself says, against the record; only what both say."""
+    """Compare the file's own description with the record, where both have a value."""
     recorded = {
         "exposure": number,
         "sensor": record.sensor,
@@ -113,4 +113,4 @@ def _description_mismatches(number: int, record: FrameRecord, frame: DecodedFram
     for key, wanted in recorded.items():
         found = stored_values.get(key)
         if found not in (None, "") and wanted is not None and found != wanted:
-            yield f"its file says {key} {found!r}; the record says {wanted!r}"
+            yield f"its file has {key} {found!r}; the record has {wanted!r}"

@@ -37,7 +37,7 @@ Run = Callable[[Sequence[str]], str]
 
 
 class HealthError(DaemonError):
-    """The health of the disks cannot be read; the sentence says what to do."""
+    """The health of the disks cannot be read; the message states what to do."""
 
 
 @dataclass(frozen=True)

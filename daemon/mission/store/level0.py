@@ -116,7 +116,7 @@ def read_tiff(
 
     Raises:
         RasterError: not a TIFF, damaged, not one plane of uint16, not of the size given, or one
-            that would unpack to more than it says.
+            that would unpack to more than its stated size.
     """
     with _first_page(path) as page:
         shape = page.shape if plane is None else page.shape[1:]
@@ -212,10 +212,12 @@ def refuse_decompression_bomb(page: Any, path: Path) -> None:
     ratio = 1 if page.compression == 1 else DEFLATE_MAX_RATIO
     max_ratio = min(TIFF_MAX_BYTES, ratio * file_nbytes)
     if page.nbytes > max_ratio:
-        raise RasterError(f"{path.name}: says {page.nbytes} bytes of pixels; it holds {max_ratio}")
+        raise RasterError(
+            f"{path.name}: states {page.nbytes} bytes of pixels; it holds {max_ratio}"
+        )
     part_nbytes = math.prod(page.chunks) * page.dtype.itemsize
     if part_nbytes > page.nbytes + PART_ALLOWANCE_BYTES:
-        raise RasterError(f"{path.name}: one of its parts says {part_nbytes} bytes; that is more")
+        raise RasterError(f"{path.name}: one of its parts states {part_nbytes} bytes; that is more")
     places = list(zip(page.dataoffsets, page.databytecounts, strict=True))
     is_listed = math.prod(page.chunked) == len(places)
     if not is_listed or any(offset + count > file_nbytes for offset, count in places):
@@ -235,7 +237,7 @@ def refuse_decompression_bomb(page: Any, path: Path) -> None:
 
 
 def read_description(path: Path) -> dict[str, Any]:
-    """What our own TIFF says of itself in ImageDescription; empty for a file of others."""
+    """ImageDescription of our own TIFF; empty for a foreign file."""
     from tifffile import TiffFile
 
     try:

@@ -156,7 +156,7 @@ def load_level0(
 
 
 def hash_file(path: Path, progress: Callable[[int], None] | None = None) -> str:
-    """SHA-256 of a file, lower-case hexadecimal; `progress` is told the bytes of each step."""
+    """SHA-256 of a file, lower-case hexadecimal; `progress` gets the bytes of each step."""
     digest = hashlib.sha256()
     buffer = bytearray(_BLOCK_BYTES)
     view = memoryview(buffer)

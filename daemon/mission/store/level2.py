@@ -80,7 +80,7 @@ def level2_contents(
         residuals_svg: a drawing of the residual vectors.
         residuals_json: the same as numbers, with figures for every overlap.
         histogram_json: counts of raw DN by sensor.
-        mosaic_json: content of mosaic.json, what the stitching says about the sensors' places.
+        mosaic_json: content of mosaic.json, the sensors' places as stitched.
 
     Raises:
         ProductError: arrays of wrong type or shape, or an unknown band.

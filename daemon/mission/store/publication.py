@@ -211,7 +211,8 @@ def _exchange(one: Path, other: Path) -> None:
 
     Raises:
         FileNotFoundError: one of them is absent.
-        OSError: ENOSYS or EINVAL where the C library, the kernel or the file system lacks it.
+        OSError: ENOSYS or EINVAL where the C library, the kernel or the file system does not have
+            it.
     """
     try:
         renameat2 = ctypes.CDLL(None, use_errno=True).renameat2

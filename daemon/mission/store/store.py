@@ -257,7 +257,7 @@ class Level0Writer:
     def _decide(self) -> None:
         """Take back a record whose last sync failed: a power cut may leave it or not.
 
-        The next record must not be chained to a perhaps, and this one is written anew.
+        The next record must not be chained to an uncertain one, and this one is written again.
 
         Raises:
             OSError: the disk still refuses; nothing can be sealed.

@@ -1,7 +1,7 @@
-"""A mission on one of several disks: its lane, its Level-0 writer and its file of the flight log.
+"""A mission on one of several disks: its thread, Level-0 writer and file of the flight log.
 
 What is done on which disk is decided in `daemon.mission.mirror.mirrored`. Methods that touch the
-disk are to be called in its lane.
+disk are to be called in its thread.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from daemon.mission.verification.chain_file import ChainFile
 
 
 class MissionCopy:
-    """The mission on one disk. `refusal` is what its log's last refused write said."""
+    """The mission on one disk. `refusal` is the error of its log's last refused write."""
 
     def __init__(self, disk: Disk, mission_id: str) -> None:
         self.disk = disk

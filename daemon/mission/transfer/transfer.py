@@ -77,7 +77,7 @@ def transfer(
             the copy.
 
     Raises:
-        TransferError: no room, a target that is not empty and not ours, a source that lacks what
+        TransferError: no room, a target that is not empty and not ours, a source without what
             the copy has, or a copy that cannot be verified.
         TreeError: links or devices in source or target, or a disk that returns other bytes.
         MissionError: another process holds the mission or the copy.

@@ -44,7 +44,7 @@ _SHA256 = re.compile(r"[0-9a-f]{64}")
 
 
 class TransferError(DaemonError):
-    """The mission was not copied, or the source was not removed; the message says why."""
+    """The mission was not copied, or the source was not removed; the message states why."""
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """The chain over exposure records: each quotes the hash of the one sealed before it.
 
-Pure: it is given hashes and says where the chain is broken. An altered, removed or slipped-in
+Pure functions: from hashes they find where the chain is broken. An altered, removed or slipped-in
 record cannot hide, except as the very last, which only the index knows.
 """
 
@@ -21,7 +21,7 @@ class ChainLink:
 
 @dataclass(frozen=True)
 class ChainReport:
-    """Records in the order they were sealed, as far as the chain tells; unreachable ones behind.
+    """Records in the order they were sealed, as far as the chain reaches; unreachable ones last.
 
     `head_sha256` is what the next record quotes: the hash of the last record reached, or the
     genesis where there is none.

@@ -179,7 +179,7 @@ class ChainFile:
         self.sealed_logs.add(name)
 
     def close_run(self, by: str, files: Mapping[str, str]) -> bool:
-        """Note that a run ended; nothing happens where the last line says so already.
+        """Note that a run ended; nothing happens where the last line already records it.
 
         Args:
             by: "landing" or "repair".

@@ -1,4 +1,4 @@
-"""On start: index, records, logs and disk are brought together, and it is told what was done.
+"""At startup: make index, records, logs and disk agree, and report what was done.
 
 Whatever was called stored is kept; whole folders that were only not renamed yet are kept too; what
 is stored but unsealed is sealed from the flight log. Running it twice changes nothing more.
@@ -45,9 +45,9 @@ Complete = Callable[[CaptureRecord, Sequence[LoggedRecord]], Exposure]
 @dataclass(frozen=True)
 class RecoveryReport:
     """What recovery found and did. `problems` are what it could not put right, `noticed` what needs
-    nothing to be done and is told at every start.
+    no action and is reported at every start.
 
-    `sealed` and `lost` are the numbers it sealed just now; `settled` are all sealed records by
+    `sealed` and `lost` are the numbers it sealed just now; `finalized` are all sealed records by
     number, for the ledger, and `ledger_sheet` the last one that was logged under the topic
     "ledger"; `next_number` is the one to go on with, beyond every trigger that was ever given.
     """
@@ -64,7 +64,7 @@ class RecoveryReport:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """All there is to tell the crew, what went wrong first."""
+        """All messages to the crew, problems first."""
         return (*self.problems, *self.done, *self.notices)
 
 
@@ -390,7 +390,7 @@ class _Recovery:
 
 
 def _is_complete(part: Path) -> bool:
-    """Whether every frame named in a part folder's record is there and hashes to what it says."""
+    """Whether every frame named in a part folder's record is there and has its recorded hash."""
     try:
         capture = read_capture(part)
     except RecordError:

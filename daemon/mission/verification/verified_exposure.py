@@ -175,7 +175,7 @@ def _check_frames(
         path = expected.folder / (frame.file or f"{frame.sensor}.tif")
         where = f"exposure {expected.folder.name}, {path.name}"
         if path.name not in expected.names:
-            found.problems.append(f"{where}: is missing; its record says it was stored")
+            found.problems.append(f"{where}: is missing; according to its record it was stored")
             continue
         try:
             sha256 = hash_file(path, step)

@@ -1,4 +1,4 @@
-"""Bundle adjustment from and to text files: a project in TOML beside tables in CSV.
+"""Bundle adjustment from and to text files: a project in TOML and tables in CSV.
 
-The mathematics is in `processing.bundle`; here are the files, and what is told of a result.
+The mathematics is in `processing.bundle`; here are the files, and the report of a result.
 """

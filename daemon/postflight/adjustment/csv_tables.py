@@ -1,6 +1,6 @@
 """Tables of an adjustment project: CSV with a line of column names, `#` begins a remark.
 
-Mistakes are gathered with file and line, so that all of them are told at once.
+Mistakes are gathered with file and line, so that all of them are reported at once.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ def read_table(path: Path, needed: Sequence[str], known: Sequence[str]) -> CsvTa
     Args:
         path: the file.
         needed: columns it must have.
-        known: columns it may have beside them.
+        known: columns it may have in addition.
 
     Raises:
         ProjectError: no such file, or columns that are missing or not known.

@@ -1,7 +1,7 @@
 """Reading an adjustment project: `project.toml` and its tables become a network.
 
-The format is told in docs/formats.md. Coordinates without a value are NaN in the network and found
-by `processing.bundle.initial_values`.
+The format is described in docs/formats.md. Coordinates without a value are NaN in the network and
+found by `processing.bundle.initial_values`.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ def read_project(path: Path) -> Project:
     build = _TableIndex(images, exposures, seen, points, problems)
     reported = [problem for t in build.tables for problem in t.problems]
     if reported:
-        # Names that are not unique fit no index: what else is wrong cannot be told yet.
+        # Names that are not unique fit no index: further mistakes cannot be found yet.
         raise ProjectError(reported)
     network = Network(
         cameras=cameras,

@@ -1,11 +1,11 @@
-"""What project.toml of an adjustment may say; docs/formats.md tells the same to people."""
+"""Schema of project.toml of an adjustment; docs/formats.md describes it."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from daemon.mission.foreign_files import ForeignFileError, read_regular_file
 from daemon.postflight.adjustment.csv_tables import ProjectError
@@ -32,6 +32,13 @@ class AdjustSection(_ProjectSection):
     earth_radius_m: float | None = Field(default=None, gt=1e6)
     refraction: bool = False
     ground_m: float = 0.0
+
+    @model_validator(mode="before")
+    @classmethod
+    def _refuse_old_key(cls, content: Any) -> Any:
+        if isinstance(content, dict) and "most_iterations" in content:
+            raise ValueError("most_iterations is now named max_iterations; rename it")
+        return content
 
 
 class FilesSection(_ProjectSection):
@@ -127,7 +134,8 @@ def read_project_file(path: Path) -> ProjectFile:
     except ValidationError as error:
         raise ProjectError(
             [
-                f"{path.name}: {'.'.join(str(part) for part in detail['loc'])}: {detail['msg']}"
+                f"{path.name}: {'.'.join(str(part) for part in detail['loc'])}: "
+                f"{detail['msg'].removeprefix('Value error, ')}"
                 for detail in error.errors()
             ]
         ) from error

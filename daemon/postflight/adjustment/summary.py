@@ -1,4 +1,4 @@
-"""What is told of an adjustment: one object for programs, tables and sentences for people."""
+"""Summary of an adjustment: one object for programs, tables and messages for people."""
 
 from __future__ import annotations
 
@@ -208,8 +208,8 @@ def _print_correlations(console: Console, report: Mapping[str, Any]) -> None:
             if pair not in printed:
                 printed.add(pair)
                 console.print(
-                    f"{p['camera']}: {p['name']} and {other} correlate by {value:.3f}: hardly told "
-                    "apart, one may be dropped",
+                    f"{p['camera']}: {p['name']} and {other} correlate by {value:.3f}: hardly "
+                    "separable, one may be dropped",
                     highlight=False,
                 )
 

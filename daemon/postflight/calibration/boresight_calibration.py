@@ -63,7 +63,7 @@ VELOCITY = ("vx_mps", "vy_mps", "vz_mps")
 
 
 class BoresightError(DaemonError, ValueError):
-    """Nothing can be compared; the sentence says what is missing."""
+    """Nothing can be compared; the message states what is missing."""
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ def controlled_of(result: Adjustment, exposures: Sequence[int]) -> ImageOrientat
 def inertial_table(
     path: Path, stations: Sequence[str], position_sigma_m: Array, attitude_sigma_rad: Array
 ) -> tuple[tuple[int, ...], InertialOrientations]:
-    """Read `inertial.csv`: which stations (by index) it tells of, and what.
+    """Read `inertial.csv`: the stations (by index) in it, and their values.
 
     Raises:
         daemon.postflight.adjustment.csv_tables.ProjectError: columns or cells that are not right.
@@ -143,7 +143,7 @@ def inertial_table(
 
 
 def system_of(project: Path, crs: str | None) -> str | LocalFrame:
-    """What the coordinates of a project are in: `crs`, or the frame that lies beside it.
+    """What the coordinates of a project are in: `crs`, or the frame file next to it.
 
     Raises:
         BoresightError: neither is there.
@@ -157,7 +157,7 @@ def system_of(project: Path, crs: str | None) -> str | LocalFrame:
     except FileNotFoundError as error:
         raise BoresightError(
             "--mission needs --crs, the coordinate system of the project, such as EPSG:25833; only "
-            "projects that `syntopic triangulate` wrote tell their own"
+            "projects that `syntopic triangulate` wrote contain their own"
         ) from error
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise BoresightError(f"{frame}: {error}; give --crs") from error
@@ -174,7 +174,7 @@ def inertial_of_mission(
     """The trajectory at the marks of a mission's exposures, in the project's coordinate system.
 
     Exposures are named as `syntopic export orientation` names them. Positions are those of the
-    antenna, as the trajectory tells them. `system` is a coordinate system that PROJ knows, or the
+    antenna, from the trajectory. `system` is a coordinate system that PROJ knows, or the
     local frame of a project that `syntopic triangulate` wrote.
 
     Raises:
@@ -271,7 +271,7 @@ def report_of(
     previous: Previous | None,
     warnings: Sequence[str] = (),
 ) -> CalibrationReport:
-    """The calibration as told and written."""
+    """The calibration report, as printed and written."""
     found, n = done.found, len(done.names)
     quantities = quantities_of(done)
     speed = np.linalg.norm(done.inertial.velocity_mps, axis=1)

@@ -33,7 +33,7 @@ Cell = str | float | int | None
 
 
 class CalibrationFolderError(DaemonError, ValueError):
-    """A calibration that cannot be written or compared; the sentence says what would be right."""
+    """A calibration that cannot be written or compared; the message states what would be right."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class QuantityChange:
 
     @property
     def significant(self) -> bool | None:
-        """None: without a standard deviation nothing can be said."""
+        """None: without a standard deviation there is no verdict."""
         return None if self.t is None else abs(self.t) > self.limit
 
 
@@ -96,7 +96,7 @@ class Plot:
 
 @dataclass(frozen=True)
 class CalibrationReport:
-    """One calibration, told.
+    """Report of one calibration.
 
     Attributes:
         kind: the command's name, such as `radiometric`.
@@ -127,7 +127,7 @@ class CalibrationReport:
 
 @dataclass(frozen=True)
 class Previous:
-    """What an earlier `calibration.json` says."""
+    """Content of an earlier `calibration.json`."""
 
     kind: str
     calibration_id: str
@@ -290,7 +290,7 @@ def calibration_folder(
     """Where a new calibration will lie, before anything is computed.
 
     Args:
-        out: the folder asked for; None takes one beside `beside`, which the calibration is made
+        out: the requested folder; None takes one next to `next_to`, which the calibration is made
             from, named by `stem`, `date` and content.
 
     Raises:
@@ -308,7 +308,7 @@ def calibration_folder(
 
 
 def content_digest(files: Mapping[str, bytes]) -> str:
-    """What tells calibrations apart that are named alike: eight hexadecimal digits of SHA-256."""
+    """Distinguishes calibrations of the same name: eight hexadecimal digits of SHA-256."""
     digest = hashlib.sha256()
     for name in sorted(files):
         digest.update(f"{name} {len(files[name])}\n".encode())

@@ -1,7 +1,7 @@
 """`syntopic calibrate platform`: mountings found by flown exposures become a rig file.
 
-The averaging is in `processing.calibration.platform`; here the missions are read, and it is told
-what was found.
+The averaging is in `processing.calibration.platform`; here the missions are read, and the
+report is built.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ _ANGLES = ("omega", "phi", "kappa")
 
 
 class PlatformCalibrationError(DaemonError, ValueError):
-    """Missions a platform cannot be calibrated from; the sentence says what would be right."""
+    """Missions a platform cannot be calibrated from; the message states what would be right."""
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ def report_of(
     date: str,
     previous: Previous | None,
 ) -> CalibrationReport:
-    """The calibration as told and written; compared with the rig flown with, or a previous one."""
+    """The calibration report; compared with the rig flown with, or a previous one."""
     rig, quantities = flown.rig, quantities_of(calibration)
     before = quantities_of_rig(rig) if previous is None else previous.quantities
     return CalibrationReport(
@@ -173,7 +173,7 @@ def report_of(
 
 
 def rig_file(rig: Rig, flown: PlatformMissions, *, date: str) -> bytes:
-    """The new rig file; it says where it comes from."""
+    """The new rig file; it states its origin."""
     remark = (
         f"{rig.name}, by `syntopic calibrate platform` on {date} from {len(flown.records)} "
         f"exposures of\n{', '.join(flown.missions)}, in place of calibration "
@@ -206,8 +206,8 @@ def _warnings(
     warnings = [] if previous is None else serial_warnings(previous, serials)
     if calibration.missing:
         warnings.append(
-            f"no or too few exposures tell of cone {', '.join(calibration.missing)} (beside the "
-            "flight axis their height above ground must be known): its angles are as they were"
+            f"no or too few exposures contain cone {', '.join(calibration.missing)} (across the "
+            "flight axis their height above ground must be known): its angles are unchanged"
         )
     warnings += [
         f"cone {c.cone}: {c.left_out} of {c.left_out + len(c.used)} exposures left out, far off "
@@ -288,7 +288,7 @@ def _inseparable_parameters(
         parts = (found.places, found.speed, found.crab, found.height)
         rows.append((cone.cone, *(_about(part) for part in parts)))
     return ReportTable(
-        "What passes for a turn and cannot be told from one, urad about x, y, z",
+        "Errors indistinguishable from a rotation, urad about x, y, z",
         ("cone", "places, one sigma", "speed or delay 1 %", "crab 1 deg", "height 1 %"),
         rows,
         "Places are within the standard deviations of the angles; so is 2 % of height. A turn of "

@@ -150,7 +150,7 @@ def vectors_svg(
 ) -> str:
     """Vectors (n, 2) at places (n, 2) about the middle of a field of `half` width and height.
 
-    y is up. `unit` names what vectors are told in and how many of it one of them is.
+    y is up. `unit` names the unit of vectors and how many of it one of them is.
     """
     wide = 700.0
     scale = wide / (2.0 * half[0])

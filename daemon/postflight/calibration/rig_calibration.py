@@ -1,6 +1,6 @@
 """`syntopic calibrate rig`: relative orientations and lenses of a block become a rig file.
 
-The averaging is in `processing.calibration.relative_orientation`; here is what is told and written.
+The averaging is in `processing.calibration.relative_orientation`; here are its report and files.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ from processing.rig import Rig
 
 GRAD = 200.0 / math.pi
 MOVED = 2.0
-"""Mean square of single exposures about the average that says the rig moved within the block."""
+"""Mean square of single exposures about the average above which the rig moved within the block."""
 
 _ANGLES = ("phi", "omega", "kappa")
 _LENS_FIELD = {"dx0": "dx0_mm", "dy0": "dy0_mm", "df": "df_mm"}
 
 
 class RigCalibrationError(DaemonError, ValueError):
-    """A block that says nothing about this rig; the sentence says what would."""
+    """A block without observations of this rig; the message states what is missing."""
 
 
 def calibrated_rig(
@@ -115,7 +115,7 @@ def report_of(
     date: str,
     previous: Previous | None,
 ) -> CalibrationReport:
-    """The calibration as told and written."""
+    """The calibration report, as printed and written."""
     quantities = quantities_of(result, found)
     warnings = [] if previous is None else serial_warnings(previous, rig.serials)
     if math.isfinite(found.squares) and found.squares > MOVED:

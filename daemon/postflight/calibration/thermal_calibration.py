@@ -72,7 +72,7 @@ def read_thermal_records(missions: Sequence[Path]) -> ThermalRecords:
         mission = Mission.open(path)
         if mission.path.resolve() in seen:
             raise ThermalCalibrationError(
-                f"{mission.id} is given twice; what it says counts once: leave one out"
+                f"{mission.id} is given twice; its records count once: leave one out"
             )
         seen.add(mission.path.resolve())
         own = load_rig(mission.rig_path)

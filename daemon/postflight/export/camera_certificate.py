@@ -28,7 +28,7 @@ AXES = (
 
 
 class CameraCertificateError(DaemonError):
-    """A rig whose images have no single perspective; the sentence says so."""
+    """A rig whose images have no single perspective; the message states so."""
 
 
 def certificate_of(rig: Rig) -> dict[str, Any]:

@@ -28,9 +28,9 @@ Value = bytes | int | tuple[Fraction, ...]
 
 @dataclass(frozen=True)
 class PictureMetadata:
-    """What is told of a picture.
+    """Metadata of a picture.
 
-    `height_m` is above the ellipsoid (EXIF 2.32 knows no such reference: `remark` says it);
+    `height_m` is above the ellipsoid (EXIF 2.32 knows no such reference: `remark` states it);
     `position_sigma_m` is None where it is not known; angles are of the image's camera against the
     local level (yaw from true north) and omega, phi, kappa against the grid `crs`.
     """

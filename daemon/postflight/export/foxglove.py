@@ -1,4 +1,4 @@
-"""A mission as one MCAP file that Foxglove opens: track, thumbnails, and what was said, in UTC.
+"""A mission as one MCAP file that Foxglove opens: track, thumbnails and messages, in UTC.
 
 Derived from the flight logs and the records, which stay as they are. Channels are JSON with the
 schema names Foxglove knows: foxglove.LocationFix, foxglove.CompressedImage, foxglove.Log.
@@ -137,7 +137,7 @@ def _register(writer: Writer, topic: str, schema: str) -> int:
 
 
 def _from_logs(mission: Mission) -> Iterator[_TopicMessage]:
-    """Positions, and what devices and people said, from every log of the mission."""
+    """Positions, and messages of devices and people, from every log of the mission."""
     for path in logs_of(mission.log_dir):
         log_messages: list[tuple[int, int, str, str]] = []
         mono_less_gps_ns: int | None = None
@@ -159,7 +159,7 @@ def _from_logs(mission: Mission) -> Iterator[_TopicMessage]:
                 level = ERROR if record.is_fault else INFO
                 log_messages.append((record.mono_ns, level, record.device, record.sentence))
         if mono_less_gps_ns is None:
-            continue  # nobody knows when this was said
+            continue  # the instant of these messages is unknown
         for mono_ns, level, name, sentence in log_messages:
             yield (utc_ns(mono_ns - mono_less_gps_ns), *_log_message(level, name, sentence))
 

@@ -43,7 +43,7 @@ _REMARK = (
 
 
 class PictureError(DaemonError):
-    """Nothing to export; the sentence says what is missing."""
+    """Nothing to export; the message states what is missing."""
 
 
 @dataclass(frozen=True)

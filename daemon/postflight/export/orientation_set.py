@@ -1,4 +1,4 @@
-"""A set of exterior orientations of a mission, written as one folder beside earlier ones.
+"""A set of exterior orientations of a mission, written as one folder next to earlier ones.
 
 One folder a trajectory, `export/orientation/<trajectory>/`: what was known in flight stays when a
 post-processed trajectory arrives.
@@ -84,7 +84,7 @@ def export_orientation(
         receiver: whose navigation, where the flight had several.
         mount_file: TOML with a `[mount]` in place of the one that was flown.
         dem_file: height model that footprints are followed to, in the same system.
-        progress: told how many exposures are done.
+        progress: called with the number of exposures done.
 
     Raises:
         OrientationError: no exposure could be oriented.
@@ -228,7 +228,7 @@ def _change(
 
 
 def _angle_deg(rotation: NDArray[np.float64]) -> float:
-    # From the skew part: the trace says nothing about small angles.
+    # From the skew part: the trace is insensitive to small angles.
     skew = rotation - rotation.T
     sine = float(np.linalg.norm([skew[2, 1], skew[0, 2], skew[1, 0]])) / 2
     return float(np.degrees(np.arctan2(sine, (np.trace(rotation) - 1) / 2)))

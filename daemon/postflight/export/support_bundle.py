@@ -1,7 +1,8 @@
 """What support needs to see of a mission, in one file: no pixels, no raw bytes, no secrets.
 
-Configuration, rig, records and verdicts, what the devices and the service said, the ledger, and the
-versions of everything. Secrets are left out of all of it (`daemon.postflight.export.redaction`).
+Configuration, rig, records and verdicts, messages of the devices and the service, the ledger, and
+the versions of everything. Secrets are left out of all of it
+(`daemon.postflight.export.redaction`).
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from daemon.postflight.export.redaction import REDACTED, text_without_secrets, w
 from processing.rig.rig_file import RIG_FILE_MAX_BYTES
 
 TOPICS = ("event/", "ledger", "audit", "trigger", "mark/", "log/")
-"""Topics of the flight log that are told; navigation and raw bytes say where somebody flew."""
+"""Included topics of the flight log; navigation and raw bytes would reveal where somebody flew."""
 
 EVENTS_MAX_BYTES = 50_000_000
 

@@ -97,7 +97,7 @@ def import_rededge(
 ) -> ImportedMission:
     """Write the mission folder `out` from all images below `folder`.
 
-    Images of one capture become one exposure, in the order of their paths. `progress` is told
+    Images of one capture become one exposure, in the order of their paths. `progress` gets
     exposures done and in all.
 
     Raises:
@@ -251,7 +251,7 @@ def _brown(xmp: Xmp, per_mm: float) -> Brown:
     k1, k2, k3, p1, p2 = xmp.numbers("PerspectiveDistortion", 5)
     x_mm, y_mm = xmp.numbers("PrincipalPoint", 2)
     f = xmp.number("PerspectiveFocalLength")
-    # Later firmware states the focal length in mm and says so.
+    # Later firmware states the focal length in mm and its unit.
     units = "PerspectiveFocalLengthUnits"
     if units in xmp and xmp.text(units) == "mm":
         f *= per_mm
@@ -297,7 +297,7 @@ def _head(image: RedEdgeImage) -> tuple[Any, ...]:
 
 
 def _cone_of(cone: Cone, image: RedEdgeImage | None, fit: dict[str, float]) -> Cone:
-    """A cone with the lens, the principal point and the serial number an image tells."""
+    """A cone with the lens, the principal point and the serial number of an image."""
     if image is None:
         return cone
     try:
@@ -407,7 +407,7 @@ def _utc(exif: Mapping[str, Any]) -> datetime | None:
 
 
 def _place(gps: Any) -> dict[str, float]:
-    """Position as the camera's receiver told it, without a standard deviation: not navigation."""
+    """Position from the camera's receiver, without a standard deviation: not navigation."""
     try:
         latitude = _degrees(gps["GPSLatitude"]) * (-1 if gps["GPSLatitudeRef"] == "S" else 1)
         longitude = _degrees(gps["GPSLongitude"]) * (-1 if gps["GPSLongitudeRef"] == "W" else 1)

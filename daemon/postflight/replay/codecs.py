@@ -25,7 +25,7 @@ from drivers.transport.serial_device import SerialDevice, SerialLine
 
 Decoded = NavSample | EventMark | TemperatureSample | ClockReading
 NEW_LINE = frozenset({"lost", "silent"})
-"""Device events after which the port is opened anew, and half a message is of no use."""
+"""Device events after which the port is reopened, and half a message is of no use."""
 
 
 class _Clock:
@@ -74,7 +74,7 @@ class _Port:
 
 
 class Codec:
-    """A device of the flight, fed with what it said then."""
+    """A device of the flight, fed with its recorded bytes."""
 
     def __init__(self, driver: SerialDevice, port: _Port, clock: _Clock) -> None:
         self._driver = driver
@@ -93,7 +93,7 @@ class Codec:
         return found
 
     def reopened(self) -> None:
-        """The port was opened anew: half a message is of no use."""
+        """The port was reopened: half a message is of no use."""
         self._driver.connected()
 
 
@@ -111,20 +111,20 @@ def codec_for(kind: str, driver: str, name: str, settings: Mapping[str, object])
 
 
 def has_first_bytes(recorded: Iterable[RawBytes | DeviceEvent]) -> bool:
-    """Whether the log holds what a device said before it was open, or there was nothing.
+    """Whether the log holds a device's bytes from before it was open, or there were none.
 
-    That was told to nobody, but the decoder learned from it, such as whether attitudes come.
+    They were not reported, but the decoder learned from them, such as whether attitudes come.
     """
     first = next(iter(recorded), None)
     return not isinstance(first, DeviceEvent) or first.name != "opened"
 
 
 def decode_all(codec: Codec, recorded: Iterable[RawBytes | DeviceEvent]) -> list[Decoded]:
-    """Everything a device said in one run of the service.
+    """Everything a device sent in one run of the service.
 
     Args:
-        heard: its bytes and events in their order. Bytes before it is open came while it was
-            looked for: they are decoded, and what they mean was told to nobody.
+        recorded: its bytes and events in their order. Bytes before it is open came during
+            discovery: they are decoded, but were not reported.
     """
     found: list[Decoded] = []
     chunks: list[RawBytes] = []

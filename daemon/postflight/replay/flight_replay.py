@@ -1,7 +1,8 @@
 """One run of the service again, from its flight log: matching, clocks, ledger and records.
 
-Instants and decisions are those of the log; what follows from them is found anew and held against
-what the flight found. Pixels are the business of `daemon.postflight.replay.product_comparison`.
+Instants and decisions are those of the log; what follows from them is computed again and compared
+with what the flight found. Pixels are the business of
+`daemon.postflight.replay.product_comparison`.
 """
 
 from __future__ import annotations
@@ -234,7 +235,7 @@ class _Run:
         self._out.deferred[decision.number] = bool(decision.detail.get("deferred"))
 
 
-_COMPARED = {"store": "stores", "given_up": "given up", "seal": "seals", "foreseen": "foreseen"}
+_COMPARED = {"store": "stores", "given_up": "given up", "seal": "seals", "foreseen": "provisional"}
 _HANDLERS: Mapping[str, Callable[[_Run, Decision], None]] = {
     "order": _Run._order,
     "not-fired": _Run._not_fired,
@@ -261,7 +262,7 @@ def _decode(
 ) -> dict[int, Decoded]:
     """What the codecs make of the logged bytes, by the message it takes the place of.
 
-    A record arrives when the flight's did; what it says comes from the bytes.
+    A record arrives when the flight's did; its content comes from the bytes.
     """
     recorded: dict[str, list[RawBytes | DeviceEvent]] = defaultdict(list)
     expected: dict[str, list[tuple[Message, Decoded]]] = defaultdict(list)
@@ -300,7 +301,7 @@ def _decode(
         first = 0 if has_first_bytes(recorded[name]) or True not in agree else agree.index(True)
         if first:
             out.sentences.append(
-                f"{what}: the log does not hold what {name} said before it was open, which early "
+                f"{what}: the log does not hold what {name} sent before it was open, which early "
                 f"versions did not log; the first {first} after it are taken as logged"
             )
         for (message, original, again), agrees in zip(pairs[first:], agree[first:], strict=True):

@@ -116,7 +116,7 @@ def compare_products(
 
 
 def content_hash(name: str, data: bytes) -> str:
-    """SHA-256 of what a file says: decoded pixels and arrays, canonical JSON without durations."""
+    """SHA-256 of a file's content: decoded pixels and arrays, canonical JSON without durations."""
     digest = hashlib.sha256()
     if name.endswith(".tif"):
         with tifffile.TiffFile(BytesIO(data)) as tiff:

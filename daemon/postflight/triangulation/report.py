@@ -1,4 +1,4 @@
-"""What is told of an aerial triangulation beside what is told of any adjustment.
+"""Report of an aerial triangulation, in addition to that of any adjustment.
 
 Image measurements in um and px, control and check residuals in px and m, orientations in the
 coordinate system asked for.

@@ -47,14 +47,14 @@ Array = NDArray[np.float64]
 
 
 class IntersectionError(DaemonError, ValueError):
-    """Nothing can be intersected; the sentence says what is missing."""
+    """Nothing can be intersected; the message states what is missing."""
 
 
 @dataclass(frozen=True)
 class IntersectionSigmas:
     """Standard deviations: of places in the images (px), positions (3,) m east, north, up,
     attitudes and boresight (3,) rad about the rig's camera axes. Mounting angles are uncertain by
-    what the rig file says (`rotation_sigma_urad`)."""
+    `rotation_sigma_urad` of the rig file."""
 
     image_px: float = 0.5
     position_m: tuple[float, float, float] = (0.05, 0.05, 0.08)

@@ -57,7 +57,7 @@ SIGMAS = ("sx_m", "sy_m", "sz_m")
 
 
 class TriangulationError(DaemonError, ValueError):
-    """A mission that cannot be triangulated; the sentence says what is missing."""
+    """A mission that cannot be triangulated; the message states what is missing."""
 
 
 @dataclass(frozen=True)

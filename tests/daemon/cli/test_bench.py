@@ -53,7 +53,7 @@ def test_the_pace_is_that_of_parallel_exposures_with_the_latency_of_each(
     figures: dict[str, Any],
 ) -> None:
     side = figures["side_by_side"]
-    assert side["parallel"] == 2 and side["exposures"] == 6
+    assert side["parallel_exposures"] == 2 and side["exposures"] == 6
     pace = figures["frame_interval_s"] / side["seconds_per_exposure"]
     assert figures["realtime_factor"] == pytest.approx(pace)
     # What is overlapped takes longer than its share of the time, never less.

@@ -1,4 +1,4 @@
-"""The index: readable beside its writer, refused when damaged, never in the way of another."""
+"""The index: readable during writing, refused when damaged, never blocking another."""
 
 from __future__ import annotations
 

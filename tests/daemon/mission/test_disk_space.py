@@ -1,4 +1,4 @@
-"""How much room is left, for how long, and what is said and flagged when it becomes low."""
+"""Free space, the time it lasts, and the warning and flag when it becomes low."""
 
 from __future__ import annotations
 

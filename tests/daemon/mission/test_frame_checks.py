@@ -71,20 +71,20 @@ def test_a_frame_altered_in_one_bit_is_refused(mission: Mission, at: int) -> Non
         (set_frame(pixel_format="Mono10p"), "Mono10p; the rig's sensor has 12 bits"),
         (set_frame(pixel_format="BayerRG12"), "BayerRG12, which is RGGB; the rig's sensor has"),
         (set_frame(pixel_format="SGBRG16"), "SGBRG16, which is GBRG"),
-        (set_frame(pixel_format="Mono14"), "its file says pixel_format 'Mono12'"),
+        (set_frame(pixel_format="Mono14"), "its file has pixel_format 'Mono12'"),
         (set_frame(exposure_time_us=0), "exposure_time_us is 0; an exposure time is positive"),
         (set_frame(exposure_time_us=-4000.0), "exposure_time_us is -4000"),
         (set_frame(exposure_time_us=600e6 + 1), r"exposure_time_us is 6e\+08; an exposure time"),
         (set_frame(exposure_time_us="4000"), "a finite number is needed"),
-        (set_frame(exposure_time_us=2001.0), "its file says exposure_time_us 2000.0; the record"),
+        (set_frame(exposure_time_us=2001.0), "its file has exposure_time_us 2000.0; the record"),
         (set_frame(settings={"TdiShifts": "12"}), "TdiShifts is '12'; a whole number from 0 to 63"),
         (set_frame(settings={"TdiShifts": -1}), "TdiShifts is -1"),
         (set_frame(settings={"TdiShifts": 1.5}), "TdiShifts is 1.5"),
         (set_frame(settings={"TdiShifts": 64}), "TdiShifts is 64; a whole number from 0 to 63"),
-        (set_frame(settings={"TdiShifts": 3}), "its file says TdiShifts 0; the record says 3"),
-        (set_frame(device_ns="5"), "its file says device_ns '1000000000'; the record says '5'"),
-        (set_frame(counter=2), "its file says counter 1; the record says 2"),
-        (set_frame(file="RIGHT.tif", sha256=""), "its file says sensor 'RIGHT'"),
+        (set_frame(settings={"TdiShifts": 3}), "its file has TdiShifts 0; the record has 3"),
+        (set_frame(device_ns="5"), "its file has device_ns '1000000000'; the record has '5'"),
+        (set_frame(counter=2), "its file has counter 1; the record has 2"),
+        (set_frame(file="RIGHT.tif", sha256=""), "its file has sensor 'RIGHT'"),
     ],
 )
 def test_what_does_not_fit_is_an_error_of_the_exposure(
@@ -113,7 +113,7 @@ def test_a_frame_of_another_exposure_is_found_though_its_hash_was_taken_over(
     path.unlink()
     path.write_bytes(other.read_bytes())
     rewrite(mission, set_frame(sha256=sha256_hex(other.read_bytes())))
-    with pytest.raises(RecordError, match="its file says exposure 2; the record says 1"):
+    with pytest.raises(RecordError, match="its file has exposure 2; the record has 1"):
         load(mission)
 
 

@@ -1,4 +1,4 @@
-"""TIFFs, flight logs and missions of strangers: refused in sentences, never hung, bounded."""
+"""Foreign TIFFs, flight logs and missions: refused with a message, in bounded time and memory."""
 
 from __future__ import annotations
 

@@ -215,4 +215,4 @@ def test_a_mission_closed_while_a_disk_was_away_is_not_resumed_from_it(
     assert Mission.current(flown.roots["root"]) is not None
     assert find_disks(flown.roots).mission is None
     remove_tree(flown.copy("mirror").path)
-    assert find_disks(flown.roots).mission is not None, "all that there is says it is being flown"
+    assert find_disks(flown.roots).mission is not None, "the only copy is being flown"

@@ -39,7 +39,7 @@ TIMEOUT_S = 60.0
 
 
 class MirroredFlight:
-    """A mirrored mission on two folders, and what it said."""
+    """A mirrored mission on two folders, and its events."""
 
     def __init__(self, roots: dict[str, Path]) -> None:
         self.roots = roots
@@ -138,7 +138,7 @@ def test_a_disk_that_refuses_a_frame_is_dropped_and_the_exposure_is_stored_on_th
     assert dropped[0].dropped_count == 1 and [d.label for d in dropped[0].in_use] == [left]
     assert failing in dropped[0].sentence and "storing goes on with" in dropped[0].sentence
     assert verify(flown.copy(left)).problems == ()
-    # Before the exposure was called stored, the disk that has it said that it is alone.
+    # Before the exposure was called stored, the disk that has it recorded that it is single.
     assert read_generations(flown.copy(left).path)[-1].disks == disks
     assert not flown.copy(failing).level0(2).exists()
 
@@ -281,5 +281,5 @@ def test_a_disk_without_room_does_not_return(flown: MirroredFlight) -> None:
     flown.storage._rejoin = RejoinSettings(POLL_S, POLL_S, required_nbytes=1 << 62)
     with refusing(flown.roots["mirror"]):
         flown.expose(1)
-    flown.until(lambda: any("GB are needed" in p for p in flown.problems()), "said")
+    flown.until(lambda: any("GB are needed" in p for p in flown.problems()), "reported")
     assert len(flown.storage.in_use) == 1 and flown.copy("mirror").numbers() == []

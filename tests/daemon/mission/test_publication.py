@@ -27,7 +27,7 @@ WRITERS = """
     import errno, os, sys, traceback
     from pathlib import Path
     os.fsync = lambda _descriptor: None  # no power cut here, and more rounds a second
-    from daemon.mission import publication
+    from daemon.mission.store import publication
     from daemon.mission.store.level2 import write_folder
     if sys.argv[2] == "renames":
         def refuse(one, other):
@@ -111,7 +111,7 @@ def kill_writers(tmp_path, how, rounds):
             # One step has no instant without a set.
             assert how == "renames" or final.is_dir()
         for pid in rng.sample(writers, 2):
-            with suppress(ProcessLookupError):  # it failed by itself, and said why
+            with suppress(ProcessLookupError):  # it failed and printed the cause
                 os.kill(pid, signal.SIGKILL)
             time.sleep(rng.uniform(0.0, 0.003))
         assert "".join(iter(program.stdout.readline, "ended\n")) == ""

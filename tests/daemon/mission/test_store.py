@@ -267,7 +267,7 @@ def test_verification_finds_an_altered_bit_a_missing_frame_and_an_extra_file(mis
     report = verify(mission)
     assert (report.exposures, report.frames) == (3, 9)
     assert report.problems == (
-        "exposure 000001, SU00.tif: is missing; its record says it was stored",
+        "exposure 000001, SU00.tif: is missing; according to its record it was stored",
         "exposure 000002, SU01.tif: was altered; its hash differs from the record's",
         "exposure 000003, note.txt: is not in the record; Level-0 is immutable",
     )

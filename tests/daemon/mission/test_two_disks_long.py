@@ -1,6 +1,6 @@
 """Two disks that are pulled, fail, fill and stall in turn, over many exposures.
 
-`SYNTOPIC_TWO_DISKS_EXPOSURES` says how many (500 in `make soak`). Exposures long verified on both
+`SYNTOPIC_TWO_DISKS_EXPOSURES` is their number (500 in `make soak`). Exposures long verified on both
 disks are deleted here, which the product never does, so that the disks stay small.
 """
 

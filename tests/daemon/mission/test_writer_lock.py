@@ -1,4 +1,4 @@
-"""Who holds a mission for writing, how often the lock is asked for, and what its file says."""
+"""Who holds a mission for writing, how often the lock is asked for, and what its file has."""
 
 from __future__ import annotations
 

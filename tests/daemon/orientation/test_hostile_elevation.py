@@ -1,4 +1,4 @@
-"""Height models of strangers: one plain local file, GeoTIFF or grid, bounded; else a sentence."""
+"""Foreign height models: one local file, GeoTIFF or grid, bounded; else an error message."""
 
 from __future__ import annotations
 

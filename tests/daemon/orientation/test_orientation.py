@@ -168,7 +168,7 @@ def test_lever_arm_and_boresight_are_taken_out(tmp_path: Path) -> None:
         )
     mount = f"[mount]\nantenna_m = {list(ANTENNA_M)}\nboresight_deg = {list(BORESIGHT_DEG)}\n"
     found = master_of(mission_at(tmp_path / "mounted", mount=mount, samples=seen))
-    # Velocity at the antenna lacks the rates of the body, so the position between two samples is
+    # Velocity at the antenna omits the rates of the body, so the position between two samples is
     # a few millimetres off.
     assert found.centre_m == pytest.approx(plain.centre_m, abs=0.01)
     assert found.rotation == pytest.approx(plain.rotation, abs=1e-7)
@@ -304,7 +304,7 @@ def test_a_csv_trajectory_equals_the_sbet(tmp_path: Path) -> None:
     [
         ("a.out", b"x" * 100, "no whole number of SBET records"),
         ("a.out", b"\xff" * 136 * 3, "no SBET"),
-        ("a.csv", b"time,lat\n1,2\n", "lacks latitude_deg"),
+        ("a.csv", b"time,lat\n1,2\n", "has no latitude_deg"),
         ("a.csv", b"\xff\xfe\x00", "UTF-8"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Plans of strangers: values of wrong types, encodings, sizes and names end in a sentence."""
+"""Foreign plans: wrong types, encodings, sizes and names end in an error message."""
 
 from __future__ import annotations
 

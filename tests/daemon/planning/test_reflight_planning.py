@@ -1,4 +1,4 @@
-"""What must be flown again is exactly what a brute-force look at the ground says.
+"""Reflights are exactly those of a brute-force search over the ground.
 
 The brute force shares nothing with the advisor: it counts, for single points of the ground, the
 images that see them, by crossing numbers in longitude and latitude.

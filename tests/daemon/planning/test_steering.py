@@ -1,4 +1,4 @@
-"""A planned line is exposed where the plan says, whoever flies it, whichever way, however often."""
+"""A planned line is exposed at its planned places, in either direction and at every pass."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Leg = tuple[tuple[float, float], tuple[float, float]]
 
 
 def line(name: str, east_m: float, length_m: float = 1000.0, **about: Any) -> PlannedLine:
-    """A line to the north, `east_m` beside the origin."""
+    """A line to the north, `east_m` from the origin."""
     start, end = PLANE.place(east_m, 0.0), PLANE.place(east_m, length_m)
     return replace(PlannedLine(name, start, end), **about)
 

@@ -160,7 +160,7 @@ def record(shot: Shot) -> Exposure:
 
 
 def valid_area_json(shot: Shot) -> dict[str, Any]:
-    """What quality.json says of the pixels, from a mask of 0.2 % resolution of the test's own."""
+    """Valid area as in quality.json, from a mask of 0.2 % resolution of the test's own."""
     from processing.quality.valid_area import area_of, as_json, gap_cells, grid_of
 
     y, x = np.meshgrid(

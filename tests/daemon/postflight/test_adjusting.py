@@ -1,4 +1,4 @@
-"""Adjustment projects: a published calibration repeated, text there and back, mistakes told."""
+"""Adjustment projects: a published calibration repeated, text round trip, mistakes reported."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def folder(request) -> Path:
     if request.param == "copy":
         return HERE
     if not SHARED.is_dir():
-        pytest.skip(f"{SHARED} is not here; the copy beside the tests is used alone")
+        pytest.skip(f"{SHARED} is not here; only the copy with the tests is used")
     return SHARED
 
 
@@ -288,6 +288,18 @@ def test_all_mistakes_are_reported_together_with_file_and_line(tmp_path) -> None
         "image_points.csv:5: x_mm is 'inf'",
     ):
         assert sentence in text, sentence
+
+
+def test_the_old_name_of_a_key_is_refused_with_the_new_name(tmp_path) -> None:
+    (tmp_path / "project.toml").write_text(
+        'format = 1\nname = "old"\n[adjust]\nmost_iterations = 5\n'
+        '[[camera]]\nname = "c"\nf_mm = 50.0\n'
+    )
+    with pytest.raises(ProjectError) as caught:
+        read_project(tmp_path / "project.toml")
+    assert caught.value.problems == (
+        "project.toml: adjust: most_iterations is now named max_iterations; rename it",
+    )
 
 
 def test_what_cannot_be_determined_ends_the_command_with_its_name(tmp_path) -> None:

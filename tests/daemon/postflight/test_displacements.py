@@ -1,4 +1,4 @@
-"""After landing, a mission says since when a sensor has been displaced."""
+"""After landing, a mission reports since when a sensor has been displaced."""
 
 from __future__ import annotations
 

@@ -53,7 +53,7 @@ def processed(tmp_path_factory):
 
 
 def _run_json(arguments):
-    """What the command says as JSON."""
+    """Output of the command as JSON."""
     done = CliRunner().invoke(app, arguments)
     assert done.exit_code == 0, done.output
     return json.loads(done.stdout)

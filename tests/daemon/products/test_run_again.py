@@ -1,4 +1,4 @@
-"""A new mission is flown by the same command, with its configuration read anew."""
+"""A new mission is flown by the same command, with its configuration read again."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from daemon.cli.run import run
 
 
 class FakeService:
-    """Runs at once; each next one as the list says: exit status, and whether a mission follows."""
+    """Runs at once; each next one as listed: exit status, and whether a mission follows."""
 
     endings: list[tuple[int, bool]]
     flown: list[Any]

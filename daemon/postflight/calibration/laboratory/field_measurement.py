@@ -1,4 +1,4 @@
-"""Frames of a 3D test field to image points: what the series says, discs found, targets told apart.
+"""Frames of a 3D test field to image points: the series, discs found, targets identified.
 
 What is made of the points is in `field`.
 """
@@ -109,7 +109,7 @@ def _matrix(image: Any) -> Array:
 def measure_targets(
     rig: Rig, exposures: Sequence[FieldExposure], field: TargetField, *, progress: Progress
 ) -> TargetObservations:
-    """Find the discs of every frame and tell which target each is.
+    """Find the discs of every frame and identify the target of each.
 
     Raises:
         SeriesError: no frame shows the field where it is expected.

@@ -133,7 +133,7 @@ def field_report(
     date: str,
     previous: tuple[Path, Previous] | None,
 ) -> CalibrationReport:
-    """Tell it all."""
+    """Build the report."""
     rows = estimated_parameters(found)
     covariance = covariance_of(found, rows)
     sigma = np.sqrt(np.diag(covariance))

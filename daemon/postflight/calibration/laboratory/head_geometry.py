@@ -48,7 +48,7 @@ Array = NDArray[np.float64]
 Progress = Callable[[str, int, int], None]
 
 FREE: Final = ("dx0", "dy0", "df", "k1", "k2", "p1", "p2", "b1", "b2")
-"""Without k3, which a field of 40 degrees hardly tells from k2."""
+"""Without k3, which a field of 40 degrees hardly separates from k2."""
 LENS_KEYS: Final = {
     name: f"{name}_mm" if name in ("dx0", "dy0", "df") else name for name in INTERIOR
 }
@@ -124,6 +124,9 @@ def targets_of(series: LaboratorySeries) -> list[Target]:
         ):
             image.add_problem("origin_px", "it is the column and row of the cut-out's first pixel")
             origin = [0, 0]
+        if "turned_deg" in image.content:
+            image.known_keys.add("turned_deg")
+            image.add_problem("turned_deg", "it is now named rotation_deg; rename it")
         found.append(
             Target(
                 path=series.file(image),

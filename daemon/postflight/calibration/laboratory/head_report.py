@@ -66,7 +66,7 @@ def head_report(
     date: str,
     previous: tuple[Path, Previous] | None,
 ) -> CalibrationReport:
-    """Tell it all."""
+    """Build the report."""
     quantities = [q for head in heads for q in quantities_of(head)]
     verdicts, warnings = [], []
     for head in heads:

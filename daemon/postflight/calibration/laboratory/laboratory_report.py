@@ -33,7 +33,7 @@ def of_series(
         report: its own facts, figures, sentences and sheets.
         sensors: whose serial numbers, and their lenses', belong to it.
         previous: an earlier calibration and its folder.
-        compared: what is compared with that; all quantities where it is not said.
+        compared: what is compared with that; all quantities if omitted.
     """
     rig = series.rig
     serials = {**series.serials, **part_serials(rig, sensors), **report.serials}

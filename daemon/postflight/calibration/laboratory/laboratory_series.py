@@ -1,7 +1,7 @@
 """A laboratory series on disk: a folder with `series.json`, the rig file and images.
 
-The list of images is checked as a whole, and all its mistakes are told at once. What an image of
-each kind of series says of itself is asked by that calibration.
+The list of images is checked completely, and all its mistakes are reported at once. Each
+calibration reads the fields of its own kind of series.
 """
 
 from __future__ import annotations

@@ -181,7 +181,7 @@ def calibrate_sensor(
     """Calibrate one sensor from its images.
 
     Raises:
-        SeriesError: sets that are needed are missing; the sentence says which.
+        SeriesError: sets that are needed are missing; the message states which.
         daemon.mission.store.level0.RasterError: an image cannot be read.
     """
     fit: list[FrameSet] = []
@@ -278,7 +278,7 @@ def common_level(heads: Sequence[HeadCalibration], pan: set[str]) -> dict[str, f
     """What to multiply each head's gain by so that PAN heads agree before one light.
 
     The most sensitive PAN head keeps the gain of one where it sees most; colour heads, whose bands
-    the monitor does not tell apart, each have their own.
+    the monitor does not distinguish, each have their own.
     """
     peak = {h.sensor.name: _peak(h) for h in heads}
     best = max((v for name, v in peak.items() if name in pan), default=1.0)

@@ -75,7 +75,7 @@ def radiometric_report(
     apertures: Sequence[float],
     previous: tuple[Path, Previous] | None,
 ) -> CalibrationReport:
-    """Tell it all."""
+    """Build the report."""
     quantities = [q for head in heads for q in quantities_of(head)]
     worst = max((c.ratio for h in heads for _, c in h.checks), default=None)
     verdicts = [
@@ -137,7 +137,7 @@ def _warnings(head: HeadCalibration) -> list[str]:
     given, k = head.sensor.electrons_per_dn, head.transfer.gain_dn_per_e
     if abs(1.0 / k - given) > 0.02 * given:
         found.append(
-            f"{name}: the rig file says electrons_per_dn = {given:g}, measured is {1.0 / k:.4g}"
+            f"{name}: the rig file has electrons_per_dn = {given:g}, measured is {1.0 / k:.4g}"
         )
     return found
 

@@ -1,4 +1,4 @@
-"""Mountings found by many exposures become a dated rig file beside the old one, never over it."""
+"""Mountings from many exposures become a dated rig file next to the old one, never over it."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ UCX_TURNS = {"1": (60e-6, 0.0, 20e-6), "2": (0.0, -50e-6, 0.0), "3": (20e-6, 20e
 L_TURNS = {"1": (40e-6, -30e-6, 20e-6)}
 
 HIGH_M = 1e12
-"""So high that a cone beside the flight axis sees as the others do: the points are drawn so."""
+"""So high that a cone off the flight axis sees as the others do: the points are drawn so."""
 
 
 def with_rotations(rig: Rig, corrections: dict[str, tuple[float, float, float]]) -> Rig:

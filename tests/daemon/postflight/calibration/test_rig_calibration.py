@@ -52,7 +52,7 @@ def test_a_block_becomes_a_dated_rig_that_is_compared_and_never_overwritten(
         cone = new_rig.cone(head)
         turn = rotation_matrix(*cone.rotation_rad).T @ block.head_rotation[k]
         assert math.degrees(math.acos(min(1.0, (np.trace(turn) - 1) / 2))) < 0.2
-        # The lens is the block's, as far as this control can tell.
+        # The lens is the block's, as far as this control can resolve.
         sigma = {q["what"]: q["sigma"] for q in output["quantities"] if q["where"] == head}
         assert abs(cone.lens.k1 - block.radial[k][0]) < 4.0 * sigma["k1"] < 3e-5
         assert abs(cone.lens.f_mm - cone.lens.df_mm - block.f_mm[k]) < 0.1

@@ -1,4 +1,4 @@
-"""Flown missions become a proposed calibration: gathered, judged, written beside, never over."""
+"""Flown missions become a proposed calibration: gathered, evaluated, written as a new file."""
 
 from __future__ import annotations
 

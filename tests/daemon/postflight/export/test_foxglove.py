@@ -58,7 +58,7 @@ def mission(tmp_path: Path) -> Mission:
     products = mission.level2(7)
     products.mkdir(parents=True)
     (products / "thumbnail.jpg").write_bytes(JPEG)
-    report = {"verdict": "refly", "findings": [{"sentence": "Burnt out."}]}
+    report = {"verdict": "refly", "findings": [{"sentence": "Saturated."}]}
     (products / "quality.json").write_text(json.dumps(report))
     return mission
 
@@ -75,7 +75,7 @@ def messages_of(path: Path) -> list[tuple[str, str, int, dict[str, Any]]]:
             jsonschema_rs.validate(own, content)
             assert set(own["properties"]) == set(content) == PUBLISHED[schema.name]
             assert own["title"] == schema.name
-            # Foxglove's own reader refuses a field that says neither.
+            # Foxglove's own reader refuses a field that has neither.
             assert all("type" in field or "oneOf" in field for field in own["properties"].values())
             stamp = content["timestamp"]
             assert stamp["sec"] * 10**9 + stamp["nsec"] == message.log_time
@@ -96,7 +96,7 @@ def test_track_thumbnails_and_messages_are_written_in_utc_in_order(mission: Miss
     assert image["format"] == "jpeg"
     logs = {c["name"]: (c["level"], c["message"], t) for n, _, t, c in found if n == "foxglove.Log"}
     assert logs["SU02"][:2] == (4, "SU02 is gone; look.")
-    assert logs["exposures"][:2] == (4, "exposure 7, line A7: complete, refly. Burnt out.")
+    assert logs["exposures"][:2] == (4, "exposure 7, line A7: complete, refly. Saturated.")
     assert logs["operator"][:2] == (2, "start: the line runs")
     # A second after the first position had arrived, in UTC.
     assert logs["SU02"][2] == pytest.approx(utc_ns(GPS_NS) + 10**9, abs=1000)

@@ -1,4 +1,4 @@
-"""What a receiver said comes out of the log byte for byte, over several runs of one flight."""
+"""A receiver's bytes come out of the log unchanged, over several runs of one flight."""
 
 from __future__ import annotations
 

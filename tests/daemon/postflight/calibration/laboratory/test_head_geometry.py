@@ -175,7 +175,7 @@ def test_the_same_head_again_has_not_changed_and_another_lens_has(
     )
     assert len(again["changes"]) == len(FREE)
     assert not [c["what"] for c in again["changes"] if c["significant"]]
-    # A lens screwed out by 0.05 mm: the calibration of before says so.
+    # A lens screwed out by 0.05 mm: the comparison with the earlier calibration reports it.
     content = json.loads((laboratory / "a" / "calibration.json").read_text())
     for q in content["quantities"]:
         if q["what"] == "df":
@@ -198,5 +198,9 @@ def test_too_few_targets_and_another_kind_of_series_are_refused(
     (tmp_path / "rig.toml").write_bytes(shipped_rigs()[RIG].read_bytes())
     run = CliRunner().invoke(app, ["head", str(tmp_path), "--out", str(tmp_path / "x")])
     assert "5 targets; 12 or more" in str(run.exception)
+    content["images"][0]["turned_deg"] = content["images"][0].pop("rotation_deg")
+    (tmp_path / "series.json").write_text(json.dumps(content))
+    run = CliRunner().invoke(app, ["head", str(tmp_path), "--out", str(tmp_path / "x")])
+    assert "turned_deg: it is now named rotation_deg; rename it" in str(run.exception)
     with pytest.raises(SeriesError, match="kind is 'head'"):
         read_series(tmp_path, kind="radiometric")
