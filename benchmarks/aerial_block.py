@@ -1,7 +1,7 @@
 """`python -m benchmarks.aerial_block`: the UltraCam L block, adjusted at full count.
 
 The emulator flies 296 frames in six lines and three cross strips and plants a systematic pattern
-of 2 um; the block is adjusted with each set of additional parameters and held against the truth.
+of 2 um; the block is adjusted with each set of additional parameters and compared with the truth.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ CELLS = (14, 10)
 
 @dataclass(frozen=True)
 class AdjustedBlock:
-    """One adjustment of a block, held against the truth."""
+    """One adjustment of a block, compared with the truth."""
 
     name: SetName
     result: Adjustment | None

@@ -1,7 +1,7 @@
 """`python -m benchmarks.boresight`: boresight, lever arm, time offset against truth, many flights.
 
 Each flight is adjusted with its control alone, its orientations are compared with the inertial
-ones, and errors are held against their covariances (the uncertainty is honest or it is not).
+ones, and errors are compared with their covariances.
 """
 
 from __future__ import annotations

@@ -35,7 +35,7 @@ from daemon.mission.store.level0_folder import read_sealed
 from processing.rig import Rig, find_rig
 
 RETAINED_EXPOSURES = 6
-"""So many exposures may lie on disk: in writing, sealed and not yet looked at, or spare."""
+"""Maximum exposures on disk: in writing, sealed and not yet checked, or spare."""
 EXPOSURE_US = 4000.0
 TICK_HZ = os.sysconf("SC_CLK_TCK")
 READY_WITHIN_S = 300.0
@@ -47,7 +47,7 @@ PIPELINE_WITHIN_S = 40.0
 class Retention:
     """Looks at sealed exposures and deletes them; a test's, never the product's.
 
-    Every exposure is looked at: each frame's number in its pixels against its record's count.
+    Every exposure is checked: each frame's number in its pixels against its record's count.
     Every `full_check_every`-th is read whole: the record's hash of each file, and the checksum that
     was in the pixels when they were made.
     """
@@ -81,7 +81,7 @@ class Retention:
 
 
 class CpuMeter:
-    """CPU seconds of processes since they were first asked for."""
+    """CPU seconds of processes since they were first measured."""
 
     def __init__(self) -> None:
         self._pids: dict[str, int] = {}
@@ -383,7 +383,7 @@ def _evaluate(
 
 
 def _file_system(folder: Path) -> str:
-    """The kind of file system a folder lies on."""
+    """The kind of file system of a folder."""
     found = subprocess.run(
         ["stat", "-f", "-c", "%T", folder], capture_output=True, text=True, timeout=10, check=False
     )
@@ -428,7 +428,7 @@ def _print(result: Mapping[str, Any]) -> None:
     if stats:
         console.print(
             f"pipeline: {stats['processed']} exposures in {stats['seconds']:.0f} s, realtime_factor "
-            f"{stats['realtime_factor']:.2f}, {stats['behind']} put off as processing behind, "
+            f"{stats['realtime_factor']:.2f}, {stats['behind']} deferred as processing behind, "
             f"{stats['not_processed']} failed; {stats['pipeline_s']['median']:.2f} s each, "
             f"{stats['trigger_to_products_s']['median']:.1f} s from trigger to products"
         )
@@ -438,7 +438,7 @@ def _print(result: Mapping[str, Any]) -> None:
     console.print(
         f"heads exposed {result['frames_exposed']} frames, sent {result['frames_sent']}, "
         f"{result['packets_resent']} of {result['packets_sent']} packets twice; "
-        f"{result['checked']} exposures looked at, {result['fully_checked']} read whole"
+        f"{result['checked']} exposures checked, {result['fully_checked']} read completely"
     )
     for problem in (*result["problems"], *(str(event) for event in result["events"])):
         console.print(f"[red]{problem}[/]")

@@ -191,7 +191,7 @@ def main() -> None:
 
 
 class Outcomes:
-    """What stitching may find of the master sensors, drawn; and what the judgement makes of it."""
+    """What stitching may find of the master sensors, drawn; and its evaluation."""
 
     def __init__(self, errors: MatchingErrors) -> None:
         self.rig = find_rig(uncertainty_consistency.RIG)
@@ -251,7 +251,7 @@ class Outcomes:
         return evaluate_master(self.rig, mosaic, temperatures)
 
     def flights(self, kind: str, *, length_px: float, flights: int) -> FlightPower:
-        """Flights judged together, each by a camera of its own; one master sensor moves."""
+        """Flights evaluated together, each with its own camera; one master sensor moves."""
         first_k, last_k, since = FLIGHTS[kind]
         found = named = named_uniquely = 0
         for k in range(flights):

@@ -2,7 +2,7 @@
 
 Fifty cameras whose mounting, places and drift are off their calibration within the tolerances of
 the rig file. Tie points are drawn where the emulator's true camera sees the same ground, with
-Gaussian noise; the turns found are held against the true ones, the common turn taken out (nine of
+Gaussian noise; the turns found are compared with the true ones, the common turn taken out (nine of
 twelve angles).
 """
 

@@ -331,7 +331,7 @@ class FastFlight:
             self._answered.add(order.number)
 
     def _truth(self, exposure: int) -> PulseTruth | None:
-        """The truth of a pulse that was given; None for a frame that no pulse asked for."""
+        """The truth of a pulse that was given; None for a frame without a pulse."""
         if exposure not in self.truth and exposure in self.clockwork.pulses:
             number = self.clockwork.pulses[exposure]
             self.truth[exposure] = PulseTruth(number, self._ordered_ns[number])

@@ -168,7 +168,7 @@ class Comparison:
 
     @property
     def _receiver_clock_is_at_fault(self) -> bool:
-        """Its time is then not the true one, and nobody on board can know."""
+        """Its time is then wrong, which is undetectable on board."""
         names = {hit.fault for hit in self.clockwork.receiver.channel.occurrences}
         return bool(names & {"clock-step", "clock-drift", "wrong-week"})
 

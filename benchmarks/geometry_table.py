@@ -1,7 +1,7 @@
 """`python -m benchmarks.geometry_table`: stitched geometry against truth.
 
 Over dC, displacement and scenes. Every exposure is rendered by the emulator (real imagery, relief,
-lens, drift, TDI, PRNU, noise, the errors a calibration has) and judged by its truth; cone
+lens, drift, TDI, PRNU, noise, the errors a calibration has) and evaluated by its truth; cone
 rotations, the displaced master sensor and the direction of its displacement are drawn for each.
 """
 
@@ -99,7 +99,7 @@ def fly(
     scenes: Iterable[int],
     cache: Path,
 ) -> list[Row]:
-    """Render and judge one exposure for every dC, displacement and scene."""
+    """Render and evaluate one exposure for every dC, displacement and scene."""
     file = shipped_rigs()[rig]
     cache.mkdir(parents=True, exist_ok=True)
     heads: RigElectronics | None = None
@@ -143,7 +143,7 @@ def evaluate(
     moved: Mapping[str, tuple[float, float]],
     size_px: float,
 ) -> Row:
-    """Take, stitch and judge one exposure."""
+    """Take, stitch and evaluate one exposure."""
     exposure = take(world, Path(), scene=scene)
     pipeline = Pipeline(world.rig, radiometry_of(heads), PipelineSettings(baselines=True))
     product = process(pipeline, heads, exposure, seed=world.settings.seed)

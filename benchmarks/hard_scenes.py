@@ -1,6 +1,6 @@
-"""`python -m benchmarks.hard_scenes`: scenes that are hard to stitch, through the pipeline, judged.
+"""`python -m benchmarks.hard_scenes`: evaluate scenes that are hard to stitch.
 
-Each is rendered for `ultracam-x-mini` at a dC of 12 K and held against the truth: the image is
+Each is rendered for `ultracam-x-mini` at a dC of 12 K and compared with the truth: the image is
 right, or its report states that it is not to be trusted.
 """
 
@@ -32,7 +32,7 @@ DC_K = 12.0
 RIGHT_PX = (0.05, 0.15)
 """Inner RMS and worst pixel of an image that counts as right."""
 INFORMATIVE_FLAGS = Flag.TIE_POINTS | Flag.SIGMA0 | Flag.UNDEREXPOSED | Flag.OVEREXPOSED | Flag.BLUR
-"""Flags that say: do not trust the geometry of this image blindly."""
+"""Flags of an image whose geometry must be checked."""
 SIGMAS = 3.0
 PICTURE_PX = 232
 PICTURE_QUALITY = 60
@@ -104,7 +104,7 @@ class Camera:
         )
 
     def evaluate(self, name: str) -> tuple[Outcome, Product]:
-        """Render, stitch and judge a scene."""
+        """Render, stitch and evaluate a scene."""
         scene = SCENES[name]
         world = World(
             world_settings(

@@ -209,7 +209,7 @@ def expose_texture(
 def drawing(results: Sequence[Found]) -> str:
     """Mean errors in x over the phase in x, every phase in y a dot; a colour for each kind."""
     chart = Chart(
-        title="Mean error of matching over sub-pixel phase (x and y alike), own pixels",
+        title="Mean error of matching over sub-pixel phase (same in x and y), own pixels",
         x_label="phase",
         y_label="mean error, px",
         x_range=(0.0, 1.0),

@@ -1,11 +1,11 @@
-"""`python -m benchmarks.mutation_sample`: do the nearest tests notice a changed decision?
+"""`python -m benchmarks.mutation_sample`: do the nearest tests detect a changed decision?
 
-Draws mutations by seed from the modules that decide truth, applies each to a copy of the tree, and
-runs the tests nearest to the module: those that import it, the one of its name first. A mutation
-that they do not notice is listed. Names in `EQUIVALENT` are changes that alter no outcome.
+Draws mutations by seed from the modules that compute results, applies each to a copy of the tree,
+and runs the tests nearest to the module: those that import it, the one of its name first. A
+mutation that they do not detect is listed. Names in `EQUIVALENT` are changes that alter no outcome.
 
-`--only` and `--skip` run a part of the same draw. With `--record` a run that was stopped goes on
-where it stood.
+`--only` and `--skip` run a part of the same draw. With `--record` a stopped run
+is resumed.
 """
 
 from __future__ import annotations
@@ -381,10 +381,10 @@ def _print(outcomes: Sequence[Outcome], seed: int, *, as_json: bool) -> None:
     share = detected / evaluated if evaluated else 1.0
     unnoticed = [asdict(o) for o in outcomes if o.outcome in ("survived", "no tests")]
     if as_json:
-        figures = {"seed": seed, "counts": counts, "noticed_share": share, "survived": unnoticed}
+        figures = {"seed": seed, "counts": counts, "detected_share": share, "survived": unnoticed}
         print(json.dumps(figures))
     else:
-        print(f"seed {seed}: {dict(counts)}; noticed {share:.1%} (goal {DETECTION_GOAL:.0%})")
+        print(f"seed {seed}: {dict(counts)}; detected {share:.1%} (goal {DETECTION_GOAL:.0%})")
     sys.exit(share < DETECTION_GOAL)
 
 

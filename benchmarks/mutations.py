@@ -154,7 +154,7 @@ def _without_annotations(node: ast.AST) -> ast.AST:
 
 
 def _token_position(between: str, token: str) -> int | None:
-    """Where a token stands in the text between two operands, remarks left out."""
+    """Offset of a token in the text between two operands, without comments."""
     plain = "\n".join(
         line.split("#")[0].ljust(len(line)) if "#" in line else line for line in between.split("\n")
     )

@@ -27,7 +27,7 @@ RIG = "ultracam-x-mini"
 SMALL_RIG = "ultracam-l-mini"
 """Four heads instead of thirteen: the same flight in half the time."""
 A_HEAD = "head"
-"""Stands for the first head of a rig."""
+"""Placeholder for the first head of a rig."""
 INTERVAL_S = 1.37
 FIRST_FAULT_S = 20.0
 MANY_EVERY_S = 30.0

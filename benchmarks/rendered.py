@@ -1,4 +1,4 @@
-"""Exposures rendered by the emulator, made into images by the pipeline, and held against the truth.
+"""Exposures rendered by the emulator, processed by the pipeline, compared with the truth.
 
 What the benchmarks of geometry, hard scenes and flags have in common. Rendering and judging are the
 emulator's and share no code with the pipeline.
@@ -135,7 +135,7 @@ def process(
 def errors_of(
     geometry: Mapping[str, NDArray[np.generic]], snapshot: Snapshot
 ) -> dict[str, float | int]:
-    """The judge's figures for the PAN image of one exposure, PAN pixels."""
+    """Evaluation figures for the PAN image of one exposure, PAN pixels."""
     return compare(geometry, snapshot.truth)["methods"].figures
 
 

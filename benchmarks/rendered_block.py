@@ -337,7 +337,7 @@ def main() -> None:
     print(
         f"{options.rig}, {f['frames']} rendered frames of {f['pixels'][0]} x {f['pixels'][1]}: "
         f"{f['image_points']} image points, {f['object_points']} object points, {f['checks']} of "
-        "them with three rays held against the truth"
+        "them with three rays compared with the truth"
     )
     for name, f in sets.items():
         rms = " ".join(f"{v * 100:.2f}" for v in f["check_rms_m"])

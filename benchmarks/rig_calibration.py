@@ -1,7 +1,7 @@
 """`python -m benchmarks.rig_calibration`: relative orientations against truth, over many blocks.
 
 The block of Jacobsen (2008), every image oriented for itself, averaged as `syntopic calibrate rig`
-does; errors are held against their covariance. `--project` writes block 1 for the command.
+does; errors are compared with their covariance. `--project` writes block 1 for the command.
 """
 
 from __future__ import annotations

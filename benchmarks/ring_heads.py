@@ -1,7 +1,7 @@
 """Emulated heads that send from a ring of three exposures made beforehand, mapped from disk.
 
 Nothing is rendered: photon noise alone costs ten seconds per full exposure. Every frame begins with
-its number, its place in the ring and a checksum, so that whoever stores it can be checked.
+its number, its place in the ring and a checksum, so that the storing process can be checked.
 """
 
 from __future__ import annotations

@@ -124,7 +124,7 @@ def main() -> None:
 
 
 def _rotated(rig_file: Path, angle_rad: float, folder: Path) -> Path:
-    """The rig with the second PAN cone turned by omega = phi = angle, calibrated and true alike."""
+    """The rig with the second PAN cone turned by omega = phi = angle, calibrated and true."""
     text = rig_file.read_text()
     head, found, tail = text.partition('name = "1"')
     tail = re.sub(

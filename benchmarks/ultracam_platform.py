@@ -3,7 +3,7 @@
 Cameras whose mounting, places and drift are off their calibration within the tolerances of the rig
 file, each flown there and back. Tie points are drawn where the emulator's true cones see the same
 ground at their own instants, with noise and bias of matching; the turns that `syntopic calibrate
-platform` finds are held against the true ones. `--calibration` compares one from rendered frames
+platform` finds are compared with the true ones. `--calibration` compares one from rendered frames
 instead.
 """
 

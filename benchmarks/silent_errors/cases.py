@@ -1,4 +1,4 @@
-"""Cases of the search: drawn by seed, run through the pipeline, and judged."""
+"""Cases of the search: drawn by seed, run through the pipeline, and evaluated."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ class Outcome:
 
 
 def run(case: Case) -> Outcome:
-    """Plant, process and judge one case."""
+    """Plant, process and evaluate one case."""
     emulated = remeasured(case.rig, case.exposure, case.seed)
     fault = FAULTS[case.kind](emulated, case.size, np.random.default_rng([case.seed, 29]))
     product = fault.emulated.process()
@@ -166,7 +166,7 @@ def named_causes(report: QualityReport) -> dict[str, frozenset[str]]:
     """Who is named as a cause, by what he is accused of; alternatives among them."""
     raised = {flag.name for flag in report.flags}
     figures = report.figures
-    # Of frames of other ground, signal and sharpness are not judged.
+    # Of frames of other ground, signal and sharpness are not evaluated.
     signal = {} if figures.get("mismatched_sensors") else figures
     found = {
         "displaced": _names(figures, "displaced_sensor", "displaced_alternatives"),

@@ -1,7 +1,8 @@
 """False alarms of healthy exposures: rendered over hard scenes, and drawn without rendering.
 
 Each light serves several exposures, each with noise and calibration errors of its own. What a scene
-itself does to an image (water without texture, haze) is expected; whoever is accused is innocent.
+itself does to an image (water without texture, haze) is expected; every other flag is a false
+alarm.
 """
 
 from __future__ import annotations

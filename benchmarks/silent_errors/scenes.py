@@ -1,4 +1,4 @@
-"""Scenes of healthy exposures that are hard to judge: water, fields, shadows, traffic, haze."""
+"""Scenes of healthy exposures that are hard to evaluate: water, fields, shadows, traffic, haze."""
 
 from __future__ import annotations
 

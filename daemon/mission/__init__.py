@@ -1,1 +1,1 @@
-"""What lies on disk and survives the plug: missions, records, logs, index, recovery."""
+"""Data on disk that survive a power cut: missions, records, logs, index, recovery."""

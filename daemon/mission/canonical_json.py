@@ -36,7 +36,7 @@ _REQUIRED: Any = object()
 
 
 class RecordError(DaemonError, ValueError):
-    """A record that cannot be used; `problems` holds one sentence for each mistake found."""
+    """A record that cannot be used; `problems` holds one message for each mistake found."""
 
     def __init__(self, problems: Sequence[str]) -> None:
         self.problems = tuple(problems)
@@ -69,7 +69,7 @@ def sha256_hex(data: bytes) -> str:
 
 
 def parse_record(data: bytes, name: str) -> dict[str, Any]:
-    """Parse one JSON object from hostile bytes; `name` stands in the error sentence.
+    """Parse one JSON object from hostile bytes; `name` is used in the error message.
 
     Raises:
         RecordError: too large, not UTF-8, not JSON, a key given twice, NaN, or not an object.
@@ -134,7 +134,7 @@ class Fields:
         if isinstance(value, bool) or not isinstance(value, int):
             self.add_problem(key, "a whole number is needed")
         elif not minimum <= value <= EXACT_INTEGER_LIMIT:
-            self.add_problem(key, f"it lies between {minimum} and 2^53")
+            self.add_problem(key, f"it must be between {minimum} and 2^53")
         else:
             return value
         return None if default is _REQUIRED else default

@@ -27,7 +27,7 @@ HEIGHT_REFERENCES = ("ellipsoid", "geoid")
 
 @dataclass(frozen=True)
 class FrameRecord:
-    """One sensor's frame as it lies on disk, and what is known of its instant.
+    """One sensor's frame as stored on disk, and what is known of its instant.
 
     `file` is a name in the folder of the exposure; `sha256` is of that whole file. Both are empty
     before the frame is stored. `mid_exposure_gps_ns` is final when the exposure is sealed.

@@ -16,7 +16,7 @@ from daemon.errors import DaemonError
 T = TypeVar("T")
 
 _UNWRITABLE_ERRNOS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS})
-"""What a disk refuses to every exposure alike: the walk ends there."""
+"""Errors of the disk that fail for every exposure: the batch ends there."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ def for_each_exposure(
 
 
 def cause_of(error: Exception) -> str:
-    """Why an exposure failed, as a sentence; errors of libraries are named by their kind."""
+    """Why an exposure failed, as a message; errors of libraries are named by their kind."""
     if isinstance(error, OSError) and error.strerror:
         where = f"{error.filename}: " if error.filename else ""
         return f"{where}{error.strerror}"

@@ -1,6 +1,6 @@
 """Files of others: opened only where they may lie, only if they are plain, and only up to a size.
 
-What the bytes mean is the business of their readers. No name that stands in a mission, a project or
+Their readers interpret the bytes. No name found in a mission, a project or
 a series reaches a library that would follow it to a network, a pipe or another folder.
 """
 
@@ -43,16 +43,16 @@ _LOCAL_FILE_SYSTEMS = frozenset(
 
 
 class ForeignFileError(DaemonError, ValueError):
-    """A file that is not opened; the sentence names it, the finding and the cure."""
+    """A file that is not opened; the message names it, the finding and the remedy."""
 
 
 def within(folder: Path, name: str, key: str) -> Path:
-    """The path of a file that a document names, if it lies in the document's folder.
+    """The path of a file that a document names, if it is in the document's folder.
 
     Args:
         folder: the folder of the document.
         name: the file as the document names it.
-        key: where in the document it stands, for the error message.
+        key: its place in the document, for the error message.
 
     Raises:
         ForeignFileError: an absolute name, one that leaves the folder upwards or by a link, a URL,
@@ -76,7 +76,7 @@ def is_on_local_disk(path: Path) -> bool:
     """Whether an absolute path can be followed without a link, a network or a device.
 
     Mount points are compared first: a name below an automount or a network file system is not even
-    looked at, since that alone would open a connection.
+    checked, since that alone would open a connection.
     """
     if not path.is_absolute() or ".." in path.parts or not str(path).isprintable():
         return False
@@ -136,7 +136,7 @@ def read_regular_file(path: Path, max_nbytes: int) -> bytes:
         nbytes = os.fstat(descriptor).st_size
         try:
             with os.fdopen(os.dup(descriptor), "rb") as file:
-                data = file.read(nbytes + 1)  # as much is set aside beforehand
+                data = file.read(nbytes + 1)  # this much is allocated beforehand
         except OSError as error:
             raise ForeignFileError(f"{path}: cannot be read ({error.strerror})") from error
     if len(data) > nbytes:

@@ -257,9 +257,9 @@ class Mission:
             ) from error
 
     def file_named(self, name: str | Path) -> Path:
-        """Where a file or folder lies that the mission's own configuration names.
+        """Path of a file or folder that the mission's own configuration names.
 
-        A mission comes from anywhere. An absolute path counts where it lies on a local disk and
+        A mission comes from anywhere. An absolute path is used where it is on a local disk and
         passes no link; of any other name only the last part, in the mission folder.
         """
         named = Path(name)
@@ -274,10 +274,10 @@ class Mission:
         )
 
     def next_number(self) -> int:
-        """A number no folder bears or bore, whole, begun or set aside; the first is 1.
+        """A number that no complete, unfinished or discarded folder has used; the first is 1.
 
         A trigger whose frames never came leaves no folder: `daemon.mission.verification.recovery`
-        knows of it from the log, and its report contains the number to continue with.
+        finds it in the log, and its report contains the number to continue with.
         """
         return 1 + max((number for number in self._used_numbers()), default=0)
 
@@ -292,7 +292,7 @@ class Mission:
             return ""
 
     def close(self) -> None:
-        """The flight ended in good order: a service started later begins a new mission."""
+        """The flight ended normally: a service started later begins a new mission."""
         marker = self.root / CURRENT_FILE
         flying = Mission.current(self.root)
         if flying is not None and flying.id == self.id:
@@ -307,7 +307,7 @@ class Mission:
     def held(self) -> Iterator[None]:
         """Keep other writers out of the mission until the block ends.
 
-        Whoever changes anything in a mission holds it; whoever only reads does not.
+        Every writer of a mission holds this lock; readers do not.
 
         Raises:
             MissionError: another process holds it; the sentence names it.

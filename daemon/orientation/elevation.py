@@ -42,7 +42,7 @@ _GDAL_SINGLE_FILE = {
 
 
 class ElevationError(DaemonError):
-    """A height model that cannot be used; the sentence names file, finding and cure."""
+    """A height model that cannot be used; the message names file, finding and remedy."""
 
 
 def read_elevation(path: Path, georeference: Georeference) -> HeightModel:
@@ -191,6 +191,6 @@ def _checked(path: Path, model: HeightModel) -> HeightModel:
     if not (HEIGHT_LIMITS_M[0] <= minimum and maximum <= HEIGHT_LIMITS_M[1]):
         raise ElevationError(
             f"{path}: heights from {minimum:g} to {maximum:g} m; the earth has none such: declare the "
-            "value that stands for no height (gdal_edit.py -a_nodata)"
+            "nodata value (gdal_edit.py -a_nodata)"
         )
     return model

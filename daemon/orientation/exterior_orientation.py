@@ -43,7 +43,7 @@ MOUNT_FILE_MAX_BYTES = 1_000_000
 
 @dataclass(frozen=True)
 class ExteriorOrientation:
-    """Where one cone stood and looked at one instant.
+    """Position and attitude of one cone at one instant.
 
     Grid coordinates in metres; `rotation` (3, 3) is grid_from_camera; latitude, longitude and
     `height_m` (above the ellipsoid) are of the projection centre. `is_virtual` marks the cone whose
@@ -236,7 +236,7 @@ def _oriented(
 
 
 def _image_cone(rig: Rig) -> Cone:
-    """The master cone; of converging heads one that stands and looks as the virtual camera."""
+    """The master cone; of converging heads one with the pose of the virtual camera."""
     if rig.master_cone is not None:
         return rig.cone(rig.master_cone)
     return dataclasses.replace(

@@ -160,7 +160,7 @@ def stac_items(
     """A STAC ItemCollection of the stitched images there are, with links to their files.
 
     Args:
-        base_href: from where the collection lies to the mission folder.
+        base_href: from the collection's folder to the mission folder.
     """
     items = []
     for eo in oriented:

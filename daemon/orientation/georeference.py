@@ -1,4 +1,4 @@
-"""From WGS 84 to the coordinate system a customer asks for, by PROJ, and never by a guess.
+"""From WGS 84 to the requested coordinate system, by PROJ, never by a guess.
 
 What PROJ can only do roughly, because a grid is not installed, is an error that names the grid.
 """
@@ -90,7 +90,7 @@ class Georeference:
         """Transform a position, height above the ellipsoid.
 
         Raises:
-            GeoreferenceError: it lies outside the area of the system.
+            GeoreferenceError: it is outside the area of the system.
         """
         north_of, south_of = latitude_deg + STEP_DEG, latitude_deg - STEP_DEG
         east, north, height = self._transform(longitude_deg, latitude_deg, height_m)
@@ -118,7 +118,7 @@ class Georeference:
         x, y, z = self._transformer.transform(longitude_deg, latitude_deg, height_m)
         if not all(map(math.isfinite, (x, y, z))):
             raise GeoreferenceError(
-                f"{latitude_deg:.6f} N {longitude_deg:.6f} E lies outside the area of {self.name}"
+                f"{latitude_deg:.6f} N {longitude_deg:.6f} E is outside the area of {self.name}"
             )
         return float(x), float(y), float(z)
 

@@ -29,7 +29,7 @@ class GroundModel:
 
     Args:
         elevation: the model's file, in `crs`.
-        ground_height_m: above the ellipsoid, as planned: where the footprint is first looked for.
+        ground_height_m: above the ellipsoid, as planned: where the search for the footprint starts.
 
     Raises:
         ElevationError, GeoreferenceError: a model or a coordinate system that cannot be used.

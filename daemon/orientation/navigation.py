@@ -61,7 +61,7 @@ class Track:
         return self._samples[-1] if self._samples else None
 
     def add(self, sample: NavSample) -> None:
-        """Note a sample; one without a position is of no use."""
+        """Note a sample; one without a position is ignored."""
         if sample.position is None:
             return
         if self._samples and sample.gps_ns <= self._samples[-1].gps_ns:
@@ -122,7 +122,7 @@ def navigation_at(samples: Iterable[NavSample], gps_ns: int) -> NavigationRecord
     """Navigation at an instant from the best of the samples near it; None without any.
 
     Samples with a height are preferred to those without: two of them around the instant, then any
-    two, then the nearest one. What lies further than two seconds apart, or away, is not used. A
+    two, then the nearest one. Samples further than two seconds apart, or away, are not used. A
     height that the chosen ones do not have is carried on from the nearest sample with one.
 
     Args:
@@ -443,7 +443,7 @@ def _attitude_between(a: NavSample, b: NavSample, u: float) -> Attitude:
 
 
 def _angle_between(a: float | None, b: float | None, u: float) -> float | None:
-    """An angle by itself, where not all three are known at both ends; None where it is not."""
+    """A single angle, where not all three are known at both ends; None where it is not."""
     if a is None or b is None:
         return None
     return (a + u * math.remainder(b - a, math.tau)) % math.tau

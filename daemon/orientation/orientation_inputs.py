@@ -1,6 +1,6 @@
 """What the exposures of a mission are oriented with: camera, mount, trajectory, coordinate system.
 
-What is not asked for is that of the flight; how one exposure is oriented is in
+Defaults are those of the flight; how one exposure is oriented is in
 `daemon.orientation.exterior_orientation`.
 """
 

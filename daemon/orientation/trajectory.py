@@ -39,12 +39,12 @@ CSV_COLUMNS = ("latitude_deg", "longitude_deg", "height_m", "roll_deg", "pitch_d
 
 
 class TrajectoryError(DaemonError):
-    """A trajectory that cannot be used; the sentence names file, place and what would be right."""
+    """A trajectory that cannot be used; the message names file, place and what would be right."""
 
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Samples in the order of time, made when they are asked for: an SBET holds a million.
+    """Samples in the order of time, created on demand: an SBET holds a million.
 
     `name` distinguishes versions: "in-flight", or the file's name and the beginning of its hash.
     `instants_ns` is strictly increasing, GPS time, (n,) int64; `sample` gives the i-th.

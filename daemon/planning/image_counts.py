@@ -24,13 +24,13 @@ Relief: TypeAlias = Callable[[Array], Array]
 longitude, degrees."""
 
 ACROSS_MIN_POINTS = 9
-"""At least so many points across a strip are looked at."""
+"""Minimum number of points across a strip."""
 MAX_POINTS_PER_IMAGE = 256
 """Points are so many to the length of an image, not closer than `STEP_M`."""
 MIN_POINTS_PER_IMAGE = 16
 """No fewer points than these to the length of an image, however small it is."""
 STEP_M = 2.0
-"""How finely coverage is looked at; a hole that is narrower is none."""
+"""Resolution of coverage; a narrower hole is ignored."""
 
 _EDGE = 1e-9
 _CORNERS = np.array([[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]])

@@ -1,4 +1,4 @@
-"""A flight plan: lines with their ids, and what the project asks of the images.
+"""A flight plan: lines with their ids, and the project's requirements on images.
 
 Places are WGS 84 in degrees. A `Plane` lays a project flat, good to decimetres over some
 kilometres.
@@ -38,10 +38,10 @@ class PlannedLine:
 
 @dataclass(frozen=True)
 class Specification:
-    """What a project asks for.
+    """Requirements of a project.
 
     Overlaps are shares of the image's extent along and across the line, as planned; the least that
-    is taken is `overlap_tolerance` below them. An exposure that breaks what is asked for has to be
+    is taken is `overlap_tolerance` below them. An exposure that violates a requirement has to be
     flown again, and does not count for the advisor. `gsd_m` and `sun_deg` (elevation) are asked for
     only where they are given.
     """

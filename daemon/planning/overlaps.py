@@ -27,7 +27,7 @@ SAMPLES = 41
 """Of a footprint, along and across: overlaps are good to a few hundredths."""
 
 BEFORE = 3
-"""So many numbers back the image before on the line is looked for."""
+"""Search depth, in numbers, for the previous image on the line."""
 
 NEIGHBOUR_WIDTHS = (0.1, 1.3)
 """Across-track distance of an image of a neighbouring line, in widths of this image."""

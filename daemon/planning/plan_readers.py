@@ -31,7 +31,7 @@ BEND_RAD = math.radians(5.0)
 
 
 class PlanError(DaemonError):
-    """A plan that cannot be used; the sentence names file, place and what would be right."""
+    """A plan that cannot be used; the message names file, place and what would be right."""
 
 
 def read_plan(path: Path) -> Plan:

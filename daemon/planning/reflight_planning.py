@@ -405,7 +405,7 @@ class _LineCoverage:
 
 
 def _within(centres_m: Array, half_m: float, low_m: float, high_m: float) -> Array:
-    """How much of cells lies between two limits, such as the ends of a line, metres."""
+    """Share of cells between two limits, such as the ends of a line, metres."""
     inside: Array = np.minimum(centres_m + half_m, high_m) - np.maximum(centres_m - half_m, low_m)
     return np.maximum(inside, 0.0)
 

@@ -182,7 +182,7 @@ def places_m(
 ) -> Sequence[float]:
     """Where along a line exposures are planned, metres in flight direction, rising.
 
-    The last one by distance lies at the end of the line or behind it, so that the end is seen as
+    The last one by distance is at the end of the line or behind it, so that the end is seen as
     often as the rest.
     """
     step_m = line.distance_m or distance_m

@@ -33,7 +33,7 @@ DISPLACEMENTS_FILE = "export/displacements.json"
 
 
 def write_displacements(mission: Path) -> Mapping[str, Any]:
-    """Judge the flight and write `export/displacements.json`.
+    """Evaluate the flight and write `export/displacements.json`.
 
     Returns:
         The content of the file: `sentences`, one for each step; `steps`, see
@@ -56,15 +56,18 @@ def flight_displacements(mission: Path) -> dict[str, Any]:
 def without_steps(exposures: Mapping[str, int]) -> str:
     """Message for a flight without steps, by evaluated exposures of each cone."""
     if not exposures:
-        return "Not judged: it takes three sensors in the master cone, or two in another PAN cone."
+        return (
+            "Not evaluated: it takes three sensors in the master cone, or two in another PAN cone."
+        )
     minimum = 2 * FlightSettings().min_exposures
     too_few = [cone for cone, count in exposures.items() if count < minimum]
     if len(too_few) == len(exposures):
-        return f"Not judged: whether a sensor moved shows in {minimum} exposures of a cone or more."
-    if too_few:
         return (
-            f"No sensor is seen to move; not judged: cone {', '.join(too_few)} (too few exposures)."
+            f"Not evaluated: whether a sensor moved shows in {minimum} exposures of a cone or more."
         )
+    if too_few:
+        cones = ", ".join(too_few)
+        return f"No sensor is seen to move; not evaluated: cone {cones} (too few exposures)."
     return "No sensor is seen to move."
 
 

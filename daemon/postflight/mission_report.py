@@ -192,7 +192,7 @@ def _temperature_series(
 
 
 def _level_steps(exposures: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Bands whose level changed alone from one exposure to the next, one sentence each."""
+    """Bands whose level changed alone from one exposure to the next, one message each."""
     levels = {exposure["number"]: levels_of(exposure["figures"]) for exposure in exposures}
     return [step.sentence for step in level_steps(levels)]
 

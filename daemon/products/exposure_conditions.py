@@ -96,7 +96,7 @@ def capture_flags(exposure: Exposure, rig: Rig) -> Flag:
 
 
 def _calibration_flag(exposure: Exposure, rig: Rig) -> Flag:
-    """Whether the calibration was too old; one without a known time is not judged."""
+    """Whether the calibration was too old; one without a known time is not evaluated."""
     if exposure.mark_gps_ns is None:
         return Flag(0)
     flown = GPS_EPOCH + datetime.timedelta(seconds=exposure.mark_gps_ns // 1_000_000_000)

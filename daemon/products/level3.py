@@ -77,7 +77,7 @@ class MissionTones:
 
 
 def level3_root(mission: Mission) -> Path:
-    """Where Level-3 lies."""
+    """Folder of Level-3."""
     return mission.path / "L3"
 
 

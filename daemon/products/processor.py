@@ -79,7 +79,7 @@ class Processor:
         *,
         frames_read: FramesRead = None,
     ) -> ProductFiles:
-        """Make the images of one exposure and judge it."""
+        """Make the images of one exposure and evaluate it."""
         return self.build(self.pipeline, exposure, frames, conditions, frames_read)
 
 
@@ -110,7 +110,7 @@ def build_processor(
 
     Args:
         radiometry: folder of calibrations; sensors without one are taken as ideal.
-        plan_file: flight plan with the requirements exposures are judged by.
+        plan_file: flight plan with the requirements exposures are evaluated by.
         own_radiance: folder of radiance calibrations where `radiometry` is None.
 
     Raises:
@@ -190,7 +190,7 @@ def histograms_of(rig: Rig, frames: Mapping[str, NDArray[np.uint16]]) -> dict[st
 
 
 def quality_requirements_of(plan_file: Path | None) -> QualityRequirements:
-    """What a flight plan asks of every exposure; nothing where there is none."""
+    """Requirements of a flight plan on every exposure; none without a plan."""
     if plan_file is None:
         return QualityRequirements()
     wanted = read_plan(plan_file).specification

@@ -1,7 +1,7 @@
 """The index of a mission: SQLite in WAL mode, always derivable from the records on disk.
 
 It answers questions quickly and is never the only place where a fact is written. Bringing it
-together with the disk after a crash is the business of `daemon.mission.verification.recovery`.
+together with the disk after a crash is done in `daemon.mission.verification.recovery`.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ class CatalogError(DaemonError):
 
 
 class CatalogBusyError(DaemonError):
-    """An index that is well but held by another process; nothing is to be repaired."""
+    """An intact index held by another process; nothing is to be repaired."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """What the index knows of an exposure. `state` is "stored" until it is sealed."""
+    """Index entry of an exposure. `state` is "stored" until it is sealed."""
 
     number: int
     state: str
@@ -115,7 +115,8 @@ class Catalog:
 
         Args:
             path: the index.
-            is_immutable: nobody writes it, so that no files are needed in its folder to share it.
+            is_immutable: no process writes it, so that no files are needed in its folder to share
+                it.
 
         Raises:
             CatalogError: not there, damaged, or of a newer schema version.
@@ -135,7 +136,8 @@ class Catalog:
             try:
                 version = connection.execute("PRAGMA user_version").fetchone()[0]
             except sqlite3.OperationalError:
-                # WAL cannot be joined where its files cannot be made; nobody writes there either.
+                # WAL cannot be joined where its files cannot be made; no process writes there
+                # either.
                 connection.close()
                 connection = sqlite3.connect(
                     f"{address}?immutable=1", uri=True, check_same_thread=False
@@ -272,7 +274,7 @@ class Catalog:
         }
 
     def events(self) -> list[tuple[str, str, str]]:
-        """Source, name and sentence of all events, in order.
+        """Source, name and message of all events, in order.
 
         Raises:
             CatalogError: damaged.

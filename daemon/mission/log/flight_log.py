@@ -180,7 +180,7 @@ class FlightLog:
         self._synced_at = self._stream.offset
 
     def close(self) -> None:
-        """End the file in good order; may be called twice."""
+        """Close the file properly; may be called twice."""
         if self._stream.is_closed:
             return
         try:
@@ -210,7 +210,7 @@ class LogReader:
     """Iterates over the messages of a log, up to its torn end.
 
     After the iteration `cut_nbytes` is how many bytes at the end could not be read,
-    `is_complete` whether the log was closed in good order, and `bad_checkpoints` how many
+    `is_complete` whether the log was closed properly, and `bad_checkpoints` how many
     checkpoints disagree with what is before them. `about` is the log's description of itself, known
     as soon as the first message comes.
     """

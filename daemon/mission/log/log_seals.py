@@ -1,7 +1,7 @@
 """Which flight logs are final, and with what content; and the line that ends a run.
 
 A log ends in the middle when the service is killed, so its end alone proves nothing. It is sealed
-in `chain.jsonl` when the flight ends in good order or when the next run begins; what is cut off
+in `chain.jsonl` when the flight ends normally or when the next run begins; what is cut off
 later is noticed. Missions of format 1 were sealed in `log/seals.json`, which is still read.
 """
 

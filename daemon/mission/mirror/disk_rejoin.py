@@ -1,6 +1,6 @@
-"""A disk that is not in use: looked for, and brought up to date in the background.
+"""A disk that is not in use: polled, and brought up to date in the background.
 
-It gives way to whatever is being stored. When it has everything, it reports at which change that
+Storing has priority over it. When it has everything, it reports at which change that
 was; `daemon.mission.mirror.mirrored` lets it join.
 """
 
@@ -31,7 +31,7 @@ NICE = 19
 class RejoinSettings:
     """When a disk that is not in use may return.
 
-    It is looked for every `poll_s`, after each failure half as often, down to every `retry_max_s`;
+    It is polled every `poll_s`, after each failure half as often, down to every `retry_max_s`;
     it needs `required_nbytes` free, in addition to the missing files.
     """
 

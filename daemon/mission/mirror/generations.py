@@ -23,7 +23,7 @@ STATE_FORMAT = 1
 class Generation:
     """A period in which the same disks held the mission.
 
-    `token` is random: two disks that went apart may count alike, but never have the same token.
+    `token` is random: two diverged disks may have the same count, but never the same token.
     `disks` are ids (`daemon.mission.store.disk_identity`), `first` is the number of the first
     exposure that that may be missing on a disk dropped at the beginning of this generation.
     """

@@ -186,7 +186,7 @@ def _capture_of(disk: Disk, mission: Mission, number: int) -> bytes | None:
 
 
 def _copy_missing_tail(leading: Mission, other: Mission, findings: list[str]) -> list[str]:
-    """Take over what only the other copy of the same generation has; sentences say what."""
+    """Take over what only the other copy of the same generation has; returns messages."""
     try:
         ours, theirs = read_generations(leading.path), read_generations(other.path)
         if not ours or not theirs or ours[-1].token != theirs[-1].token:

@@ -189,7 +189,7 @@ class MirroredStorage:
         copy.executor.submit(lambda: copy.writer.note_products(number, files, verdict))
 
     def write_note(self, name: str, data: bytes) -> None:
-        """Put a small file under a name below the root of every disk in use; nobody waits for it.
+        """Put a small file under a name below the root of every disk in use; asynchronous.
 
         Args:
             name: relative to the root, such as "unhandled-faults.json".
@@ -214,7 +214,7 @@ class MirroredStorage:
                 self._join(inactive)
 
     def release(self, label: str, reason: str) -> None:
-        """Take a disk out of use in good order, so that it can be unmounted.
+        """Release a disk, so that it can be unmounted.
 
         Raises:
             DaemonError: it is not in use, or it is the only one.
@@ -228,7 +228,7 @@ class MirroredStorage:
         self._drop(copy, reason, is_fault=False)
 
     def drop(self, label: str, reason: str) -> None:
-        """Drop a disk of which others know that it is of no use any more; never the only one."""
+        """Drop a disk that failed elsewhere; never the only one."""
         for copy in list(self._copies):
             if copy.disk.label == label:
                 self._drop(copy, reason)
@@ -245,7 +245,7 @@ class MirroredStorage:
         inactive.accept()
 
     def end_mission(self) -> None:
-        """Nobody is to go on with the mission once this is closed."""
+        """The mission may not be used once this is closed."""
         self._ends_mission = True
 
     def close(self) -> None:
@@ -332,7 +332,7 @@ class MirroredStorage:
         now_s = time.monotonic()
         elapsed_s, self._polled_s = now_s - self._polled_s, now_s
         waited_s = {copy: copy.executor.update_waited(elapsed_s) for copy in self._copies}
-        # Where all of them wait, the machine is busy or they share a cause: dropping helps nobody.
+        # Where all of them wait, the machine is busy or they share a cause: dropping does not help.
         if min(waited_s.values()) > self._stall_s / 2:
             return
         for copy, waited in waited_s.items():

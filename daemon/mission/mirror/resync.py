@@ -1,7 +1,7 @@
 """Bring one copy of a mission up to date from the copy that leads.
 
 Exposures, records, logs and what else belongs to the mission are copied; what differs on the copy
-behind is set aside, never removed. Products (`L2`, `export`) are not mirrored.
+behind is moved to `.superseded`, never removed. Products (`L2`, `export`) are not mirrored.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class Resync:
             open_log: name of the log that is being written; copied as far as it is.
 
         Returns:
-            How many exposures and files were copied or set aside.
+            How many exposures and files were copied or superseded.
 
         Raises:
             MirrorError: the target holds another mission, or went on without the source.

@@ -23,7 +23,7 @@ T = TypeVar("T")
 
 
 class DroppedError(OSError):
-    """The disk was dropped while work on it was under way; the work is of no use any more."""
+    """The disk was dropped while work on it was running; the result is discarded."""
 
     def __init__(self, disk: Disk) -> None:
         super().__init__(errno.ENODEV, f"disk {disk} was dropped")
@@ -137,6 +137,6 @@ def _outcome(work: Callable[[], object], future: Future[object]) -> Callable[[],
     """Do the work; returns the call that sets the future's result."""
     try:
         result = work()
-    except Exception as error:  # noqa: BLE001 - it belongs to whoever waits for the result
+    except Exception as error:  # noqa: BLE001 - it belongs to the waiting caller
         return partial(future.set_exception, error)
     return partial(future.set_result, result)

@@ -1,4 +1,4 @@
-"""Which disk lies under a folder: an id in a file at its root, and whether it takes bytes.
+"""The disk under a folder: an id in a file at its root, and whether it takes bytes.
 
 An empty mount point looks like an empty disk; the id distinguishes them.
 """

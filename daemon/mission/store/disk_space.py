@@ -50,7 +50,7 @@ class DiskSpaceMonitor:
         limits: the reserve, and from how many exposures on it warns.
         exposure_nbytes: the frames of one exposure.
         path: on the disk.
-        free_bytes: asks the disk; for tests.
+        free_bytes: queries the disk; replaced in tests.
     """
 
     def __init__(

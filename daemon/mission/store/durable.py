@@ -173,7 +173,7 @@ def _begin_part(path: Path, mode: int | None) -> tuple[Path, int]:
         except BlockingIOError:
             is_ours = False
         except OSError:
-            is_ours = True  # a file system without locks: nobody removes it either
+            is_ours = True  # a file system without locks: no process removes it either
         if is_ours:
             return part, descriptor
         os.close(descriptor)

@@ -206,7 +206,7 @@ class FileTree:
 
     @contextmanager
     def reading(self, name: str, *, direct: bool = False) -> Iterator[int]:
-        """A descriptor of a plain file; with O_DIRECT, where asked for and possible."""
+        """A descriptor of a plain file; with O_DIRECT, where requested and possible."""
         folder, _, last = name.rpartition("/")
         with self._folder(folder) as parent:
             try:

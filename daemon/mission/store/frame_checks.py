@@ -27,7 +27,7 @@ _BAYER |= {f"S{pattern}": pattern for pattern in _BAYER.values()}  # as V4L2 cal
 def mismatches(
     number: int, record: FrameRecord, sensor: Sensor, frame: DecodedFrame
 ) -> Iterator[str]:
-    """What of a frame does not fit its record or its rig, one sentence each.
+    """What of a frame does not fit its record or its rig, one message each.
 
     Args:
         number: of the exposure.
@@ -52,7 +52,7 @@ def mismatches(
 
 
 def setting_problems(record: FrameRecord, sensor: Sensor) -> Iterator[str]:
-    """Exposure times and TDI counts that cannot be, one sentence each."""
+    """Exposure times and TDI counts that are impossible, one message each."""
     time_us = record.exposure_time_us
     if time_us is not None and not 0.0 < time_us <= EXPOSURE_TIME_MAX_US:
         yield (

@@ -158,7 +158,7 @@ def _problems(
 
 
 def read_health(root: Path, report: Path = REPORT) -> DiskHealth | None:
-    """The health of the disk under a folder; None where nobody reads it.
+    """The health of the disk under a folder; None where it is not read.
 
     Several physical disks under one folder (RAID, LVM) count as one: the worst of each.
     """

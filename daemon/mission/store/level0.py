@@ -1,7 +1,7 @@
 """Raster files as this program writes them: uncompressed TIFF whose pixels are one block.
 
 Writing needs no library and no copy of the pixels; reading takes any 16-bit TIFF that tifffile
-reads. Which files belong to an exposure is the business of `daemon.mission.store.store`.
+reads. The files of an exposure are defined in `daemon.mission.store.store`.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _SOFTWARE = b"Syntopic\0"
 
 
 class RasterError(DaemonError, ValueError):
-    """Pixels or a TIFF that cannot be taken; the sentence names file, finding and cure."""
+    """Pixels or a TIFF that cannot be taken; the message names file, finding and remedy."""
 
 
 def tiff_parts(

@@ -35,7 +35,7 @@ _BLOCK_BYTES = 4 << 20
 
 @dataclass(frozen=True)
 class SealedRecord:
-    """An exposure's record as it lies on disk, with the hash of its bytes."""
+    """An exposure's record as stored on disk, with the hash of its bytes."""
 
     exposure: Exposure
     sha256: str

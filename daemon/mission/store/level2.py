@@ -193,7 +193,7 @@ def verdict_of(folder: Path) -> str | None:
 
 
 def recover_level2(mission: Mission) -> list[str]:
-    """Clear what an interrupted `write_level2` left; sentences say what was done.
+    """Clear what an interrupted `write_level2` left; returns messages about what was done.
 
     Args:
         mission: it must be held by the caller (`Mission.held`).

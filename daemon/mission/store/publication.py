@@ -1,4 +1,4 @@
-"""Product folders appear whole: a complete set of files takes the place of an earlier one at once.
+"""Publication of product folders: a complete set of files replaces an earlier one atomically.
 
 A new set is written into a part folder of its own name, which its writer holds by a lock, so that
 two writers cannot mix their files and what a dead writer left can be recognised. Publication
@@ -132,7 +132,7 @@ def _locked(folder: Path) -> int | None:
 
 
 def _remove_abandoned(entry: Path) -> bool:
-    """Remove what no living writer holds; nobody can begin to hold it while it is removed."""
+    """Remove what no live writer holds; no writer can begin to hold it during removal."""
     try:
         lock = _locked(entry)
     except NotADirectoryError:

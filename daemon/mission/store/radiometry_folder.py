@@ -1,4 +1,4 @@
-"""Radiometric calibrations as they lie in a folder: `<sensor>.npz`, read when asked for.
+"""Radiometric calibrations of a folder: `<sensor>.npz`, read on demand.
 
 As floating-point maps they are four times what a pipeline keeps of them; nothing is kept here.
 """
@@ -16,7 +16,7 @@ class RadiometryFolder(Mapping[str, RadiometricCalibration]):
     """By sensor name; a sensor without a file is not in it.
 
     Raises:
-        CalibrationError: when a file that is asked for cannot be read.
+        CalibrationError: when a requested file cannot be read.
     """
 
     def __init__(self, folder: Path, rig: Rig) -> None:

@@ -65,7 +65,7 @@ class StoreError(DaemonError):
 class Level0Writer:
     """Makes exposures durable. One per mission, after recovery has seen the disk.
 
-    Frames are written and hashed by `threads` threads, so that hashing hides behind the disk.
+    Frames are written and hashed by `threads` threads, so that hashing runs during disk writes.
     `step` is called after each file and before anything gets its final name; what it raises as
     OSError ends the work as a refusal of the disk does.
     """

@@ -1,7 +1,7 @@
 """The chain over exposure records: each quotes the hash of the one sealed before it.
 
-Pure functions: from hashes they find where the chain is broken. An altered, removed or slipped-in
-record cannot hide, except as the very last, which only the index knows.
+Pure functions: from hashes they find where the chain is broken. An altered, removed or inserted
+record is detected; the last record needs the index.
 """
 
 from __future__ import annotations

@@ -106,7 +106,7 @@ def first_line(genesis_sha256: str, *, rebuilt_utc: str = "") -> bytes:
 
     Args:
         genesis_sha256: hash of mission.json.
-        rebuilt_utc: given where it takes the place of a file that was lost.
+        rebuilt_utc: given where it replaces a lost file.
     """
     entry: dict[str, Any] = {
         "kind": "begun",

@@ -1,4 +1,4 @@
-"""What lies in a mission folder, whatever its name and kind; and why some of it has no hash.
+"""Every file in a mission folder, whatever its name and kind; and why some have no hash.
 
 Walking only: what the files should contain is compared in
 `daemon.mission.verification.verification`.
@@ -92,7 +92,7 @@ def take_inventory(root: Path) -> Inventory:
 
 
 def is_unfinished(path: str) -> bool:
-    """Whether a path is, or lies in, something that does not have its final name yet."""
+    """Whether a path is, or is in, something that does not have its final name yet."""
     return any(part.endswith((durable.PART_SUFFIX, ".replaced")) for part in path.split("/"))
 
 

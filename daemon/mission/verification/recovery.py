@@ -44,7 +44,7 @@ Complete = Callable[[CaptureRecord, Sequence[LoggedRecord]], Exposure]
 
 @dataclass(frozen=True)
 class RecoveryReport:
-    """What recovery found and did. `problems` are what it could not put right, `noticed` what needs
+    """Result of recovery. `problems` are what it could not repair, `notices` what needs
     no action and is reported at every start.
 
     `sealed` and `lost` are the numbers it sealed just now; `finalized` are all sealed records by
@@ -69,7 +69,7 @@ class RecoveryReport:
 
 
 def recover(mission: Mission, complete: Complete, *, software: str = "") -> RecoveryReport:
-    """Bring a mission in order; to be run before anything else writes into it.
+    """Recover a mission; to be run before anything else writes into it.
 
     Args:
         mission: it must be held by the caller (`Mission.held`).
@@ -145,7 +145,7 @@ class _Recovery:
             catalog.add_event("recovery", name, sentence, is_fault=is_fault, mono_ns=0, boot_id="")
 
     def _parts(self) -> None:
-        """Folders without their final name: whole ones get it, the rest is set aside."""
+        """Folders without their final name: complete ones get it, the others are discarded."""
         for part in sorted(self.mission.level0_root.glob(f"*{durable.PART_SUFFIX}")):
             final = part.with_name(part.name.removesuffix(durable.PART_SUFFIX))
             if not final.exists() and _is_complete(part):
@@ -170,7 +170,7 @@ class _Recovery:
         durable.sync_directory(part.parent)
         self.done.append(
             f"exposure {name}: was being written and never called stored; "
-            f"what there is lies in L0/{DISCARDED}/{target.name}"
+            f"its files are in L0/{DISCARDED}/{target.name}"
         )
 
     def _read_folders(self) -> tuple[dict[int, SealedRecord], dict[int, CaptureRecord]]:

@@ -3,7 +3,7 @@
 Reads only. Everything is compared with a hash, or listed as not covered with the reason. While
 the mission is flown, index, chain file and disk are read in this order, the reverse of the order in
 which they are written: what an earlier one names must be in each later one, whatever is added
-meanwhile, so nothing has to be waited for or looked at twice. Putting things right is in
+meanwhile, so nothing has to be waited for or checked twice. Repairing is in
 `daemon.mission.verification.recovery`.
 """
 
@@ -57,7 +57,7 @@ class CoveredFiles:
 
 @dataclass(frozen=True)
 class VerifyReport:
-    """What was checked, what was not, and one sentence for everything that is wrong.
+    """What was checked, what was not, and one message for every problem.
 
     `state` is a key of `STATES`; `remarks` are limits of what could be noticed.
     """
@@ -389,7 +389,7 @@ class _Verification:
 def _read_index(mission: Mission, *, is_flown: bool) -> tuple[dict[int, IndexedExposure], str]:
     """Rows by exposure, as of one instant; and what is wrong with the index.
 
-    Without its shared memory SQLite reads the file as it lies, which another process may be
+    Without its shared memory SQLite reads the file as it is, which another process may be
     writing: such a finding counts when it is the same in every attempt.
     """
     error_text = ""

@@ -1,6 +1,6 @@
-"""One exposure's folder held against what chain file, index and its own record say of it.
+"""One exposure's folder checked against chain file, index and its own record.
 
-Every exposure is judged by itself: a damaged one does not keep others from being checked.
+Every exposure is checked on its own: a damaged one does not block others.
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ _MAX_PROBLEMS = 30
 
 
 class ProjectError(DaemonError, ValueError):
-    """A project that cannot be read; `problems` holds one sentence for each mistake found."""
+    """A project that cannot be read; `problems` holds one message for each mistake found."""
 
     def __init__(self, problems: Sequence[str]) -> None:
         self.problems = tuple(problems)

@@ -64,7 +64,7 @@ class CheckPoints:
 
 @dataclass(frozen=True)
 class Project:
-    """What is adjusted, how, and what it is held against."""
+    """What is adjusted, how, and its check points."""
 
     name: str
     file: ProjectFile
@@ -242,7 +242,7 @@ class _TableIndex:
                     table.add_problem(
                         table.lines[k], "a sigma is negative; 0 holds, empty leaves free"
                     )
-            # A coordinate that is not known is no control, whatever sigma stands there.
+            # A coordinate that is not known is no control, whatever sigma it has.
             sigma[: len(given)] = np.where(np.isfinite(given), sigma[: len(given)], np.nan)
         return Points(tuple(self.point_names), xyz, sigma, with_coordinates)
 

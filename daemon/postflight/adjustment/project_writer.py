@@ -39,7 +39,7 @@ def write_project(
     """Write a project that `read_project` reads back as it was.
 
     Args:
-        folder: made, if need be; a project that lies there already is not overwritten.
+        folder: made, if need be; an existing project is not overwritten.
         file: its settings, cameras and heads.
         network: observations and starting values.
         checks: independent coordinates.

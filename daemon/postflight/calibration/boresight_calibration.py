@@ -1,7 +1,7 @@
 """`syntopic calibrate boresight`: from a project or mission with its trajectory to a dated mount.
 
 The project is adjusted with its control alone: antenna positions and attitudes in it are left out,
-because they are what is to be judged. The mathematics is in `processing.calibration.boresight`.
+because they are what is evaluated. The mathematics is in `processing.calibration.boresight`.
 """
 
 from __future__ import annotations
@@ -124,7 +124,7 @@ def inertial_table(
     if not rows:
         raise BoresightError(
             f"{path}: none of its exposures ({', '.join(names[:3])} ...) is in the project "
-            f"({', '.join(list(stations)[:3])} ...); both are named alike"
+            f"({', '.join(list(stations)[:3])} ...); both use the same names"
         )
     columns = (*places, *VELOCITY, *ANGLES, *RATES)
     values = np.array([table.numbers(c, 0.0 if c in RATES else math.nan) for c in columns]).T[rows]
@@ -383,7 +383,7 @@ def _correlated(found: BoresightCalibration) -> list[str]:
 
 
 def _attitude_of_station(network: Network) -> dict[int, int]:
-    """The attitude that stands for an exposure: the shared one, else that of its first image."""
+    """The attitude that represents an exposure: the shared one, else that of its first image."""
     found: dict[int, int] = {}
     for station, attitude in zip(network.images.station, network.images.attitude, strict=True):
         found.setdefault(int(station), int(attitude))

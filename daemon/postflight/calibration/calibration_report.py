@@ -2,7 +2,7 @@
 
 A calibration is never overwritten: its folder is new, complete when it has its name, and holds
 `calibration.json` (what programs read, the next calibration's "previous") and `report.html`
-(self-contained). What was measured and how it was adjusted is the business of each calibration.
+(self-contained). Measurement and adjustment are in each calibration.
 """
 
 from __future__ import annotations
@@ -163,7 +163,7 @@ def _combined_sigma(a: float | None, b: float | None) -> float | None:
 
 
 def serial_warnings(previous: Previous, serials: Mapping[str, str]) -> list[str]:
-    """A sentence for every part whose serial number is another than it was."""
+    """A message for every part whose serial number changed."""
     return [
         f"{name} is now {serial!r}, the calibration {previous.calibration_id} was of "
         f"{previous.serials[name]!r}: differences are between two parts, not a change of one"
@@ -294,7 +294,7 @@ def calibration_folder(
             from, named by `stem`, `date` and content.
 
     Raises:
-        CalibrationFolderError: the folder asked for exists, or nothing can be written there.
+        CalibrationFolderError: the requested folder exists, or nothing can be written there.
     """
     if out is not None:
         refuse_existing(out)

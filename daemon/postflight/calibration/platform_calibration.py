@@ -43,7 +43,7 @@ Array = NDArray[np.float64]
 
 KIND = "platform"
 UNCERTAIN_MOUNTING_RAD = 20e-6
-"""Turning from exposure to exposure, beyond what tie points explain, that is worth a sentence."""
+"""Rotation between exposures, beyond what tie points explain, that is reported."""
 _ANGLES = ("omega", "phi", "kappa")
 
 
@@ -53,7 +53,7 @@ class PlatformCalibrationError(DaemonError, ValueError):
 
 @dataclass(frozen=True)
 class PlatformMissions:
-    """The stitching of missions flown with one rig file; `skipped` are sentences."""
+    """The stitching of missions flown with one rig file; `skipped` are messages."""
 
     rig: Rig
     missions: tuple[str, ...]

@@ -102,7 +102,7 @@ def chart_svg(
 def histogram_svg(
     title: str, label: str, values: Array, *, bins: int = 60, log: bool = False
 ) -> str:
-    """How often values occur; `log` gives the logarithm of the counts, as EMVA 1288 asks."""
+    """How often values occur; `log` gives the logarithm of the counts, as EMVA 1288 requires."""
     flat = np.asarray(values, float).ravel()
     flat = flat[np.isfinite(flat)]
     counts, edges = np.histogram(flat, bins=bins) if flat.size else (np.zeros(1), np.arange(2.0))

@@ -59,7 +59,7 @@ def calibrated_rig(
     if foreign:
         raise RigCalibrationError(
             f"cameras {', '.join(foreign)} of the block are no cones of rig {rig.name} "
-            f"({', '.join(cones)}); name them alike"
+            f"({', '.join(cones)}); give them the same names"
         )
     if rig.master_cone != found.reference:
         raise RigCalibrationError(

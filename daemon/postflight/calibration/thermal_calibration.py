@@ -37,7 +37,7 @@ MOSAIC_MAX_BYTES = 4_000_000
 
 
 class ThermalCalibrationError(DaemonError, ValueError):
-    """Missions that cannot be learned from together, or a file that is in the way."""
+    """Missions that cannot be learned from together, or a file that already exists there."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ def read_thermal_records(missions: Sequence[Path]) -> ThermalRecords:
             bad = faults.get(number, {})
             if bad:
                 states = ", ".join(f"{probe} {s.value}" for probe, s in bad.items())
-                skipped.append(f"{mission.id} {number}: probes not believed: {states}")
+                skipped.append(f"{mission.id} {number}: implausible probes: {states}")
                 record = _without(rig, record, set(bad))
             try:
                 state = add_exposure(rig, state, record)
@@ -114,7 +114,7 @@ def read_thermal_records(missions: Sequence[Path]) -> ThermalRecords:
 
 
 def faulty_probes(rig: Rig, exposures: Iterable[Exposure]) -> dict[int, dict[str, ProbeState]]:
-    """By exposure, the probes that were not to be believed then, from the flight's own history."""
+    """By exposure, the probes that were not plausible then, from the flight's own history."""
     reference = calibration_temperatures(rig)
     result: dict[int, dict[str, ProbeState]] = {}
     histories: dict[tuple[str, str], list[ProbeSample]] = {}

@@ -23,7 +23,7 @@ AXES = (
     "x to the right, y up (nominal flight direction of the nadir image), origin at the principal "
     "point, which is the centre of the image; column = x / pixel + (width - 1) / 2, row = (height "
     "- 1) / 2 - y / pixel, whole numbers at pixel centres; the camera looks along -z, the image "
-    "plane lies at z = -principal distance"
+    "plane is at z = -principal distance"
 )
 
 

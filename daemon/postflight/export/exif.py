@@ -189,7 +189,7 @@ def _tiff(
 
 
 def _directory(entries: Sequence[tuple[int, int, Value]], offset: int) -> bytes:
-    """One IFD with its values behind it, entries by tag as the standard asks."""
+    """One IFD with its values behind it, entries by tag as the standard requires."""
     ordered = sorted(entries, key=lambda entry: entry[0])
     beyond = offset + 2 + 12 * len(ordered) + 4
     table, data = struct.pack("<H", len(ordered)), b""

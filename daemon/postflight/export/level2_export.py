@@ -1,7 +1,7 @@
 """Level-2 for other programs: Cloud Optimized GeoTIFFs, and JPEGs with EXIF and XMP.
 
 The geometry stays that of the image: nothing is rectified. A COG carries ground control points on
-level ground, from trajectory and mount, so that it lies about where it belongs; its orientation is
+level ground, from trajectory and mount, so that it is roughly in place; its orientation is
 in its tags.
 """
 
@@ -227,7 +227,7 @@ def _ground_control(
         ],
         axis=1,
     )
-    # The plane lies as far below in the grid's heights as it does below the ellipsoid's.
+    # The plane is as far below in the grid's heights as below the ellipsoid's.
     level = float(picture.eo.centre_m[2]) - (picture.eo.height_m - ground_m)
     ground = on_level_ground(picture.eo.centre_m, picture.eo.rotation, xy, picture.f_mm, level)
     return [

@@ -49,7 +49,7 @@ _XMP, _EXIF, _GPS, _BLACK_LEVEL = 700, 34665, 34853, 50714
 
 
 class ImagesError(DaemonError):
-    """Images that make no mission; `problems` holds one sentence for each mistake found."""
+    """Images that make no mission; `problems` holds one message for each mistake found."""
 
     def __init__(self, problems: Sequence[str]) -> None:
         self.problems = tuple(problems)

@@ -18,11 +18,11 @@ _RDF = "{http://www.w3.org/1999/02/22-rdf-syntax-ns#}"
 
 
 class XmpError(DaemonError, ValueError):
-    """An XMP packet that cannot be used; the sentence names file, finding and cure."""
+    """An XMP packet that cannot be used; the message names file, finding and remedy."""
 
 
 class Xmp:
-    """The values of one packet; `file` names it in the error sentences.
+    """The values of one packet; `file` names it in error messages.
 
     A key is the local name of a property, such as `BandName`; a value is its text, or the texts of
     its `rdf:li`.

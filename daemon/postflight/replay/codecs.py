@@ -1,4 +1,4 @@
-"""Recorded bytes of a device through its driver again, on a clock that goes as they came.
+"""Recorded bytes of a device through its driver again, on a clock driven by their recorded times.
 
 The driver is the one that flew; only its port and its clock are stand-ins. What comes out is held
 against the records of the flight log by `daemon.postflight.replay.flight_replay`.
@@ -25,11 +25,11 @@ from drivers.transport.serial_device import SerialDevice, SerialLine
 
 Decoded = NavSample | EventMark | TemperatureSample | ClockReading
 NEW_LINE = frozenset({"lost", "silent"})
-"""Device events after which the port is reopened, and half a message is of no use."""
+"""Device events after which the port is reopened, and half a message is dropped."""
 
 
 class _Clock:
-    """Stands still but for what is waited and what arrives."""
+    """Advances only by waits and by arriving bytes."""
 
     def __init__(self) -> None:
         self.now_ns = 0
@@ -93,7 +93,7 @@ class Codec:
         return found
 
     def reopened(self) -> None:
-        """The port was reopened: half a message is of no use."""
+        """The port was reopened: half a message is dropped."""
         self._driver.connected()
 
 

@@ -249,7 +249,7 @@ _HANDLERS: Mapping[str, Callable[[_Run, Decision], None]] = {
 
 
 def _on_disk(folder: Path, frame: FrameRecord) -> FrameRecord:
-    """The frame with the file as it lies there now."""
+    """The frame with the present state of its file."""
     name = f"{frame.sensor}.tif"
     try:
         return replace(frame, file=name, sha256=hash_file(folder / name))
@@ -260,7 +260,7 @@ def _on_disk(folder: Path, frame: FrameRecord) -> FrameRecord:
 def _decode(
     messages: Iterable[Message], configuration: Configuration, rig: Rig, out: ReplayResult
 ) -> dict[int, Decoded]:
-    """What the codecs make of the logged bytes, by the message it takes the place of.
+    """Records decoded from the logged bytes, by the message they replace.
 
     A record arrives when the flight's did; its content comes from the bytes.
     """
@@ -291,7 +291,7 @@ def _decode(
         if codec is None:
             continue
         what = f"records of {name}"
-        # A reading of a clock answers a question; when that was asked is not among the bytes.
+        # A clock reading answers a request, whose time is not among the bytes.
         found = [r for r in decode_all(codec, recorded[name]) if not isinstance(r, ClockReading)]
         pairs = [
             (message, original, replace(again, mono_ns=original.mono_ns))

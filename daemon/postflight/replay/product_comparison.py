@@ -1,4 +1,4 @@
-"""The records and the images of a flight again, held against those on disk.
+"""Process records and images of a flight again and compare them with those on disk.
 
 Nothing is written. What the flight decided about an exposure's images, that they were made late, is
 taken from the log; everything else is computed.

@@ -1,7 +1,7 @@
 """Report of an aerial triangulation, in addition to that of any adjustment.
 
 Image measurements in um and px, control and check residuals in px and m, orientations in the
-coordinate system asked for.
+requested coordinate system.
 """
 
 from __future__ import annotations

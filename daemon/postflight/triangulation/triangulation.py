@@ -1,7 +1,7 @@
 """Aerial triangulation of a mission: matched, adjusted with direct georeferencing as start.
 
 The result is an adjustment project like any other (docs/formats.md), with all its tables, and the
-orientations in the coordinate system asked for. Matching is in
+orientations in the requested coordinate system. Matching is in
 `processing.matching.block_matching`.
 """
 
@@ -128,8 +128,8 @@ def block_of(
     """Orient the exposures that have a stitched PAN image, or the images of heads.
 
     Args:
-        heads: cones whose own images make the block, alike in pixels and principal distance; none:
-            the stitched images.
+        heads: cones whose own images make the block, with the same pixels and principal distance;
+            none: the stitched images.
 
     Raises:
         TriangulationError: a rig without such images, or fewer than two of them.
@@ -203,7 +203,7 @@ def _common_image(rig: Rig, heads: Sequence[str]) -> VirtualImage:
     image = images.pop()
     if image is None or images:
         raise TriangulationError(
-            f"--head {', '.join(heads)}: a block is made of images of heads alike in pixels and "
+            f"--head {', '.join(heads)}: a block is made of images of heads with the same pixels and "
             f"principal distance; {rig.name} has {', '.join(known) or 'stitched images, no heads'}"
         )
     return image
@@ -445,7 +445,7 @@ def _file(block: ImageBlock, options: TriangulationSettings) -> ProjectFile:
 def attitude_sigmas(mdeg: tuple[float, float, float]) -> tuple[float, float, float]:
     """Sigmas about the camera's x, y, z of sigmas of roll, pitch and heading, mdeg, in rad.
 
-    The camera looks down: its x lies across (pitch), its y along the flight (roll).
+    The camera looks down: its x is across (pitch), its y along the flight (roll).
     """
     roll, pitch, heading = (math.radians(v * 1e-3) for v in mdeg)
     return pitch, roll, heading

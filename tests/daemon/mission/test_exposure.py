@@ -143,7 +143,7 @@ def test_every_mistake_is_named_at_once_with_key_value_and_cure():
     sentences = "\n".join(caught.value.problems)
     assert len(caught.value.problems) == 6
     for part in (
-        "exposure.json: number is 0; it lies between 1 and 2^53",
+        "exposure.json: number is 0; it must be between 1 and 2^53",
         "mark_gps_ns is 1447000003000000000; an instant is a decimal string",
         "frames[1].file is '../../etc/passwd'; letters, digits",
         "frames[2].exposure_time_us is '4000'; a finite number is needed",

@@ -60,9 +60,9 @@ def test_the_command_prints_it_and_reports_by_its_exit_code(moved: Path, tmp_pat
 
 def test_a_flight_that_shows_nothing_is_not_called_healthy() -> None:
     assert without_steps({"0": 12, "1": 6}) == "No sensor is seen to move."
-    assert without_steps({"0": 12, "1": 5}).endswith("not judged: cone 1 (too few exposures).")
-    assert without_steps({"0": 0, "1": 5}).startswith("Not judged:")
-    assert without_steps({}).startswith("Not judged: it takes three sensors")
+    assert without_steps({"0": 12, "1": 5}).endswith("not evaluated: cone 1 (too few exposures).")
+    assert without_steps({"0": 0, "1": 5}).startswith("Not evaluated:")
+    assert without_steps({}).startswith("Not evaluated: it takes three sensors")
 
 
 def test_a_mission_without_products_is_not_called_healthy(tmp_path: Path) -> None:

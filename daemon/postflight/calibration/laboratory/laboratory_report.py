@@ -1,4 +1,4 @@
-"""What the reports of all laboratory calibrations say alike: the series, parts, the comparison."""
+"""Common parts of the reports of all laboratory calibrations: series, parts, comparison."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ _MAX_LISTED: Final = 20
 
 
 class SeriesError(DaemonError, ValueError):
-    """A series that cannot be used; one sentence a line for each mistake."""
+    """A series that cannot be used; one message a line for each mistake."""
 
     def __init__(self, problems: list[str]) -> None:
         more = len(problems) - _MAX_LISTED
@@ -45,7 +45,7 @@ class LaboratorySeries:
     images: tuple[TomlTable, ...]
 
     def checked(self) -> None:
-        """Refuse the series with everything that was wrong with what was asked.
+        """Refuse the series with every mistake found so far.
 
         Raises:
             SeriesError: a key was missing, of another kind, or unknown.

@@ -366,7 +366,7 @@ def _plots(head: HeadCalibration) -> list[Plot]:
                 bins=120,
                 log=True,
             ),
-            "Logarithmic: a single pixel is seen; what stands apart is a defect.",
+            "Logarithmic: a single pixel is visible; an outlier is a defect.",
         ),
         Plot(
             f"{name}: dark signal of pixels",
