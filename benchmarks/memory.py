@@ -45,7 +45,7 @@ def main() -> None:
         "machine": machine(),
         "rig": found.name,
         "exposures": options.exposures,
-        "parallel": options.parallel,
+        "parallel_exposures": options.parallel,
         "warmed_up_mib": round(warmed_up, 1),
         "last_mib": round(seen[-1], 1),
         "most_mib": round(max(seen), 1),
