@@ -25,7 +25,7 @@ def test_pixels_reach_the_file_wherever_they_lie(tmp_path: Path, offset: int, pi
     assert (tmp_path / "pan.tif").read_bytes() == expected
 
 
-def test_where_the_disk_has_no_way_past_the_cache_the_file_is_whole_all_the_same(
+def test_a_disk_without_direct_io_still_gets_the_complete_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refusing(descriptor: int, parts: object) -> int:
@@ -49,7 +49,7 @@ def test_a_full_disk_is_reported_without_a_retry(
 
 
 @pytest.mark.parametrize("leaves_a_file", [False, True])
-def test_where_the_disk_refuses_the_way_past_the_cache_the_file_is_whole_all_the_same(
+def test_a_disk_that_refuses_direct_io_still_gets_the_complete_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, leaves_a_file: bool
 ) -> None:
     plain_open = os.open

@@ -21,7 +21,7 @@ def executor_for(tmp_path: Path) -> DiskExecutor:
     return DiskExecutor(Disk("mirror", tmp_path, "1"))
 
 
-def test_waiting_is_counted_only_without_progress_and_never_more_than_a_look(
+def test_waiting_is_counted_only_without_progress_and_at_most_one_step_per_check(
     tmp_path: Path,
 ) -> None:
     executor, go_on = executor_for(tmp_path), threading.Event()
@@ -35,7 +35,7 @@ def test_waiting_is_counted_only_without_progress_and_never_more_than_a_look(
     assert done.result(10) and executor.end(10.0)
 
 
-def test_the_first_look_at_pending_work_counts_from_zero(tmp_path: Path) -> None:
+def test_the_first_check_of_pending_work_counts_from_zero(tmp_path: Path) -> None:
     executor, go_on = executor_for(tmp_path), threading.Event()
     done = executor.submit(lambda: go_on.wait(10))
     assert executor.update_waited(0.1) == pytest.approx(0.1)

@@ -50,7 +50,7 @@ def rejoining_disk(tmp_path: Path, source: Mission, polls: list[int]) -> Rejoini
     )
 
 
-def test_a_disk_that_refuses_is_looked_for_half_as_often_each_time(tmp_path: Path) -> None:
+def test_a_disk_that_refuses_is_polled_half_as_often_each_time(tmp_path: Path) -> None:
     source, polls = Mission(tmp_path / "m", "m"), list[int]()
     rejoining = rejoining_disk(tmp_path, source, polls)
     waits = Woken(5)

@@ -107,7 +107,7 @@ def test_the_limits_themselves_are_healthy() -> None:
         {"ata_smart_attributes": {"table": [None, 5, {"id": 197, "raw": {"value": "many"}}]}},
     ],
 )  # fmt: skip
-def test_malformed_output_never_raises_and_claims_nothing(smart_data: dict[str, Any]) -> None:
+def test_malformed_output_never_raises_and_yields_no_values(smart_data: dict[str, Any]) -> None:
     found = health_of(smart_data)
     assert found.temperature_c is None and found.wear_percent is None
 

@@ -253,7 +253,7 @@ def test_a_mission_with_a_link_is_refused_and_nothing_is_followed(mission, tmp_p
     assert secret.read_text() == "of somebody else"
 
 
-def test_a_pipe_or_a_socket_in_a_mission_hangs_nobody(mission):
+def test_a_pipe_or_a_socket_in_a_mission_blocks_no_reader(mission):
     pipe = mission.level0(2) / "SU01.tif"
     pipe.unlink()
     os.mkfifo(pipe)
@@ -271,7 +271,7 @@ def test_a_pipe_or_a_socket_in_a_mission_hangs_nobody(mission):
         Mission.open(mission.path)
 
 
-def test_an_index_with_a_view_that_never_ends_is_not_asked(mission):
+def test_an_index_with_an_endless_view_is_not_queried(mission):
     """A mission.db whose table of exposures is a program."""
     mission.catalog_path.unlink()
     connection = sqlite3.connect(mission.catalog_path)

@@ -70,7 +70,7 @@ def test_no_pixel_is_copied_on_the_way():
 
 
 @pytest.mark.parametrize("options", [{}, {"compression": "zlib"}, {"bigtiff": True}])
-def test_a_tiff_of_another_writer_is_taken(tmp_path, options):
+def test_a_tiff_of_another_writer_is_accepted(tmp_path, options):
     tifffile.imwrite(tmp_path / "b.tif", PIXELS, **options)
     assert np.array_equal(read_tiff(tmp_path / "b.tif", width_px=64, height_px=48), PIXELS)
     assert read_description(tmp_path / "b.tif").get("sensor") is None

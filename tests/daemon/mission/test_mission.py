@@ -11,7 +11,7 @@ from daemon.mission.layout import Mission, MissionError
 from tests.daemon.small_camera import RIG_TOML, new_mission
 
 
-def test_a_new_mission_is_whole_and_is_the_current_one(tmp_path):
+def test_a_new_mission_is_complete_and_is_the_current_one(tmp_path):
     mission = new_mission(tmp_path / "flights" / "2026")
     assert mission.id == "20261121T101500Z-small"
     assert mission.rig_path.read_text() == RIG_TOML

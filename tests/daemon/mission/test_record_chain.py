@@ -27,7 +27,7 @@ orders = st.permutations(range(1, 9))
 
 
 @given(orders, st.randoms())
-def test_a_whole_chain_is_followed_in_the_order_of_sealing(order, random):
+def test_a_complete_chain_is_followed_in_the_order_of_sealing(order, random):
     links = chain_of(order)
     shuffled = list(links)
     random.shuffle(shuffled)

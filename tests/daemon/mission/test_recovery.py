@@ -117,7 +117,7 @@ def test_a_torn_log_seals_with_what_it_still_has(mission):
     log.close()
 
 
-def test_a_whole_folder_that_was_only_not_renamed_is_kept(mission):
+def test_a_complete_folder_that_was_only_not_renamed_is_kept(mission):
     fly(mission, [1])
     store_unsealed(mission, 2)
     forget(mission, 2)
@@ -129,7 +129,7 @@ def test_a_whole_folder_that_was_only_not_renamed_is_kept(mission):
 
 
 @pytest.mark.parametrize("damage", ["torn frame", "no record", "missing frame", "empty"])
-def test_a_folder_that_is_not_whole_is_set_aside_and_never_called_stored(mission, damage):
+def test_an_incomplete_folder_is_discarded_and_never_reported_as_stored(mission, damage):
     fly(mission, [1])
     store_unsealed(mission, 2)
     forget(mission, 2)

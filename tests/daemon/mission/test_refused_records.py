@@ -30,7 +30,7 @@ def flown() -> tuple[Flight, int]:
     return new_flight, 4 * NS
 
 
-def test_a_record_that_was_refused_is_made_again_the_same() -> None:
+def test_a_refused_record_is_rebuilt_identically() -> None:
     new_flight, now_ns = flown()
     first = new_flight.due_to_seal(now_ns)
     again = new_flight.due_to_seal(now_ns + SEAL_RETRY_NS)

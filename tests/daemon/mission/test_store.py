@@ -179,7 +179,7 @@ def test_a_new_ancestor_is_synced_into_its_parent(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("refused", range(1, 12))
-def test_a_full_disk_at_any_step_leaves_the_exposure_whole_or_not_at_all(
+def test_a_full_disk_at_any_step_leaves_the_exposure_complete_or_absent(
     mission, writer, monkeypatch, refused
 ):
     writer.seal(final_record(store_one(writer, 1)))

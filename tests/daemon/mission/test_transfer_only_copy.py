@@ -80,7 +80,7 @@ def removal_killed_at(mission: Mission, disk: Path, files_removed: int) -> None:
 
 
 @pytest.mark.parametrize("files_removed", [1, 5, 12])
-def test_a_second_run_after_a_killed_removal_keeps_the_whole_copy(
+def test_a_second_run_after_a_killed_removal_keeps_the_complete_copy(
     mission: Mission, disk: Path, files_removed: int
 ) -> None:
     original = content_of(mission.path)

@@ -11,7 +11,9 @@ from daemon.mission import writer_lock as lock_module
 from daemon.mission.writer_lock import LOCK_FILE, MissionError, is_locked, writer_lock
 
 
-def test_a_held_mission_is_asked_for_five_times_and_its_holder_named(tmp_path: Path, monkeypatch):
+def test_the_lock_of_a_held_mission_is_tried_five_times_and_its_holder_named(
+    tmp_path: Path, monkeypatch
+):
     waited: list[float] = []
     monkeypatch.setattr(lock_module.time, "sleep", waited.append)
     assert not is_locked(tmp_path)

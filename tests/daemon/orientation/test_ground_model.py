@@ -95,7 +95,7 @@ def test_the_height_is_that_above_the_mean_of_what_the_image_shows(model: Path) 
     assert level - ahead == pytest.approx(SLOPE * 850.0 * math.tan(math.radians(5.0)), rel=0.2)
 
 
-def test_beyond_the_model_and_without_attitude_it_is_not_asked(model: Path) -> None:
+def test_beyond_the_model_and_without_attitude_it_is_not_queried(model: Path) -> None:
     known = ground(find_rig("dmc-mini"), model)
     assert known.height_above_m(flown(latitude_deg=48.0)) is None
     assert known.height_above_m(flown(roll_rad=None)) is None

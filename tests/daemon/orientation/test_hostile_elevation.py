@@ -109,7 +109,7 @@ def test_a_height_model_that_names_a_network_file_opens_no_connection(
     assert Contacts.requests == []
 
 
-def test_what_lies_next_to_a_height_model_is_not_read(
+def test_files_next_to_a_height_model_are_not_read(
     tmp_path: Path, server: str, system: Georeference
 ) -> None:
     good = geotiff(tmp_path / "dem.tif")
@@ -170,7 +170,7 @@ def test_a_path_below_a_network_mount_or_through_a_link_is_not_local(
         assert not is_on_local_disk(tmp_path / "far" / "dem.tif"), kind
 
 
-def test_a_pipe_or_a_folder_as_height_model_hangs_nobody(
+def test_a_pipe_or_a_folder_as_height_model_is_refused_without_blocking(
     tmp_path: Path, system: Georeference
 ) -> None:
     os.mkfifo(tmp_path / "dem.tif")

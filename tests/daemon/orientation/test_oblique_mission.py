@@ -203,7 +203,7 @@ def test_a_flight_over_a_height_model_is_replayed_with_the_model_from_elsewhere(
     assert output[1]["sentences"] == ["L2/000002/quality.json: differs with 1 in work"]
 
 
-def test_like_looking_obliques_are_tied_where_both_see_the_same_ground(flown) -> None:
+def test_obliques_of_the_same_direction_are_tied_where_both_see_the_same_ground(flown) -> None:
     world, folder = flown
     mission = Mission.open(folder / "mission")
     trajectory = folder / "trajectory.csv"
@@ -256,7 +256,7 @@ def _oriented(folder: Path) -> dict[str, dict]:
     return {eo["image"]: eo for eo in json.loads(done.stdout)["oriented"]}
 
 
-def test_every_head_is_oriented_where_it_truly_looked(flown) -> None:
+def test_every_head_is_oriented_as_in_the_truth(flown) -> None:
     world, folder = flown
     output = _oriented(folder)
     assert len(output) == EXPOSURES * LINES * 5
@@ -342,7 +342,7 @@ def test_exiftool_reads_time_place_and_attitude_of_a_picture(flown) -> None:
     assert "SIMULATED" in output["ImageDescription"]
 
 
-def test_a_cog_has_tiles_overviews_tags_and_lies_where_the_head_looked(flown) -> None:
+def test_a_cog_has_tiles_overviews_tags_and_the_place_of_its_footprint(flown) -> None:
     rasterio = pytest.importorskip("rasterio", reason="pip install 'syntopic[geotiff]'")
     _, folder = flown
     eo = _oriented(folder)["000002_5"]

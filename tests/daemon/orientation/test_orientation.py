@@ -134,7 +134,7 @@ def test_ground_points_fall_where_the_true_camera_sees_them(tmp_path: Path) -> N
         assert ray[:2] / -ray[2] == pytest.approx(seen, rel=1e-4, abs=2e-6)
 
 
-def test_each_cone_stands_where_it_was_at_its_own_mid_exposure(tmp_path: Path) -> None:
+def test_each_cone_has_the_pose_of_its_own_mid_exposure(tmp_path: Path) -> None:
     done = export_orientation(mission_at(tmp_path))
     by_cone = {eo.cone: eo for eo in done.oriented}
     assert by_cone["1"].gps_ns == MID_NS + 7_000_000
@@ -144,7 +144,7 @@ def test_each_cone_stands_where_it_was_at_its_own_mid_exposure(tmp_path: Path) -
     assert float(np.linalg.norm(moved)) == pytest.approx(60.0 * 0.007 + rig_offset_m, abs=0.03)
 
 
-def test_lever_arm_and_boresight_are_taken_out(tmp_path: Path) -> None:
+def test_lever_arm_and_boresight_are_applied(tmp_path: Path) -> None:
     """Samples of an antenna and a tilted inertial unit give the orientation of plain ones."""
     plain = master_of(mission_at(tmp_path / "plain"))
     boresight = enu_to_ned(enu_from_body(*np.radians(BORESIGHT_DEG)))

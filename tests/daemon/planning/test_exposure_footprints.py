@@ -31,7 +31,7 @@ def objections(quality: Mapping[str, Any], **changes: Any) -> list[str]:
         ({"crab_deg": 10.1, "tilt_deg": 6.0}, ["tilted by 6.0 deg", "turned by 10.1 deg"]),
     ],
 )
-def test_tilt_and_crab_are_as_asked_for_up_to_their_limit(
+def test_tilt_and_crab_meet_the_requirement_up_to_their_limit(
     figures: dict[str, float], expected: list[str]
 ) -> None:
     assert objections({"figures": figures}) == expected
@@ -41,7 +41,7 @@ def test_tilt_and_crab_are_as_asked_for_up_to_their_limit(
     ("sigma_ns", "expected"),
     [(None, []), (1_000_000, []), (1_500_000, ["time known to 1.5 ms only"])],
 )
-def test_time_is_known_as_asked_for_up_to_its_limit(
+def test_time_meets_the_requirement_up_to_its_limit(
     sigma_ns: int | None, expected: list[str]
 ) -> None:
     assert objections({}, mark_sigma_ns=sigma_ns) == expected

@@ -92,7 +92,7 @@ def test_the_points_of_a_strip_lie_ahead_and_to_the_left() -> None:
     assert strip_of(still, PLANE, half_width_m=1.0, image_along_m=1.0) is None
 
 
-def test_relief_is_asked_for_at_the_places_of_the_points() -> None:
+def test_relief_is_queried_at_the_places_of_the_points() -> None:
     requested: list[Array] = []
 
     def relief(places: Array) -> Array:

@@ -195,13 +195,13 @@ def test_a_line_flown_off_its_place_is_flown_again_entirely() -> None:
     assert advised(plan, neighbours) == {"1": [(0.0, pytest.approx(LINE_M))]}
 
 
-def test_a_line_that_was_never_flown_is_flown_whole() -> None:
+def test_a_line_that_was_never_flown_is_flown_completely() -> None:
     plan = block(2)
     only_first = [one for one in fly(plan) if one.number <= 11]
     assert advised(plan, only_first)["2"] == [(0.0, pytest.approx(LINE_M))]
 
 
-def test_only_lines_for_which_something_changed_are_looked_at_again():
+def test_only_lines_for_which_something_changed_are_evaluated_again():
     plan = block(lines=2)
     first, second = (line.id for line in plan.lines)
     taken, known = fly(plan), {}
@@ -234,7 +234,7 @@ def test_only_lines_for_which_something_changed_are_looked_at_again():
 
 @pytest.mark.trust
 @pytest.mark.parametrize("image_m", [0.4, 3.0, 30.0])
-def test_images_of_a_few_metres_are_asked_for_like_large_ones(image_m):
+def test_images_of_a_few_metres_are_required_like_large_ones(image_m):
     end = PLANE.place(0.0, 20 * image_m)
     plan = Plan("small", (PlannedLine("1", PLANE.place(0.0, 0.0), end),), SPECIFICATION)
 

@@ -120,7 +120,7 @@ def test_next_to_or_across_a_line_nothing_is_exposed(leg: Leg) -> None:
     assert flown(trigger(line("7", 0.0)), [leg]) == []
 
 
-def test_the_camera_is_never_asked_for_more_than_it_can() -> None:
+def test_the_camera_is_never_triggered_faster_than_its_limit() -> None:
     taken = norths(flown(trigger(line("7", 0.0), interval_s=2.0), [((0, -300), (0, 1500))]))
     ways = np.diff(taken)
     assert min(ways) >= 2.0 * SPEED_MPS - 0.2

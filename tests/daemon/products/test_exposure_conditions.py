@@ -58,7 +58,7 @@ def test_an_expired_calibration_makes_an_exposure_usable_and_states_what_to_do()
     assert "have the camera calibrated" in finding.sentence
 
 
-def test_an_exposure_that_could_not_be_processed_is_judged_all_the_same() -> None:
+def test_an_exposure_that_could_not_be_processed_is_still_evaluated() -> None:
     report = report_unprocessed(RIG, flown_after(9000), Flag(0))
     assert {"NOT_PROCESSED", "CALIBRATION_EXPIRED"} <= set(report["flags"])
     assert report["verdict"] == "usable"
@@ -98,7 +98,7 @@ def test_exposure_time_and_tdi_are_those_of_each_frame() -> None:
 
 @pytest.mark.trust
 @pytest.mark.parametrize(("time_us", "shifts"), [(4000.0, "many"), (4000.0, -1), (-1.0, 12)])
-def test_impossible_settings_of_a_head_are_an_error_of_the_exposure_and_are_judged(
+def test_impossible_settings_of_a_head_are_an_error_of_the_exposure_and_are_evaluated(
     time_us: float, shifts: float | str
 ) -> None:
     exposure = Exposure(1, frames=(frame("SU00", time_us, shifts),))

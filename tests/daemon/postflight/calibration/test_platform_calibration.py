@@ -122,7 +122,7 @@ def test_a_base_off_the_flight_axis_is_no_rotation() -> None:
     assert "RGB" in unknown.missing and "1" not in unknown.missing
 
 
-def test_turns_found_in_whole_flights_are_as_good_as_stated() -> None:
+def test_rotations_found_in_complete_flights_are_as_accurate_as_stated() -> None:
     found = ultracam_platform.evaluate("ultracam-l-mini", 4, 6)
     assert set(found) == {"1", "RGB"}
     for figures in found.values():

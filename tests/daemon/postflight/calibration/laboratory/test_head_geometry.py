@@ -201,6 +201,7 @@ def test_too_few_targets_and_another_kind_of_series_are_refused(
     content["images"][0]["turned_deg"] = content["images"][0].pop("rotation_deg")
     (tmp_path / "series.json").write_text(json.dumps(content))
     run = CliRunner().invoke(app, ["head", str(tmp_path), "--out", str(tmp_path / "x")])
-    assert "turned_deg: it is now named rotation_deg; rename it" in str(run.exception)
+    assert ".turned_deg is " in str(run.exception)
+    assert "it is now named rotation_deg; rename it" in str(run.exception)
     with pytest.raises(SeriesError, match="kind is 'head'"):
         read_series(tmp_path, kind="radiometric")
