@@ -59,10 +59,10 @@ class Found:
 def compare(
     emulated: EmulatedExposure, product: Product | HeadsProduct, clean: Mapping[str, Array]
 ) -> Found:
-    """Hold an image against the truth.
+    """Compare an image with the truth.
 
     Args:
-        planted: what it was made of.
+        emulated: the exposure it was made of.
         product: the image and its report.
         clean: fine detail by sensor (`detail_of`) of the exposure without a fault.
     """

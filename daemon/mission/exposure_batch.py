@@ -1,7 +1,7 @@
-"""Doing one thing to every exposure of a mission, and going on after one that fails.
+"""Apply one action to every exposure of a mission, and continue after failures.
 
-Every command that walks a mission comes through here; what failed is returned together with its
-cause, for the command to list at its end (`daemon.cli.exposure_failures`).
+Every command over the exposures of a mission uses this. Failures are returned with their causes;
+the command lists them at its end (`daemon.cli.exposure_failures`).
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class ExposureFailure:
 
 @dataclass(frozen=True)
 class BatchResult(Generic[T]):
-    """What came of each exposure, in the order of the walk: a result, or a failure."""
+    """Outcome of each exposure, in order: a result, or a failure."""
 
     results: Mapping[int, T]
     failures: tuple[ExposureFailure, ...]
@@ -44,13 +44,13 @@ def for_each_exposure(
     action: Callable[[int], T],
     progress: Callable[[int], None] = lambda _done: None,
 ) -> BatchResult[T]:
-    """Visit exposures one after another; one that fails does not end the walk.
+    """Apply an action to exposures one after another; a failed one does not end the batch.
 
-    A disk that is full or read-only does: the exposures behind it are listed as not attempted.
+    A full or read-only disk ends it: the remaining exposures are listed as not attempted.
 
     Args:
         numbers: of the exposures.
-        visit: does what is to be done to one of them.
+        action: processes one of them.
         progress: called with the count of exposures done, failed ones among them.
     """
     pending = list(numbers)

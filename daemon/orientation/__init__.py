@@ -1,1 +1,1 @@
-"""Where images looked from and what they saw: orientation, footprints, triangulation."""
+"""Orientation of images and their footprints."""

@@ -97,7 +97,7 @@ def _ascii_header(head: bytes) -> tuple[dict[str, float], int]:
 
 
 def _ascii_heights(descriptor: int, begin: int, count: int) -> np.ndarray[Any, Any]:
-    """So many numbers, and nothing behind them; a number at a time, never the text at once."""
+    """Exactly this many numbers, parsed one at a time."""
     with os.fdopen(os.dup(descriptor), "rb") as file, warnings.catch_warnings():
         warnings.simplefilter("error", DeprecationWarning)  # how numpy reports other words
         file.seek(begin)

@@ -1,4 +1,4 @@
-"""What each image sees of the ground, as GeoJSON and as STAC items.
+"""Ground footprints of images, as GeoJSON and as STAC items.
 
 Rays are followed to level ground in the local east, north, up of the projection centre; relief and
 the curvature of the earth (8 cm at 1 km) are left out.

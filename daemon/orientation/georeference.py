@@ -82,7 +82,7 @@ class Georeference:
 
     @property
     def height_system(self) -> str:
-        """What the heights count from, in words."""
+        """Height reference, in words."""
         vertical = [part for part in self.crs.sub_crs_list if part.is_vertical]
         return str(vertical[0].name) if vertical else "ellipsoid of WGS 84"
 

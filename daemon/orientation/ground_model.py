@@ -1,4 +1,4 @@
-"""How high above the ground an exposure was taken: over a height model, where one is configured.
+"""Height of an exposure above the ground: over a height model, where one is configured.
 
 The mean over the image's footprint is what converging heads are projected onto
 (docs/mathematics/virtual-camera.md#ground-plane).
@@ -43,7 +43,7 @@ class GroundModel:
         self._model = read_elevation(elevation, self._system)
 
     def height_above_m(self, there: NavigationRecord) -> float | None:
-        """Of the camera above the mean of the terrain it sees.
+        """Height of the camera above the mean of the terrain it sees.
 
         None without a height or an attitude, and where the model does not know half of the
         footprint.

@@ -33,7 +33,7 @@ PLACES: Final = "WGS 84, height above the ellipsoid (EPSG:4979)"
 def orientation_json(
     exposure: Exposure, rig: Rig, mount: MountSection, ground_m: float
 ) -> Mapping[str, Any]:
-    """What `orientation.json` holds: every cone at its own mid-exposure, its footprint on a plane.
+    """Content of `orientation.json`: every cone at its own mid-exposure, its footprint on a plane.
 
     Args:
         ground_m: height of level ground above the ellipsoid.

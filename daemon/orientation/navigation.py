@@ -30,7 +30,7 @@ EARLY_TOLERANCE_NS = 100_000_000
 CONTRADICTION_M = 1.0
 CONTRADICTION_MPS2 = 2.0
 CONTRADICTION_SIGMAS = 5
-"""How far two positions may disagree with the way between them, in addition to their sigmas."""
+"""Tolerance of two positions against the velocity between them, in addition to their sigmas."""
 CLIMB_RATE_MAX_MPS = 60.0
 """Faster than any aircraft that takes images climbs or sinks."""
 CLIMB_SIGMA_MPS = 3.0

@@ -32,7 +32,7 @@ CSV_COLUMNS = (
 
 @dataclass(frozen=True)
 class OrientationSetInfo:
-    """What holds for a whole set of orientations."""
+    """Properties common to a set of orientations."""
 
     mission: str
     rig: Rig
@@ -44,7 +44,7 @@ class OrientationSetInfo:
 
 
 def header_lines(about: OrientationSetInfo) -> list[str]:
-    """What somebody must know before using the numbers; one fact a line."""
+    """Notes on the use of the numbers; one fact a line."""
     system, mount = about.georeference, about.mount
     antenna = ", ".join(f"{value:g}" for value in mount.antenna_m)
     boresight = ", ".join(f"{value:g}" for value in mount.boresight_deg)

@@ -1,4 +1,4 @@
-"""What the exposures of a mission are oriented with: camera, mount, trajectory, coordinate system.
+"""Inputs for orienting the exposures of a mission: camera, mount, trajectory, coordinate system.
 
 Defaults are those of the flight; how one exposure is oriented is in
 `daemon.orientation.exterior_orientation`.
@@ -33,7 +33,7 @@ class OrientationError(DaemonError):
 
 @dataclass(frozen=True)
 class OrientationInputs:
-    """How to orient; `ground_height_m` as planned."""
+    """Options of an orientation; `ground_height_m` as planned."""
 
     rig: Rig
     mount: MountSection
@@ -47,7 +47,7 @@ class OrientationInputs:
         return orient(exposure, self.rig, self.mount, self.trajectory, self.georeference)
 
     def oriented(self, exposures: Iterable[Exposure]) -> list[ExteriorOrientation]:
-        """What of them can be oriented."""
+        """Exposures that can be oriented."""
         every = (one for exposure in exposures for one in self.of(exposure))
         return [one for one in every if isinstance(one, ExteriorOrientation)]
 
@@ -61,7 +61,7 @@ def read_orientation_inputs(
     mount_file: Path | None = None,
     receiver: str | None = None,
 ) -> OrientationInputs:
-    """What to orient these exposures with.
+    """Inputs to orient these exposures with.
 
     Args:
         crs: such as EPSG:25833; None is the UTM zone of the trajectory's beginning.

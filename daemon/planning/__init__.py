@@ -1,1 +1,1 @@
-"""What is to be flown: lines and the specification of a project, and what must be flown again."""
+"""Flight plans: lines and the specification of a project, and reflights."""

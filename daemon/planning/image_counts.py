@@ -1,4 +1,4 @@
-"""How many images see each point of a planned line's strip, band by band, by valid pixels.
+"""Number of images that see each point of a planned line's strip, by band and valid pixels.
 
 A point of the ground is followed back into each image by the homography of its footprint, over
 relief along the ray to the projection centre. There it is seen if it is in the image's valid area.
@@ -162,7 +162,7 @@ class FlightFootprints:
         return [int(k) for k in np.flatnonzero(near)]
 
     def seen(self, strip: LineStrip) -> Iterator[StripCoverage]:
-        """What each image sees of a strip; images that see nothing of it are passed over."""
+        """Visible part of a strip in each image; images that see nothing of it are skipped."""
         for k in self._near(strip):
             found = _seen(strip, self.taken[k], self.corners_m[k], self.projection_centres_m[k])
             if found is not None:
@@ -219,7 +219,7 @@ def _seen(
 def _shift_m(
     strip: LineStrip, corners: Array, projection_centre: tuple[Array, float] | None
 ) -> float:
-    """How far relief may move what an image sees, metres."""
+    """Maximum displacement by relief of the ground an image sees, metres."""
     if projection_centre is None or strip.relief_m is None:
         return 0.0
     highest_m = float(np.max(np.abs(strip.relief_m)))
@@ -230,7 +230,7 @@ def _shift_m(
 def count_images(
     strip: LineStrip, seen: Sequence[StripCoverage]
 ) -> tuple[Counts, Mapping[str, Counts]]:
-    """How many images have each point inside, and by band in how many of them it is in a gap."""
+    """Number of images with each point inside, and by band the number with it in a gap."""
     shape = (len(strip.along), len(strip.across))
     inside: Counts = np.zeros(shape, np.int16)
     in_gaps: dict[str, Counts] = {}
@@ -242,7 +242,7 @@ def count_images(
 
 
 def image_shares(corners: Array, points: Array) -> Array:
-    """Where points of level ground lie in an image, as shares of its width and height, (..., 2).
+    """Positions of points of level ground in an image, as shares of its width and height, (..., 2).
 
     Args:
         corners: (4, 2), the footprint; points: (..., 2), in the same plane.
@@ -278,7 +278,7 @@ def _image_from_ground(corners: Array) -> Array | None:
 
 
 def is_inside(shares: Array) -> Flags:
-    """Which points lie in the image, its edges included."""
+    """Whether points are in the image, its edges included."""
     flags: Flags = np.all((shares >= -_EDGE) & (shares <= 1.0 + _EDGE), axis=-1)
     return flags
 

@@ -1,4 +1,4 @@
-"""What one image sees of level ground, as planned: from the rig and a height alone."""
+"""Size of one image on level ground, as planned: from the rig and a height alone."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What of a mission's own plan must be flown again, as its report shows it."""
+"""Coverage of a mission's own plan and its reflights, for the report."""
 
 from __future__ import annotations
 

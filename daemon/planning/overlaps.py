@@ -1,4 +1,4 @@
-"""How much of an exposure earlier ones saw as well: the one before it, and the neighbouring line.
+"""Overlap of an exposure with earlier ones: the one before it, and the neighbouring line.
 
 Footprints on level ground, without the parts of heads that sent no image; the band with the least
 overlap counts. Relief is left out. An exposure is compared with those of smaller
@@ -93,7 +93,7 @@ class Overlaps:
         )
 
     def of(self, number: int) -> OverlapShares:
-        """What is known of an exposure that was taken in."""
+        """Data of an exposure that was added."""
         this = self._seen.get(number)
         if this is None:
             return OverlapShares()

@@ -249,7 +249,7 @@ def _straight(
 
 
 def _name(where: str, value: Any) -> str:
-    """What a plan calls a line or strip: one line of text that a person can see."""
+    """Name of a line or strip in a plan: one line of visible text."""
     if isinstance(value, dict | list) or len(text := str(value)) > NAME_MAX_CHARACTERS:
         raise PlanError(
             f"{where}: {str(value)[:60]!r} is no name; {NAME_MAX_CHARACTERS} characters at most"

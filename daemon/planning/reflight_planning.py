@@ -1,4 +1,4 @@
-"""Which segments of which lines must be flown again, before leaving.
+"""Find the segments of lines that must be flown again, before leaving.
 
 A point of a line is well where enough images hold valid pixels of it in every band, over the whole
 width of its strip: as many as the overlaps ask for, at the ends of the line and of the block as
@@ -82,7 +82,7 @@ class Segment:
 
 @dataclass(frozen=True)
 class ReflightPlan:
-    """What to fly again, and how much of the plan is well.
+    """Segments to fly again, and the covered length of the plan.
 
     `hole_m2` is the ground that too few images see and no planned exposure will.
     """
@@ -99,7 +99,7 @@ class ReflightPlan:
 
 @dataclass(frozen=True)
 class LineReflights:
-    """What was found of one line, and what it was found from."""
+    """Result for one line, and the images it is based on."""
 
     segments: tuple[Segment, ...]
     planned_m: float
@@ -109,7 +109,7 @@ class LineReflights:
 
 @dataclass(frozen=True)
 class _ReflightInputs:
-    """What all lines have in common."""
+    """Inputs common to all lines."""
 
     plan: Plan
     plane: LocalPlane
@@ -141,8 +141,8 @@ def reflights(
         taken: exposures with footprints on the ground, in any order.
         image_along_m, image_across_m: what one image sees of level ground as planned.
         relief: the terrain over the level ground of the footprints, where it is known.
-        rest: by line, between which distances from its start (metres) it is still to be flown: what
-            the planned exposures there will see is no hole.
+        unflown: by line, intervals of distance from its start (metres) that are still to be flown.
+            Ground that the planned exposures there will see is no hole.
         known: what was found before, by line, with the same plan and relief; a line for which
             nothing has changed is not looked at again. It is updated.
 
@@ -245,7 +245,7 @@ def _needed(strip: LineStrip, block: _ReflightInputs) -> Counts:
 
 
 def _upcoming_images(strip: LineStrip, block: _ReflightInputs, line: PlannedLine) -> Counts:
-    """How many planned images will still see each point along a line, (n,)."""
+    """Number of planned images that will still see each point along a line, (n,)."""
     if line.id not in block.unflown:
         return np.zeros(len(strip.along), np.int16)
     from_m, to_m = block.unflown[line.id]
@@ -260,7 +260,7 @@ def _images_at(
     image_along_m: float,
     margin_m: float | None = None,
 ) -> Counts:
-    """How many images at the stations see the places along a line, of any shape.
+    """Number of images at the stations that see the places along a line, of any shape.
 
     The margin at the border of an image is that of `_margin_m` where none is given.
     """

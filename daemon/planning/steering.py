@@ -27,7 +27,7 @@ MIN_SPEED_MPS = 1.0
 
 @dataclass(frozen=True)
 class LinePosition:
-    """Where on a planned line: metres flown along it and to the right of it, in flight direction.
+    """Position on a planned line: metres along it and to the right of it, in flight direction.
 
     `along_m` is negative before the line begins. `speed_mps` is the part of the speed along it.
     """
@@ -180,7 +180,7 @@ class PlanTrigger:
 def places_m(
     line: PlannedLine, length_m: float, distance_m: float, *, is_reversed: bool = False
 ) -> Sequence[float]:
-    """Where along a line exposures are planned, metres in flight direction, rising.
+    """Distances of planned exposures along a line, metres in flight direction, rising.
 
     The last one by distance is at the end of the line or behind it, so that the end is seen as
     often as the rest.

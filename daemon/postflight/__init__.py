@@ -1,1 +1,1 @@
-"""What runs after landing: adjustment, calibration, exchange, replay and reports."""
+"""Post-flight processing: adjustment, calibration, exchange, replay and reports."""

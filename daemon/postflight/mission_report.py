@@ -97,7 +97,7 @@ def write_report(
 
 
 def _coverage(mission: Path) -> dict[str, Any] | None:
-    """What of the plan is seen often enough; None without a plan, or one that cannot be used."""
+    """Coverage of the plan; None without a plan, or one that cannot be used."""
     try:
         return coverage_of(Mission.open(mission))
     except (OSError, DaemonError, ConfigurationError, RigError):
@@ -155,7 +155,7 @@ def _worst_time_sigma(record: Mapping[str, Any]) -> int | None:
 
 
 def _displaced(exposures: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Which sensor was found displaced, in how many exposures, and by how much on average."""
+    """The displaced sensor, its number of exposures, and its mean displacement."""
     found: dict[str, list[Mapping[str, Any]]] = {}
     for exposure in exposures:
         name = exposure["figures"].get("displaced_sensor")

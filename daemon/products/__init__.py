@@ -1,1 +1,1 @@
-"""What becomes of a landed mission's frames: bands, heads, Level-3."""
+"""Products of a mission's frames: bands, heads, Level-3."""

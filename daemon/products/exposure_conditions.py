@@ -91,7 +91,7 @@ def _tdi_shifts(exposure: Exposure, rig: Rig) -> dict[str, int]:
 
 
 def capture_flags(exposure: Exposure, rig: Rig) -> Flag:
-    """What capture found of an exposure, and whether its calibration was too old."""
+    """Flags of an exposure from capture, and whether its calibration was too old."""
     return Flag(exposure.flags) | _calibration_flag(exposure, rig)
 
 

@@ -56,7 +56,7 @@ class Level3Error(DaemonError):
 
 @dataclass(frozen=True)
 class PansharpenedExposure:
-    """What was written for one exposure: file name to size in bytes, and what could not be."""
+    """Files written for one exposure: name to size in bytes, and those that failed."""
 
     number: int
     files: Mapping[str, int]

@@ -1,4 +1,4 @@
-"""What makes the images of an exposure, whatever the rig: one interface, chosen by the rig alone.
+"""Processors of exposures: one interface for every rig, chosen by the rig alone.
 
 The worker in flight, `syntopic process` after landing and the replay all come through here.
 """
@@ -37,7 +37,7 @@ Frames: TypeAlias = Mapping[str, NDArray[np.uint16]]
 
 
 class AnyPipeline(Protocol):
-    """What the pipelines of all kinds of rig have in common."""
+    """Interface common to the pipelines of all kinds of rig."""
 
     @property
     def rig(self) -> Rig:
@@ -106,7 +106,7 @@ def build_processor(
     *,
     own_radiance: Path | None = None,
 ) -> Processor:
-    """What makes the images of this rig: stitched, head by head, or band by band.
+    """Create the processor of this rig: stitched, head by head, or band by band.
 
     Args:
         radiometry: folder of calibrations; sensors without one are taken as ideal.
@@ -167,7 +167,7 @@ def make_products(
     *,
     frames_read: Callable[[], None] | None = None,
 ) -> ProductFiles:
-    """All that Level-2 of one exposure holds: its images, and what is the same for every rig.
+    """All Level-2 files of one exposure: its images, and the files common to every rig.
 
     Returns:
         The content of quality.json, and the parts of every file by its name. Pixels among them

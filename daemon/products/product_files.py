@@ -1,4 +1,4 @@
-"""What every kind of Level-2 has in common: its report, quick look and files by name."""
+"""Files common to every kind of Level-2: report, quick look and files by name."""
 
 from __future__ import annotations
 

@@ -58,7 +58,7 @@ def after_recovery(
 
     Args:
         leading: the copy that leads.
-        behind: the other one.
+        outdated: the other one.
         step: called between blocks of bytes.
 
     Returns:

@@ -58,7 +58,7 @@ class MirroredStorage:
         mission_id: the mission; its folder is there on the first disk.
         disks: the disks, the leading one first; the others join once they are up to date.
         stall_s: how long a disk may make no progress while another does.
-        returns: when and how a disk that is not in use is brought up to date.
+        rejoin: when and how a disk that is not in use is brought up to date.
         emit: called when the disks in use have changed.
     """
 

@@ -59,7 +59,7 @@ class LogFile:
         os.fdatasync(self._descriptor)
 
     def close(self) -> None:
-        """Let go of the file; may be called twice."""
+        """Close the file; may be called twice."""
         if self._descriptor >= 0:
             os.close(self._descriptor)
             self._descriptor = -1

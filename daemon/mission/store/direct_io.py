@@ -25,7 +25,7 @@ _BUFFER_BYTES = 4 << 20
 
 
 def create_file(path: Path, parts: Sequence[bytes | memoryview], *, mode: int = 0o444) -> int:
-    """As `durable.create_file`, past the page cache where the file is large and its disk allows it.
+    """Like `durable.create_file`, without the page cache where the file is large and the disk allows.
 
     Parts that lie in memory as they lie in the file, on a multiple of `BLOCK`, are never copied.
 

@@ -112,7 +112,7 @@ class DiskExecutor:
             future.set_exception(DroppedError(self.disk))
 
     def end(self, timeout_s: float) -> bool:
-        """Let the thread end after what it is doing; False where it does not in time."""
+        """End the thread after its current work; False on timeout."""
         self.abandon()
         self._thread.join(timeout_s)
         return not self._thread.is_alive()

@@ -1,4 +1,4 @@
-"""How many exposures the disk still holds, for how long that is, and when it is too few.
+"""Number of exposures that fit on the disk, the time they last, and the low-space warning.
 
 It only measures. The line stops by it (`daemon.onboard.service.flight_line`); the service reports
 it.
@@ -23,7 +23,7 @@ RATE_EXPOSURES = 9
 
 @dataclass(frozen=True)
 class DiskCapacity:
-    """What the disk still takes above the reserve.
+    """Free space of the disk above the reserve.
 
     `seconds` at the current rate; None where there is none yet. `is_low` is the warning, `is_full`
     the stop: no exposure is begun that might not fit.
@@ -39,7 +39,7 @@ class DiskCapacity:
 
 
 def needed_nbytes(exposure_nbytes: int) -> int:
-    """What an exposure takes on the disk, its products included."""
+    """Size of an exposure on the disk, its products included."""
     return max(1, (1 + LEVEL2_SHARE) * exposure_nbytes)
 
 

@@ -40,7 +40,7 @@ def create_file(path: Path, parts: Sequence[bytes | memoryview], *, mode: int = 
 
 
 def replace_file(path: Path, data: bytes, *, mode: int = 0o644) -> None:
-    """Put a whole new content under a name: old or new is there at any instant, never a mixture."""
+    """Replace a file atomically: at any instant it has its old or its new content."""
     with _part_of(path, mode) as (part, descriptor):
         write_all(descriptor, [data])
         os.fsync(descriptor)
@@ -250,7 +250,7 @@ def sync_file(path: Path) -> None:
 
 
 def free_bytes(path: Path) -> int:
-    """What an unprivileged writer may still put on the disk that holds `path`."""
+    """Free bytes for an unprivileged writer on the disk that holds `path`."""
     status = os.statvfs(path)
     return status.f_bavail * status.f_frsize
 

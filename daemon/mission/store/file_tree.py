@@ -165,7 +165,7 @@ class FileTree:
         return sha256
 
     def replace(self, name: str, data: bytes) -> None:
-        """Put a whole new content under a name in the root; old or new is there at any instant."""
+        """Replace a file in the root atomically: it always has its old or its new content."""
         part = f".{name}{durable.PART_SUFFIX}"
         with suppress(FileNotFoundError):
             os.unlink(part, dir_fd=self.descriptor)

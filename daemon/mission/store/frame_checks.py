@@ -27,7 +27,7 @@ _BAYER |= {f"S{pattern}": pattern for pattern in _BAYER.values()}  # as V4L2 cal
 def mismatches(
     number: int, record: FrameRecord, sensor: Sensor, frame: DecodedFrame
 ) -> Iterator[str]:
-    """What of a frame does not fit its record or its rig, one message each.
+    """Mismatches of a frame with its record or its rig, one message each.
 
     Args:
         number: of the exposure.

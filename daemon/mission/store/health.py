@@ -20,7 +20,7 @@ from daemon.mission.canonical_json import RecordError, parse_record
 from daemon.mission.store import durable
 
 REPORT = Path("/run/syntopic-health/disks.json")
-"""Where the helper leaves what it found."""
+"""File with the results of the helper."""
 
 STALE_S = 600.0
 """The timer runs every two minutes; after five missed runs the report is old."""
@@ -42,7 +42,7 @@ class HealthError(DaemonError):
 
 @dataclass(frozen=True)
 class DiskHealth:
-    """What a disk states of itself; None where it states nothing.
+    """SMART values of a disk; None where it reports none.
 
     `problems` are sentences about what is bad; empty for a healthy disk.
     """
@@ -215,7 +215,7 @@ def _matching(names: Sequence[str], known: Mapping[str, Any]) -> list[str]:
 
 
 def failed_report(error: Exception) -> dict[str, Any]:
-    """What the helper leaves when it could not ask."""
+    """Result of the helper when the query failed."""
     return {"monotonic_s": time.monotonic(), "failure": str(error), "disks": {}}
 
 

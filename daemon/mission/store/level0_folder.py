@@ -58,7 +58,7 @@ def read_sealed(folder: Path) -> SealedRecord | None:
 
 
 def read_capture(folder: Path) -> CaptureRecord | None:
-    """What was known when the pixels became durable, or None for a folder of others.
+    """The record from when the pixels became durable, or None for a foreign folder.
 
     Raises:
         RecordError: the record is damaged.

@@ -48,7 +48,7 @@ JPEG_COMMENT = b"\xff\xfe" + (len(_COMMENT) + 2).to_bytes(2, "big") + _COMMENT
 
 @dataclass(frozen=True)
 class Level2Record:
-    """What was written: file name to size in bytes, and the verdict of quality.json."""
+    """Written files: name to size in bytes, and the verdict of quality.json."""
 
     number: int
     files: Mapping[str, int]
@@ -225,7 +225,7 @@ def _npz(arrays: Mapping[str, NDArray[Any]]) -> bytes:
 
 
 def simulated_mark(report_json: Mapping[str, Any]) -> dict[str, bool]:
-    """What goes into the description of an image of emulated hardware; nothing for any other."""
+    """Description of an image of emulated hardware; empty for any other."""
     flags = report_json.get("flags")
     return {"simulated": True} if isinstance(flags, list) and SIMULATED in flags else {}
 

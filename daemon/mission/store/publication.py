@@ -171,7 +171,7 @@ def _take_name(part: Path, final: Path) -> None:
 
 
 def _renamed_in_two_steps(part: Path, final: Path) -> bool:
-    """As `_take_name` where folders cannot be exchanged; False: another writer was faster."""
+    """Like `_take_name` where folders cannot be exchanged; False: another writer was faster."""
     replaced = part.with_suffix(REPLACED_SUFFIX)
     with suppress(FileNotFoundError):
         final.rename(replaced)

@@ -92,7 +92,7 @@ class Level0Writer:
 
     @property
     def unindexed(self) -> int:
-        """How many changes the index or the chain file has refused so far.
+        """Number of changes that the index or the chain file has refused so far.
 
         They are tried again with the next one. The folders are durable all the same, and recovery
         takes them into both.
@@ -101,7 +101,7 @@ class Level0Writer:
 
     @property
     def head_sha256(self) -> str:
-        """What the next sealed record will quote."""
+        """Hash that the next sealed record will quote."""
         return self._head_sha256
 
     def write(
@@ -222,7 +222,7 @@ class Level0Writer:
         self._commit(lambda: self._catalog.add_products(number, files, verdict))
 
     def close(self) -> None:
-        """Let go of threads, index and chain file; may be called twice."""
+        """Release threads, index and chain file; may be called twice."""
         self._pool.shutdown()
         if self._owns_chain:
             self._chain.close()
@@ -299,7 +299,7 @@ def _write_frame(
 
 
 def _description(capture: CaptureRecord, frame: FrameRecord) -> dict[str, Any]:
-    """What the head knew, and nothing that was found out later."""
+    """Data of the head only, without later findings."""
     return {
         "syntopic": 1,
         "exposure": capture.number,

@@ -45,7 +45,7 @@ def no_progress(_done: int, _total: int) -> None:
 
 @dataclass(frozen=True)
 class TransferReport:
-    """What was done.
+    """Result of a transfer.
 
     `copied` files were written, `kept` were identical in the copy of an earlier run. `sealed_utc`
     is empty where the copy is not sealed.
@@ -243,7 +243,7 @@ class _Copying:
         return _sealed_report(self._target.path, manifest, source_removed=remove)
 
     def _copy(self, entry: FileEntry) -> tuple[str, bool]:
-        """Bring one file into the copy; its SHA-256, and whether the copy had it already."""
+        """Copy one file; returns its SHA-256, and whether the copy had it already."""
         size = self._target.size(entry.name)
         if size is not None:
             there = self._target.sha256(entry.name, self._step, from_disk=True)

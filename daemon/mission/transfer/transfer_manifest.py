@@ -1,4 +1,4 @@
-"""What a copy knows about itself: `transfer.json` in the copy's folder.
+"""Manifest of a copy: `transfer.json` in the copy's folder.
 
 It goes through three states, each written durably before anything that depends on it is done:
 

@@ -26,7 +26,7 @@ REMOVING_SUFFIX = ".removing"
 
 
 def removing_path(source: Path) -> Path:
-    """Where a source is moved to before its first file is removed."""
+    """Folder a source is moved to before its first file is removed."""
     return source.with_name(f".{source.name}{REMOVING_SUFFIX}")
 
 
@@ -57,8 +57,8 @@ def remove_sealed_source(source: FileTree, manifest: TransferManifest, target: P
     """Remove a source that is as it was copied.
 
     Args:
-        source: the mission's folder; the caller has compared it with the note.
-        note: of the copy, sealed.
+        source: the mission's folder; the caller has compared it with the manifest.
+        manifest: of the copy, sealed.
         target: the copy, for the mark.
 
     Raises:

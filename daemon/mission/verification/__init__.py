@@ -1,1 +1,1 @@
-"""What a mission holds against its chain of hashes, and recovery after a crash."""
+"""Verification of a mission by its hash chain, and recovery after a crash."""

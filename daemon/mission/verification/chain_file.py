@@ -45,7 +45,7 @@ class LogSeal:
 
 @dataclass(frozen=True)
 class History:
-    """What the lines of a chain file say, up to the moment it was read.
+    """Content of a chain file, up to the moment it was read.
 
     Attributes:
         exists: False where there is no chain file.
@@ -196,7 +196,7 @@ class ChainFile:
         return True
 
     def close(self) -> None:
-        """Let go of the file; may be called twice."""
+        """Close the file; may be called twice."""
         if self._descriptor is not None:
             os.close(self._descriptor)
             self._descriptor = None

@@ -84,7 +84,7 @@ def recover(mission: Mission, complete: Complete, *, software: str = "") -> Reco
 
 @dataclass
 class _Log:
-    """What the flight logs hold of the exposures that need it."""
+    """Records of the flight logs for the exposures that need them."""
 
     triggers: dict[int, tuple[str, LoggedTrigger]] = field(default_factory=dict)
     sheet: Mapping[str, Any] | None = None

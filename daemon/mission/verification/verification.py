@@ -57,7 +57,7 @@ class CoveredFiles:
 
 @dataclass(frozen=True)
 class VerifyReport:
-    """What was checked, what was not, and one message for every problem.
+    """Result of a verification: checked parts, skipped parts, and one message for every problem.
 
     `state` is a key of `STATES`; `remarks` are limits of what could be noticed.
     """
@@ -364,7 +364,7 @@ class _Verification:
             )
 
     def _entries(self) -> None:
-        """What has no place in a mission."""
+        """Files that do not belong in a mission."""
         for path in self.inventory.special_files:
             self.problems.append(
                 f"{path}: is a link, a pipe or a device; it was not followed. A mission holds "

@@ -28,7 +28,7 @@ ByteProgress = Callable[[int], None]
 
 @dataclass(frozen=True)
 class ExpectedExposure:
-    """What is known of an exposure before its folder is looked into.
+    """Expected state of an exposure, before its folder is read.
 
     `names` are the plain files and folders in it, `odd` links and pipes, which are not opened;
     `record_sha256` are the hashes of all records that were sealed under its number; `is_chained`
@@ -50,7 +50,7 @@ class ExpectedExposure:
 
 @dataclass
 class FoundExposure:
-    """What its folder holds. `covered` names files by what they are and where their hash is."""
+    """Content of its folder. `covered` names files by their kind and the place of their hash."""
 
     number: int
     name: str

@@ -64,7 +64,7 @@ class CheckPoints:
 
 @dataclass(frozen=True)
 class Project:
-    """What is adjusted, how, and its check points."""
+    """A network, the settings of its adjustment, and its check points."""
 
     name: str
     file: ProjectFile

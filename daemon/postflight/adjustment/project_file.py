@@ -20,7 +20,7 @@ class _ProjectSection(BaseModel):
 
 
 class AdjustSection(_ProjectSection):
-    """How to adjust."""
+    """Settings of the adjustment."""
 
     robust: bool = False
     reject_beyond: float | None = Field(default=None, gt=1.0)
@@ -42,7 +42,7 @@ class AdjustSection(_ProjectSection):
 
 
 class FilesSection(_ProjectSection):
-    """Where the tables are, relative to the project file."""
+    """Paths of the tables, relative to the project file."""
 
     images: str = "images.csv"
     image_points: str = "image_points.csv"
@@ -84,7 +84,7 @@ class CameraSection(_ProjectSection):
 
 
 class AdjustmentHeadSection(_ProjectSection):
-    """Where a camera sits against the others of an exposure."""
+    """Pose of a camera relative to the others of an exposure."""
 
     name: str
     omega_deg: float = 0.0

@@ -140,7 +140,7 @@ def write_results(
 def fill_results(
     folder: Path, project: Project, result: Adjustment, report: Mapping[str, Any]
 ) -> None:
-    """As `write_results`, into the folder of `new_project`."""
+    """Like `write_results`, into the folder of `new_project`."""
     network = result.network
     _write_project(folder, project.file, network, project.checks, result.state)
     sigma = result.sigma0 * np.sqrt(np.clip(np.einsum("nii->ni", result.point_cofactor), 0.0, None))

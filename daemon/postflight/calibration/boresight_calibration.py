@@ -68,7 +68,7 @@ class BoresightError(DaemonError, ValueError):
 
 @dataclass(frozen=True)
 class BoresightComparison:
-    """What was compared: names of exposures, both orientations, and what came out."""
+    """A comparison: names of exposures, both orientations, and the result."""
 
     names: tuple[str, ...]
     inertial: InertialOrientations
@@ -143,7 +143,7 @@ def inertial_table(
 
 
 def system_of(project: Path, crs: str | None) -> str | LocalFrame:
-    """What the coordinates of a project are in: `crs`, or the frame file next to it.
+    """Coordinate system of a project: `crs`, or the frame file next to it.
 
     Raises:
         BoresightError: neither is there.

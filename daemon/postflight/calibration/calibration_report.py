@@ -1,4 +1,4 @@
-"""What every calibration hands over: a dated folder with numbers, a comparison and a report.
+"""Output of every calibration: a dated folder with numbers, a comparison and a report.
 
 A calibration is never overwritten: its folder is new, complete when it has its name, and holds
 `calibration.json` (what programs read, the next calibration's "previous") and `report.html`
@@ -257,7 +257,7 @@ def write_calibration(
 
 
 def refuse_existing(folder: Path) -> None:
-    """Before anything is computed: a folder that is there stays as it is.
+    """Refuse an existing folder, before anything is computed.
 
     Raises:
         CalibrationFolderError: it exists.
@@ -270,9 +270,9 @@ def refuse_existing(folder: Path) -> None:
 
 @dataclass(frozen=True)
 class CalibrationFolder:
-    """Where a new calibration will lie: in `folder`, or in one named by its id in `parent`.
+    """Place of a new calibration: in `folder`, or in one named by its id in `parent`.
 
-    `name` is what its id begins with; a digest of its content follows (`identified`).
+    `name` is what its id begins with; a digest of its content follows (`content_digest`).
     """
 
     name: str
@@ -287,7 +287,7 @@ class CalibrationFolder:
 def calibration_folder(
     out: Path | None, stem: str, date: str, *, next_to: Path
 ) -> CalibrationFolder:
-    """Where a new calibration will lie, before anything is computed.
+    """Choose the folder of a new calibration, before anything is computed.
 
     Args:
         out: the requested folder; None takes one next to `next_to`, which the calibration is made

@@ -206,7 +206,7 @@ def _table(found: RelativeOrientations, unit: str, factor: float) -> ReportTable
 
 
 def _plots(found: RelativeOrientations) -> tuple[Plot, ...]:
-    """What single exposures are off the averages, head by head."""
+    """Deviations of single exposures from the averages, head by head."""
     return tuple(
         Plot(
             f"Head {head.head}: single exposures less average",

@@ -1,4 +1,4 @@
-"""What flown missions say about the camera's drift, gathered from their records and products.
+"""Observations of the camera's drift in flown missions, gathered from their records and products.
 
 The mathematics is in `processing.calibration.thermal_learning`; a proposal is written as a rig file
 of its own, in place of nothing.
@@ -42,7 +42,7 @@ class ThermalCalibrationError(DaemonError, ValueError):
 
 @dataclass(frozen=True)
 class ThermalRecords:
-    """All that the missions gave. `skipped` are sentences; `estimates` by mission and number
+    """Data of the missions. `skipped` are messages; `estimates` by mission and number
     of the exposure."""
 
     rig: Rig

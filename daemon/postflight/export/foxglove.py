@@ -89,7 +89,7 @@ _TopicMessage = tuple[int, str, str, dict[str, Any]]
 
 @dataclass(frozen=True)
 class FoxgloveExport:
-    """What was written: messages by topic, and the exposures that could not be read."""
+    """Written messages by topic, and the exposures that could not be read."""
 
     file: Path
     messages: dict[str, int]

@@ -216,7 +216,7 @@ def _cog(
 def _ground_control(
     picture: Level2Image, georeference: Georeference, ground_m: float, width: int, height: int
 ) -> list[Any]:
-    """Where pixels of a grid fall on level ground; rows and columns count from the corner."""
+    """Positions of grid pixels on level ground; rows and columns count from the corner."""
     from rasterio.control import GroundControlPoint
 
     columns, rows = np.meshgrid(np.linspace(0, width - 1, GRID), np.linspace(0, height - 1, GRID))

@@ -48,7 +48,7 @@ from processing.rig import Rig
 
 @dataclass(frozen=True)
 class OrientationSet:
-    """What was written, and against which earlier set it differs by how much.
+    """The written set, and its differences from an earlier set.
 
     `change_m` and `change_deg` are the greatest differences of position and of any axis's
     direction against the in-flight orientation of the same images; None where there is none.

@@ -27,7 +27,7 @@ NATIVE_SUFFIXES = {
     "nmea": "nmea",
     "mavlink": "raw",
 }
-"""How post-processing software expects a receiver's recording to be called, by driver."""
+"""File name that post-processing software expects for a receiver's recording, by driver."""
 
 EVENT_COLUMNS = (
     "exposure",
@@ -53,7 +53,7 @@ _WEEK_NS = 604_800_000_000_000
 
 @dataclass(frozen=True)
 class RawExport:
-    """What was written: bytes by file name, and how many exposures are in the event file.
+    """Written bytes by file name, and the number of exposures in the event file.
 
     Exposures whose record cannot be read are in `failures`, and in no file.
     """

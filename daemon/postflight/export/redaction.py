@@ -1,4 +1,4 @@
-"""What is left out of a document before it is given away: secrets, by their key or form.
+"""Redaction of a document before it is shared: secrets, by their key or form.
 
 Documents are parsed first, so that neither quoting nor line breaks hide a key. What cannot be
 parsed is not for these functions: it is left out as a whole.

@@ -1,4 +1,4 @@
-"""What support needs to see of a mission, in one file: no pixels, no raw bytes, no secrets.
+"""Support bundle of a mission, in one file: no pixels, no raw bytes, no secrets.
 
 Configuration, rig, records and verdicts, messages of the devices and the service, the ledger, and
 the versions of everything. Secrets are left out of all of it

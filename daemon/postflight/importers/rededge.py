@@ -83,7 +83,7 @@ class RedEdgeImage:
 
 @dataclass(frozen=True)
 class ImportedMission:
-    """What was written: the mission, its exposures, and how well each lens was carried over."""
+    """The written mission, its exposures, and the residuals of each converted lens."""
 
     mission: Mission
     exposures: int

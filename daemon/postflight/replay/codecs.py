@@ -83,7 +83,7 @@ class Codec:
         self._line = SerialLine(port, lambda _data: None)
 
     def decode(self, chunks: Iterable[RawBytes]) -> list[Decoded]:
-        """What these bytes mean, after those before them."""
+        """Records decoded from these bytes, after those before them."""
         self._port.chunks.extend(chunks)
         if self._port.chunks:
             self._clock.now_ns = max(self._clock.now_ns, self._port.chunks[0].mono_ns)

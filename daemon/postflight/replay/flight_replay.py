@@ -46,12 +46,12 @@ from processing.quality.report import Flag
 from processing.rig import Rig
 
 IdentityFactory = Callable[[str], FlightIdentity]
-"""What every record of a run repeats, by the boot its log names."""
+"""Identity repeated in every record of a run, by the boot its log names."""
 
 
 @dataclass
 class ReplayResult:
-    """What a run became the second time.
+    """Result of replaying a run.
 
     `records` are the sealed exposures in their order; `deferred` those the pipeline read from disk
     in the air. `agreements` and `disagreements` count by what was compared; `sentences` say more of
@@ -80,7 +80,7 @@ class ReplayResult:
         self.is_complete = self.is_complete and other.is_complete
 
     def as_json(self) -> dict[str, Any]:
-        """What was compared, as plain JSON types."""
+        """The comparisons, as plain JSON types."""
         names = sorted(self.agreements.keys() | self.disagreements.keys())
         return {
             "agrees": self.agrees,

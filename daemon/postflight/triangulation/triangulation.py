@@ -62,7 +62,7 @@ class TriangulationError(DaemonError, ValueError):
 
 @dataclass(frozen=True)
 class TriangulationSettings:
-    """How to triangulate.
+    """Options of a triangulation.
 
     `parameters` is the set of additional parameters, `interior` whether it holds the interior
     orientation. Sigmas: position (3,) m east, north, up; attitude (3,) rad about the camera's axes.
@@ -102,7 +102,7 @@ class ImageBlock:
 
     @property
     def camera(self) -> str:
-        """What the images' common camera is called."""
+        """Name of the images' common camera."""
         heads = dict.fromkeys(eo.cone for eo in self.oriented if not eo.is_virtual)
         return "-".join(heads) or "stitched"
 

@@ -41,7 +41,7 @@ _CONVERGED_MM: Final = 5e-5
 
 @dataclass(frozen=True)
 class RigCalibration:
-    """What was found: the rig with its new places, and the last adjustment, whose cofactor holds
+    """Result: the rig with its new places, and the last adjustment, whose cofactor holds
     for them."""
 
     rig: Rig

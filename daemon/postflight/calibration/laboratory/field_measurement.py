@@ -144,7 +144,7 @@ def measure_targets(
 def _predicted(
     rig: Rig, sensor: Sensor, exposure: FieldExposure, field: TargetField
 ) -> tuple[Array, NDArray[np.int64]]:
-    """Where the nominal rig would see targets, px, and which these are."""
+    """Positions of targets by the nominal rig, px, and their ids."""
     cone = rig.cone_of(sensor.name)
     centre = exposure.position_m + exposure.object_from_rig @ offset_m(rig, cone)
     ray = (field.xyz_m - centre) @ exposure.object_from_rig @ rotation_matrix(*cone.rotation_rad)

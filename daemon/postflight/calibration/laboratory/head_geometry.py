@@ -73,7 +73,7 @@ class Target:
 
 @dataclass(frozen=True)
 class HeadGeometry:
-    """What was found of a head: the matching, the adjustment, and the grid on top.
+    """Result of a head: the matching, the adjustment, and the grid on top.
 
     `measured_mm`, `residual_mm` (n, 2) of the targets used; `grid_residual_mm` (n, 2) what a grid
     made of the other half of the targets leaves.

@@ -157,7 +157,7 @@ def _parameters(heads: Sequence[HeadGeometry]) -> ReportTable:
 
 
 def _at_corner_um(head: HeadGeometry, p: EstimatedParameter) -> float:
-    """What one sigma of a parameter moves the corner of the field by."""
+    """Displacement of the corner of the field by one sigma of a parameter."""
     half = np.array([head.sensor.width_px, head.sensor.height_px]) * head.sensor.pitch_mm / 2.0
     x, y = (float(v) for v in half)
     r2 = x * x + y * y

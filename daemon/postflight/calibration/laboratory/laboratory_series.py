@@ -32,7 +32,7 @@ class SeriesError(DaemonError, ValueError):
 
 @dataclass(frozen=True)
 class LaboratorySeries:
-    """What holds for the whole series. `table` answers for the keys of its kind, `images` are the
+    """Properties of the complete series. `table` answers for the keys of its kind, `images` are the
     single ones; `checked` ends the asking."""
 
     folder: Path

@@ -63,7 +63,7 @@ class CalibrationShot:
 
 @dataclass(frozen=True)
 class HeadCalibration:
-    """What was found of one sensor.
+    """Result of one sensor.
 
     `signal_per_light` is the mean signal of the main flat set per monitored light and second.
     `gain`, at `gain_c`, has a relative standard deviation of `gain_noise` a pixel; `response_per_k`
@@ -275,7 +275,7 @@ def checks_of(
 
 
 def common_level(heads: Sequence[HeadCalibration], pan: set[str]) -> dict[str, float]:
-    """What to multiply each head's gain by so that PAN heads agree before one light.
+    """Factor of each head's gain with which PAN heads agree before one light.
 
     The most sensitive PAN head keeps the gain of one where it sees most; colour heads, whose bands
     the monitor does not distinguish, each have their own.

@@ -29,7 +29,7 @@ _SAME_TEMPERATURE_K: Final = 2.0
 
 
 def quantities_of(head: HeadCalibration) -> list[Quantity]:
-    """What the next calibration of this sensor is compared with."""
+    """Values of this sensor that the next calibration is compared with."""
     where, t = head.sensor.name, head.transfer
     pixels = float((head.defects.mask == 0).sum())
     level = float(np.median(head.dark.dark_dn_per_s))
