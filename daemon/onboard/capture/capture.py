@@ -1,7 +1,7 @@
 """The capture process: every device of the rig, each in its own thread.
 
 The only process that imports GigE Vision and friends. Records go to the service as they come;
-frames lie in shared memory and only their slot numbers travel.
+frames stay in shared memory and only their slot numbers are sent.
 """
 
 from __future__ import annotations
@@ -120,7 +120,7 @@ class _Capture:
         self.link.send(record)
 
     def _run_trigger(self) -> None:
-        """The trigger in a thread of its own: a slow unit holds up no frame."""
+        """Run the trigger in a separate thread: a slow unit delays no frame."""
         if self.trigger_spec is None:
             return
         spec = self.trigger_spec

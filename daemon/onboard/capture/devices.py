@@ -1,4 +1,4 @@
-"""The devices a configuration asks for, and what the rig has to say about them."""
+"""The devices of a configuration, and their agreement with the rig."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from drivers.contract import CHUNK_ALLOWANCE_NBYTES
 from processing.rig import Rig
 
 _FRAME = re.compile(r"(\d+) x (\d+) (\S+)")
-"""How heads say what their frames are."""
+"""Format of a head's property `frame`."""
 
 
 def device_specs(configuration: Configuration, rig: Rig) -> tuple[DeviceSpec, ...]:
@@ -33,7 +33,7 @@ def device_specs(configuration: Configuration, rig: Rig) -> tuple[DeviceSpec, ..
 
 
 def frame_nbytes(rig: Rig, sensor_name: str) -> int:
-    """Bytes of a sensor's frame in memory, 16 bit, with room for chunk data."""
+    """Bytes of a sensor's frame in memory, 16 bit, with space for chunk data."""
     sensor = rig.sensor(sensor_name)
     return sensor.width_px * sensor.height_px * 2 + CHUNK_ALLOWANCE_NBYTES
 

@@ -1,4 +1,4 @@
-"""Whether others are on the network of the heads: there somebody can send in a head's name."""
+"""Check whether other computers share the network of the heads and could forge their frames."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Route:
 
 
 def head_network(configuration: Configuration, _rig: Rig) -> Iterator[CheckResult]:
-    """A caution for each network that heads share with others; it keeps nobody from flying."""
+    """A caution for each network that heads share with others; it does not prevent a flight."""
     heads = {
         head.sensor: address
         for head in configuration.head
@@ -84,9 +84,9 @@ def cautions_of(
             why.insert(0, "the default route leads there")
         if why:
             found[interface] = (
-                f"{_listed(sensors)} on a network shared with others ({', '.join(why)}): who "
-                "forges the address of a head there can put pixels into its frames. Give the "
-                "heads an interface of their own"
+                f"{_listed(sensors)} on a network shared with others ({', '.join(why)}): a "
+                "computer that forges a head's address there can alter its frames. Give the "
+                "heads a separate interface"
             )
     return found
 

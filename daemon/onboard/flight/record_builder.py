@@ -1,4 +1,4 @@
-"""The record of an exposure, composed of what was found out about it, and its instant.
+"""The record of an exposure and its instant.
 
 Pure functions; which mark and which frames belong to an exposure is decided in
 `daemon.onboard.flight.flight`.

@@ -1,8 +1,8 @@
-"""Exposures in work side by side: a few processors with buffers of their own, and their threads.
+"""Parallel processing of exposures: several processors with separate buffers, and their threads.
 
-One exposure leaves cores idle wherever its work cannot be shared out (adjustment, seams, writing);
-a second one fills them. Every exposure goes through one processor alone, so what comes out does not
-depend on what its neighbour does.
+One exposure leaves cores idle where its work is serial (adjustment, seams, writing); a second one
+uses them. Each exposure is processed by one processor alone, so the result does not depend on the
+others.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ Result = TypeVar("Result")
 
 
 class Cloneable(Protocol):
-    """What makes images of one exposure at a time, and can be had several times."""
+    """A processor of one exposure at a time that can be cloned."""
 
     def clone(self: PipelineT) -> PipelineT:
-        """Another with buffers of its own; calibrations are shared."""
+        """Another processor with separate buffers and shared calibrations."""
 
 
 PipelineT = TypeVar("PipelineT", bound=Cloneable)
@@ -32,8 +32,8 @@ class PipelinePool(Generic[PipelineT]):
 
     Args:
         first: warmed up; the others share its calibrations.
-        count: exposures in work at a time. Where numba has only its own thread pool ("workqueue"),
-            which two threads may not enter, it is one.
+        count: exposures processed at a time. It is one if numba has only its own thread pool
+            ("workqueue"), which two threads may not enter.
     """
 
     def __init__(self, first: PipelineT, count: int) -> None:
@@ -45,11 +45,11 @@ class PipelinePool(Generic[PipelineT]):
         self._threads = ThreadPoolExecutor(self.count, thread_name_prefix="exposure")
 
     def submit(self, task: Callable[[PipelineT], Result]) -> Future[Result]:
-        """Run a task with a processor of its own, as soon as one is free."""
+        """Run a task with an exclusive processor, as soon as one is free."""
         return self._threads.submit(self._run, task)
 
     def end(self) -> None:
-        """Finish what is in work and let the threads go."""
+        """Finish running tasks and end the threads."""
         self._threads.shutdown()
 
     def _run(self, task: Callable[[PipelineT], Result]) -> Result:

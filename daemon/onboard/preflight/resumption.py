@@ -44,7 +44,7 @@ def resume(
         mission: what was being flown.
         configuration: the one in force.
         configured: the rig that it names.
-        config_path: where it lies, for the command that begins a new mission.
+        config_path: its path, for the command that begins a new mission.
     """
     new_mission_command = f"syntopic run {config_path} --new-mission"
     try:

@@ -1,4 +1,4 @@
-"""A flight without a mission: the processes that `run` starts, until each has proven what it does.
+"""A flight without a mission: the processes of `run`, until each device and process is verified.
 
 The same builders, messages and arming rules as in flight (`daemon.onboard.service.startup`,
 `daemon.onboard.preflight.preflight`); nothing is written, and nothing is fired unless that is asked
@@ -55,7 +55,7 @@ BIND_TIMEOUT_S: Final = 25.0
 DATA_TIMEOUT_S: Final = 10.0
 """From when every device has answered: a receiver that is not sure of its time by then searches."""
 KERNELS_TIMEOUT_S: Final = 120.0
-"""Loading takes seconds; compiling may take minutes, and is not waited for."""
+"""Loading takes seconds; compiling may take minutes and is not awaited."""
 STEP_S: Final = 0.1
 WITHOUT_MARKS: Final = frozenset({"gpsd"})
 """Drivers of receivers that have no event marks."""
@@ -68,11 +68,11 @@ ACTIONS: Final = {
 }
 """By what is missing (`drivers.receivers.fix_monitor.missing_for_flight`)."""
 ARRIVING_LATER: Final = frozenset({"arming-time", "arming-navigation", "arming-kernels"})
-"""What comes by itself where nothing else fails."""
+"""Prerequisites that are met later without action if nothing else fails."""
 
 
 class SystemCheck(MessageDispatcher):
-    """Starts what a flight needs, and finds out of each part whether it is there.
+    """Starts the processes of a flight and verifies each part.
 
     Args:
         configuration: what is tried.

@@ -31,9 +31,9 @@ from drivers.contract import (
 )
 
 EARLY_FRAME_LIMIT_NS: Final = 12_000_000_000
-"""So long a frame waits for the answer to a trigger; a trigger answers within ten seconds."""
+"""Longest wait of a frame for the answer to its trigger, which comes within ten seconds."""
 _NOT_AWAITED = frozenset({"lost", "absent"})
-"""Heads are not waited for from then on."""
+"""Device events after which a head is not awaited."""
 
 
 class EmitEvent(Protocol):

@@ -188,14 +188,14 @@ class Mirror(MessageDispatcher):
         return named
 
     async def save(self, name: str, data: bytes) -> None:
-        """As `save_now`, and nobody waits for the disk."""
+        """As `save_now`, without blocking the event loop."""
         if self._is_with_writer:
             self.save_now(name, data)
         else:
             await asyncio.to_thread(self.save_now, name, data)
 
     def save_now(self, name: str, data: bytes) -> None:
-        """Keep a small file below the root of every disk in use.
+        """Save a small file below the root of every disk in use.
 
         Raises:
             OSError: the only disk refused.
@@ -211,13 +211,13 @@ class Mirror(MessageDispatcher):
         return bool(self._disks) and not self._has_landed
 
     def land(self, *, ends_mission: bool) -> None:
-        """The writer is about to end; with `ends_mission` nobody is to go on with the mission."""
+        """The writer is about to end; with `ends_mission` the mission is not resumed."""
         self._has_landed = True
         if self._disks and ends_mission:
             self._send("writer", EndMission())
 
     def release(self, label: str) -> str | None:
-        """Have a disk taken out of use, so that it can be unmounted; why not, if it cannot be."""
+        """Release a disk, so that it can be unmounted; return the reason if that is refused."""
         refusal = self._refusal(label)
         if refusal is None and label not in [disk.label for disk in self._in_use]:
             refusal = f"disk {label} is not in use; it may be unmounted"
@@ -228,7 +228,7 @@ class Mirror(MessageDispatcher):
         return refusal
 
     def accept(self, label: str) -> str | None:
-        """Have whatever disk is there now brought up to date and used; why not, if it cannot be."""
+        """Synchronize and use the disk mounted there; return the reason if that is refused."""
         refusal = self._refusal(label)
         if refusal is None and label in [disk.label for disk in self._in_use]:
             refusal = f"disk {label} is in use; release it first"

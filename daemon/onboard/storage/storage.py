@@ -55,7 +55,7 @@ class Storage(Protocol):
 
 
 class OneDisk:
-    """A mission on one disk, written where it is asked for."""
+    """A mission on one disk, written in the calling thread."""
 
     def __init__(self, mission: Mission) -> None:
         self._mission = mission
@@ -82,7 +82,7 @@ class OneDisk:
         self._writer.note_products(number, files, verdict)
 
     def tick(self) -> None:
-        """One disk is waited for, however long it takes."""
+        """Nothing to do: a single disk is awaited without a time-out."""
 
     def close(self) -> None:
         self.log.close()

@@ -42,7 +42,7 @@ WANDER_PRIOR_SIGMA: Final = 1.5
 """Crystals in a case that warms and cools wander by about 2 ppb after a second (log10 of its square
 here), one in three by six times more or less."""
 SCALE_SPREAD: Final = math.log(2.0)
-"""Stated sigmas are believed to a factor of two, before they are looked at."""
+"""Prior of the scale of stated sigmas: a factor of two."""
 OUTLIER: Final = 4.0
 """A pair so many sigmas off the others loses weight, or is held back as it comes."""
 GATE_SHARE: Final = 4

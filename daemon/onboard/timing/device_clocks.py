@@ -30,7 +30,7 @@ class HostInstant:
 
 
 class DeviceClockEstimator:
-    """One device's clock. Readings in, instants out; nothing here looks at a clock."""
+    """One device's clock. A pure model: it reads no clock itself."""
 
     def __init__(self) -> None:
         self._model = ClockModel()
@@ -66,7 +66,7 @@ class DeviceClockEstimator:
     def at(self, device_ns: int) -> HostInstant | None:
         """Host time of a device's instant; None before the first reading.
 
-        What both halves of all round trips may differ by alike is part of the sigma.
+        The common asymmetry of all round trips is part of the sigma.
         """
         estimate = self._model.at(device_ns)
         if estimate is None:

@@ -34,7 +34,7 @@ LONG_GAP_NS: Final = 100 * SECOND_NS
 SECOND_TOLERANCE_NS: Final = 100_000_000
 ROUND_TRIPS_MAX: Final = 32
 UNUSUAL_RATIO: Final = 1.7
-"""A round trip so many times the median is one that somebody was late in."""
+"""A round trip longer than this multiple of the median was delayed."""
 RESIDUALS_MAX: Final = 64
 PRIOR_WEIGHT: Final = 4.0
 """How many readings the stated sigma of a pulse's host time weighs against what is seen."""
@@ -75,8 +75,8 @@ class ClockEvent:
 class RoundTrips:
     """How well the middle of a round trip is the moment asked about, from recent round trips.
 
-    What is usual is taken as jitter of a constant size, since nobody knows which way took longer;
-    what a round trip is longer than is still usual counts in full.
+    What is usual is taken as jitter of a constant size, since the asymmetry is unknown;
+    the excess of a longer round trip counts in full.
     """
 
     def __init__(self) -> None:
@@ -93,8 +93,8 @@ class RoundTrips:
 
     @property
     def systematic_ns(self) -> float:
-        """How unsure it is by how much all are late alike: one way takes at most three times the
-        other, and both together the shortest round trip."""
+        """Uncertainty of the common delay: one way takes at most three times the other, and both
+        together the shortest round trip."""
         return min(self._halves, default=0) / 2 / math.sqrt(3)
 
     def sigma_ns(self, half_width_ns: int) -> float:
@@ -144,7 +144,7 @@ class _PulseLateness:
 
 
 class GpsClock:
-    """GPS time of host instants. Everything is handed in; nothing here looks at a clock."""
+    """GPS time of host instants. A pure model: it reads no clock itself."""
 
     def __init__(self) -> None:
         self._marks = ClockModel()
@@ -267,7 +267,7 @@ class GpsClock:
             found.append(self._as_gps_estimate(pps, sigma_ns, "pps", mono_ns))
         marks = self._marks.at(mono_ns)
         if marks is not None:
-            # All pulses may be late alike.
+            # All pulses may have a common delay.
             sigma_ns = math.hypot(marks.sigma_ns, self.round_trips.systematic_ns)
             found.append(self._as_gps_estimate(marks, sigma_ns, "marks", mono_ns))
         if found:
@@ -277,7 +277,7 @@ class GpsClock:
     def pulse_at(self, mono_ns: int, half_width_ns: int) -> GpsEstimate | None:
         """GPS time of a pulse whose host time is known to half its round trip.
 
-        What all pulses are late by alike is known from the marks of others, and is in here.
+        The common delay of all pulses is estimated from other marks and is included.
         """
         reading_ns = self.round_trips.sigma_ns(half_width_ns)
         found = []
@@ -381,7 +381,7 @@ class GpsClock:
         return GpsEstimate(mono_ns - minimum + centre, COARSE_SIGMA_NS, True, "messages")
 
     def _pps_systematic_ns(self) -> float:
-        """What all edges may be late by alike: as stated, or more where they scatter by more."""
+        """Common delay of all edges: as stated, or more if they scatter by more."""
         return self._pps_sigma_ns * max(1.0, self._pps.reading_scale() / SCATTER_RATIO_MAX)
 
     def _through_pps(self, mono_ns: int) -> Estimate | None:

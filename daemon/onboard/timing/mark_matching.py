@@ -1,7 +1,7 @@
 """Which event mark belongs to which pulse: an assignment that may be revised until it is sealed.
 
 A mark is given to a pulse only where its time fits that pulse and no other, and where neither its
-count nor its arrival speaks for another. What cannot be decided is held, and looked at again
+count nor its arrival speaks for another. An ambiguous mark stays pending, and is evaluated again
 whenever something new is known; what belongs nowhere in the end is spurious.
 
 Source: docs/mathematics/time.md#which-mark-belongs-to-which-pulse.
@@ -35,7 +35,7 @@ SAME_NS: Final = 1_000
 MARKS_TO_REASSIGN: Final = 2
 DUPLICATES_MAX: Final = 256
 PENDING_MAX: Final = 32
-"""A strobe line full of noise must not cost the service its time: the oldest are given up."""
+"""Limits the time spent on a noisy strobe line: the oldest marks are given up."""
 PAIRS_MAX: Final = 100
 
 
@@ -311,7 +311,7 @@ class MarkMatcher:
     # Several marks
 
     def _reassign(self) -> None:
-        """Marks that fit nothing but fit pulses alike, all shifted by the same: then the clock is
+        """Marks that match no pulse, but do so after one common shift: then the clock is
         wrong, not they. Only where there is one such shift."""
         pairs = [
             (pending, pulse)

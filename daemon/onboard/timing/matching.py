@@ -1,7 +1,7 @@
 """Which frame and which event mark belong to which pulse: by time and by count, never by order.
 
-Pure and revisable: it knows pulses, frames and marks, no deadlines and no disk. What fits nothing,
-or two pulses alike, stays unmatched and is named. Marks are in
+Pure and revisable: it knows pulses, frames and marks, no deadlines and no disk. What matches no
+pulse, or two equally, stays unmatched and is reported. Marks are in
 `daemon.onboard.timing.mark_matching`.
 """
 
@@ -39,7 +39,7 @@ STARTS_TO_RELEARN: Final = 3
 """So many unusual starts in succession that agree are the new usual."""
 SPURIOUS_MAX: Final = 3
 SPURIOUS_WINDOW_NS: Final = 1_500_000_000
-"""A head that sent so many frames nobody asked for within this time is not believed."""
+"""A head that sent this many unrequested frames within this time is not trusted."""
 
 
 @dataclass
@@ -52,10 +52,10 @@ class _HeadHistory:
     """How much later than by their pulses exposures began, by the head's clock."""
     unusual_starts_ns: deque[int] = field(default_factory=lambda: deque(maxlen=STARTS_TO_RELEARN))
     spurious_ns: deque[int] = field(default_factory=lambda: deque(maxlen=SPURIOUS_MAX))
-    """When exposures began that nobody asked for."""
+    """Start times of unrequested exposures."""
 
     def is_suspect(self, start_ns: int) -> bool:
-        """Whether so many frames came unasked for that one among them may be near by chance."""
+        """Whether there were so many unrequested frames that one may match by chance."""
         full = len(self.spurious_ns) == SPURIOUS_MAX
         return full and abs(start_ns - self.spurious_ns[0]) < SPURIOUS_WINDOW_NS
 

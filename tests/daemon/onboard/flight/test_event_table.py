@@ -13,6 +13,7 @@ ROOT = Path(__file__).parents[4]
 EMITTERS = {
     "_event": "",
     "_emit": "",
+    "_emit_event": "",
     "emit": "device/",
     "emit_throttled": "device/",
     "_alarm": "device/",

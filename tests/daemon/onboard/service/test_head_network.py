@@ -43,8 +43,8 @@ def test_heads_on_the_interface_of_the_default_route_share_it() -> None:
     found = cautions_of(heads("192.168.1.11"), ROUTES, HEADER)
     assert found == {
         "eth0": "head SU00 is on a network shared with others (the default route leads there): "
-        "who forges the address of a head there can put pixels into its frames. Give the heads "
-        "an interface of their own"
+        "a computer that forges a head's address there can alter its frames. Give the heads a "
+        "separate interface"
     }
 
 
