@@ -238,6 +238,10 @@ class ProcessingSection(_ConfigurationSection):
     @field_validator("thresholds")
     @classmethod
     def _check_thresholds(cls, given: dict[str, float]) -> dict[str, float]:
+        if "burnt_overlap_fraction" in given:
+            raise ValueError(
+                "burnt_overlap_fraction is now named saturated_overlap_fraction; rename it"
+            )
         unknown = sorted(given.keys() - {field.name for field in fields(Thresholds)})
         if unknown:
             raise ValueError(

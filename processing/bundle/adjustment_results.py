@@ -24,7 +24,7 @@ SIGNIFICANT_T = 2.0
 
 
 @dataclass(frozen=True)
-class EstimatedParameter:
+class AdjustedParameter:
     """One parameter of interior orientation, in `unit`; `t` is |value| / sigma.
 
     `high_correlations` names parameters of the same camera with a correlation beyond 0.95.
@@ -88,7 +88,7 @@ class ResidualPattern:
     count: NDArray[np.int64]
 
 
-def parameters_of(result: Adjustment) -> tuple[EstimatedParameter, ...]:
+def parameters_of(result: Adjustment) -> tuple[AdjustedParameter, ...]:
     """Estimated interior orientation and additional parameters of every camera."""
     found = []
     for index, camera in enumerate(result.network.cameras):
@@ -109,7 +109,7 @@ def parameters_of(result: Adjustment) -> tuple[EstimatedParameter, ...]:
                 if j != k and abs(correlation[k, j]) > HIGH_CORRELATION
             ]
             found.append(
-                EstimatedParameter(
+                AdjustedParameter(
                     camera.name,
                     names[at],
                     unit,

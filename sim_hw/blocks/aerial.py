@@ -26,7 +26,7 @@ _PATTERN_GRID = 25
 
 
 @dataclass(frozen=True)
-class FlightLine:
+class ImageStrip:
     """One flight line: start, heading (degrees, clockwise from north), frames, height."""
 
     name: str
@@ -74,7 +74,7 @@ class MeasurementErrors:
 class AerialBlockPlan:
     """Strips, ground, and how densely tie points are matched."""
 
-    strips: tuple[FlightLine, ...]
+    strips: tuple[ImageStrip, ...]
     frame: ImageFormat
     spacing_m: float
     relief_m: float
@@ -183,7 +183,7 @@ def ultracam_l_plan() -> AerialBlockPlan:
         north = k % 2 == 0
         y = -(frames - 1) / 2 * base * (1 if north else -1)
         strips.append(
-            FlightLine(
+            ImageStrip(
                 f"line {k + 1}",
                 ((k - 2.5) * line_spacing, y),
                 0.0 if north else 180.0,
@@ -196,7 +196,7 @@ def ultracam_l_plan() -> AerialBlockPlan:
         east = k % 2 == 0
         x = -12.5 * base * (1 if east else -1)
         strips.append(
-            FlightLine(
+            ImageStrip(
                 f"cross {k + 1}", (x, (k - 1) * 1900.0), 90.0 if east else 270.0, 26, base, height
             )
         )
@@ -211,7 +211,7 @@ def small_plan(frame: ImageFormat = ULTRACAM_L, rig: str = "ultracam-l") -> Aeri
     scale = height / frame.f_mm
     base, line_spacing = 0.4 * frame.half_height_mm * scale, 1.2 * frame.half_width_mm * scale
     strips = [
-        FlightLine(
+        ImageStrip(
             f"line {k + 1}",
             ((k - 1) * line_spacing, -3.5 * base * (1 if k % 2 == 0 else -1)),
             0.0 if k % 2 == 0 else 180.0,
@@ -221,7 +221,7 @@ def small_plan(frame: ImageFormat = ULTRACAM_L, rig: str = "ultracam-l") -> Aeri
         )
         for k in range(3)
     ]
-    strips.append(FlightLine("cross 1", (-2.5 * base, 0.0), 90.0, 6, base, height))
+    strips.append(ImageStrip("cross 1", (-2.5 * base, 0.0), 90.0, 6, base, height))
     spacing = 0.077 * frame.half_width_mm * scale * 2.0
     return AerialBlockPlan(
         tuple(strips), frame, spacing, relief_m=40.0, control=12, checks=20, rig=rig

@@ -103,6 +103,13 @@ def test_a_former_key_is_refused_with_the_present_one(
     assert old in sentence and f"is now named {new}; rename it" in sentence
 
 
+def test_a_former_threshold_is_refused_with_the_present_one() -> None:
+    content = copy.deepcopy(GOOD)
+    content["processing"] = {"thresholds": {"burnt_overlap_fraction": 0.1}}
+    (sentence,) = problems_of(content)
+    assert "is now named saturated_overlap_fraction; rename it" in sentence
+
+
 def test_two_heads_for_one_sensor_are_refused() -> None:
     content = copy.deepcopy(GOOD)
     content["head"].append(dict(content["head"][0], address="127.0.0.3"))

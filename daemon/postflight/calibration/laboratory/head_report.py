@@ -21,7 +21,7 @@ from daemon.postflight.calibration.laboratory.head_geometry import LENS_KEYS, He
 from daemon.postflight.calibration.laboratory.laboratory_report import of_series
 from daemon.postflight.calibration.laboratory.laboratory_series import LaboratorySeries
 from daemon.postflight.calibration.plots import Curve, chart_svg, histogram_svg, vectors_svg
-from processing.bundle.adjustment_results import EstimatedParameter, exposures_of, parameters_of
+from processing.bundle.adjustment_results import AdjustedParameter, exposures_of, parameters_of
 from processing.bundle.network import INTERIOR
 from processing.rig import Rig
 
@@ -156,7 +156,7 @@ def _parameters(heads: Sequence[HeadGeometry]) -> ReportTable:
     )
 
 
-def _at_corner_um(head: HeadGeometry, p: EstimatedParameter) -> float:
+def _at_corner_um(head: HeadGeometry, p: AdjustedParameter) -> float:
     """Displacement of the corner of the field by one sigma of a parameter."""
     half = np.array([head.sensor.width_px, head.sensor.height_px]) * head.sensor.pitch_mm / 2.0
     x, y = (float(v) for v in half)
