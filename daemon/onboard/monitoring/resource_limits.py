@@ -39,7 +39,7 @@ def apply_resource_limits() -> None:
         with suppress(OSError, ValueError):
             resource.setrlimit(kind, (limit, limit))
     with suppress(OSError):
-        os.setpriority(os.PRIO_PROCESS, 0, NICENESS)
+        os.nice(NICENESS)
     with suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text(str(OOM_SCORE), "ascii")
     restrict()

@@ -99,7 +99,7 @@ def run(arguments: list[str], output_file: Path) -> Callable[[], None]:
     """The command as the shell starts it; its status and what it prints go into a file."""
 
     def action() -> None:
-        sys.argv = ["syntopic", *arguments]
+        sys.argv = ["/opt/syntopic/bin/syntopic", *arguments]
         errors = io.StringIO()
         status: object = None
         with redirect_stderr(errors), redirect_stdout(io.StringIO()):
