@@ -15,6 +15,7 @@ from scipy.ndimage import map_coordinates
 
 from benchmarks.silent_errors.exposures import EmulatedExposure
 from benchmarks.uncertainty_consistency import NormalizedErrors, normalized_errors
+from processing.geometry.conditions import reference_exposure_times
 from processing.geometry.placement import vip_mm_from_raw, vip_px_from_mm
 from processing.geometry.projective import apply_projective
 from processing.mosaic.precision import disturbance_covariance_px, placed_covariance_px
@@ -267,8 +268,11 @@ def _compared(
 ) -> tuple[Array, Array, Array]:
     """Raw pixels with data, what the image shows there (DN) and what it should show."""
     cone, sensor = emulated.world.rig.cone_of(name), emulated.rig.sensor(name)
-    look = emulated.snapshot.parameters_by_sensor[name]
-    seconds = look.exposure_time_us * 1e-6
+    looks = emulated.snapshot.parameters_by_sensor
+    times_us = {sensor_name: look.exposure_time_us for sensor_name, look in looks.items()}
+    # The image brings a head that was exposed otherwise to the level of the others of its kind.
+    references_us = reference_exposure_times(emulated.world.rig, times_us)
+    seconds = references_us.get(name, times_us[name]) * 1e-6
     factor = emulated.world.electrons_per_radiance_s(cone) * seconds / sensor.electrons_per_dn
     at = np.clip(np.rint(raw).astype(int), 0, (sensor.width_px - 1, sensor.height_px - 1))
     true = emulated.snapshot.light[name][at[:, 1], at[:, 0]] * factor
