@@ -1,45 +1,78 @@
-"""`syntopic explain`: what an event means, and what helps."""
+"""`syntopic explain`: the meaning of an event or a quality flag."""
 
 from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Sequence
 from dataclasses import asdict
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from daemon.terminal.console import Console
 from daemon.terminal.tables import light_table
 
-HELP = """Explain an event of the service: meaning, cause and corrective action.
+if TYPE_CHECKING:
+    from daemon.onboard.flight.event_table import EventDefinition
+    from daemon.onboard.flight.flag_table import FlagDefinition
 
-Without NAME all events are listed. NAME may be part of a name.
+HELP = """Explain an event of the service or a quality flag: cause and action.
 
-Examples: `syntopic explain lost`, `syntopic explain arming`, `syntopic explain --json`
+Without NAME all are listed. NAME may be part of a name.
+
+Examples: `syntopic explain lost`, `syntopic explain TILT`, `syntopic explain --json`
 """
 
 
 def explain(
-    name: Annotated[str, typer.Argument(help="An event, or part of its name.")] = "",
+    name: Annotated[str, typer.Argument(help="An event or a flag, or part of its name.")] = "",
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
     markdown: Annotated[
         bool, typer.Option("--markdown", help="Output as the page docs/events.md.")
     ] = False,
 ) -> None:
     from daemon.onboard.flight.event_table import TABLE, as_markdown, entry_of
+    from daemon.onboard.flight.flag_table import FLAG_TABLE
 
     if markdown:
         sys.stdout.write(as_markdown())
         return
     exact = entry_of(name)
-    found = [exact] if exact else [entry for entry in TABLE if name in entry.name]
+    events = [exact] if exact else [entry for entry in TABLE if name in entry.name]
+    flags = [] if exact else [entry for entry in FLAG_TABLE if name.upper() in entry.name]
+    if any(entry.name == name.upper() for entry in flags):
+        events = []
+        flags = [entry for entry in flags if entry.name == name.upper()]
     if as_json:
-        sys.stdout.write(json.dumps({"events": [asdict(entry) for entry in found]}) + "\n")
+        content = {
+            "events": [asdict(entry) for entry in events],
+            "flags": [asdict(entry) for entry in flags],
+        }
+        sys.stdout.write(json.dumps(content) + "\n")
     else:
-        table = light_table(f"{len(found)} events", ("event", "severity", "cause", "action"), ())
-        for entry in found:
-            table.add_row(entry.name, entry.severity, entry.cause, entry.action)
-        Console().print(table)
-    if not found:
+        _print(events, flags, name)
+    if not events and not flags:
         raise typer.Exit(1)
+
+
+def _print(events: Sequence[EventDefinition], flags: Sequence[FlagDefinition], name: str) -> None:
+    console = Console()
+    if events:
+        table = light_table(
+            f"{len(events)} event{'s' * (len(events) != 1)}",
+            ("event", "severity", "cause", "action"),
+            (),
+        )
+        for event in events:
+            table.add_row(event.name, event.severity, event.cause, event.action)
+        console.print(table)
+    if flags:
+        table = light_table(
+            f"{len(flags)} flag{'s' * (len(flags) != 1)}", ("flag", "cause", "action"), ()
+        )
+        for flag in flags:
+            table.add_row(flag.name, flag.cause, flag.action)
+        console.print(table)
+    if not events and not flags:
+        console.print(f"No event or flag has {name!r} in its name.", markup=False)
