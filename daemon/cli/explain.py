@@ -40,7 +40,8 @@ def explain(
         return
     exact = entry_of(name)
     events = [exact] if exact else [entry for entry in TABLE if name in entry.name]
-    flags = [] if exact else [entry for entry in FLAG_TABLE if name.upper() in entry.name]
+    is_event = exact is not None and exact.name == name
+    flags = [] if is_event else [e for e in FLAG_TABLE if name.upper() in e.name]
     if any(entry.name == name.upper() for entry in flags):
         events = []
         flags = [entry for entry in flags if entry.name == name.upper()]
