@@ -124,7 +124,7 @@ def inertial_table(
     if not rows:
         raise BoresightError(
             f"{path}: none of its exposures ({', '.join(names[:3])} ...) is in the project "
-            f"({', '.join(list(stations)[:3])} ...); both use the same names"
+            f"({', '.join(list(stations)[:3])} ...); both must use the same names"
         )
     columns = (*places, *VELOCITY, *ANGLES, *RATES)
     values = np.array([table.numbers(c, 0.0 if c in RATES else math.nan) for c in columns]).T[rows]

@@ -75,7 +75,7 @@ def test_a_flight_becomes_a_dated_mount_that_is_compared_and_never_overwritten(
 
 def test_exposures_with_other_names_are_an_error_that_states_so(project) -> None:
     ones = np.ones(3)
-    with pytest.raises(BoresightError, match="named alike"):
+    with pytest.raises(BoresightError, match="must use the same names"):
         inertial_table(project / "inertial.csv", ("left", "right"), ones, ones)
 
 
