@@ -127,7 +127,7 @@ def test_forged_frames_and_block_numbers_of_another_address_cost_nothing(
     (event,) = [e for e in pair.events if e.name == "other-sender"]
     assert event.is_fault
     assert f"the last from {source}; only {accepted} is accepted" in event.sentence
-    assert "give the heads a network of their own" in event.sentence
+    assert "connect the heads to a separate network" in event.sentence
 
 
 def test_another_port_of_the_heads_address_is_another_sender() -> None:
