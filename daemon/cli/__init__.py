@@ -59,9 +59,7 @@ def main() -> NoReturn:
     try:
         app()
     except KeyboardInterrupt:
-        interrupt_messages.print_notice(
-            f"Interrupted: nothing was begun; {interrupt_messages.RETRY_HINT}."
-        )
+        interrupt_messages.print_notice(interrupt_messages.NOTHING_BEGUN)
         sys.exit(interrupt_messages.STATUS)
     except Exception as error:  # noqa: BLE001 - what is not understood is raised again
         _print_refusal(error)

@@ -165,6 +165,14 @@ class CommandGroup(TyperGroup):
         self.commands = _Loaded()
         self._is_listing = False
 
+    def invoke(self, ctx: Any) -> Any:
+        """Import and run the command; Ctrl-C before it begins ends in one sentence as well."""
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt:
+            interrupt_messages.print_notice(interrupt_messages.NOTHING_BEGUN)
+            raise typer.Exit(interrupt_messages.STATUS) from None
+
     def list_commands(self, ctx: Any) -> list[str]:
         """The names, in the order of `TABLE`."""
         return list(self.commands)

@@ -16,6 +16,7 @@ STATUS = 130
 """Exit status after SIGINT, as shells give it: 128 + 2."""
 
 RETRY_HINT = "run the same command again"
+NOTHING_BEGUN = f"Interrupted: nothing was begun; {RETRY_HINT}."
 _NOTHING_WRITTEN = f"nothing was changed; {RETRY_HINT}"
 _COMPLETE_FILES = f"every file that has its name is complete, new or as it was before; {RETRY_HINT}"
 

@@ -96,6 +96,9 @@ def process(
         task = progress.add_task("compiling kernels", total=None)
         try:
             processor = processor_for(rig, folder, processing, radiometry)
+        except ValueError as error:
+            raise ConfigurationError([str(error)]) from error
+        try:
             processor.warm_up()
         except CalibrationError as error:
             raise ConfigurationError([str(error)]) from error

@@ -13,7 +13,7 @@ import pytest
 from typer.main import get_command
 from typer.testing import CliRunner
 
-from daemon.cli import app
+from daemon.cli import app, command_table, interrupt_messages
 from daemon.cli.command_table import RENAMED, TABLE
 
 
@@ -78,3 +78,15 @@ def test_summaries_are_imperative_sentences() -> None:
 def test_the_version_is_that_of_the_distribution() -> None:
     done = CliRunner().invoke(app, ["--version"])
     assert done.output.strip() == f"syntopic {version('syntopic')}"
+
+
+def test_an_interruption_while_a_command_is_imported_ends_in_one_sentence(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def interrupted(_: object) -> object:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(command_table, "load", interrupted)
+    done = CliRunner().invoke(app, ["verify", "MISSION"])
+    assert done.exit_code == interrupt_messages.STATUS
+    assert done.output.strip() == interrupt_messages.NOTHING_BEGUN
