@@ -3,31 +3,58 @@
 
 PYTHON ?= python3
 BIN := .venv/bin
+# Processes that run tests side by side.
+WORKERS ?= 3
 
-.PHONY: setup demo test test-v4l2 check audit bench attack fuzz soak clean
+.PHONY: setup wheel demo test test-busy release-check test-v4l2 check audit docs bench attack fuzz
+.PHONY: soak schemas clean
 
 setup: .venv/ready .venv/kernels
 
 .venv/ready: requirements.lock pyproject.toml bootstrap.sh
-	PYTHON=$(PYTHON) sh bootstrap.sh
-	touch $@
+	@PYTHON=$(PYTHON) sh bootstrap.sh
+	@touch $@
 
 # The compiler's cache looks at a kernel's own file only, not at those of the kernels it calls.
-.venv/kernels: .venv/ready $(wildcard processing/*.py processing/*/*.py processing/*/*/*.py)
-	find processing -name "*.nb[ic]" -delete
-	@echo "Compiling the pipeline's kernels, so that nothing compiles in flight"
-	$(BIN)/syntopic kernels
+.venv/kernels: .venv/ready $(wildcard processing/*.py processing/*/*.py processing/*/*/*.py) \
+		processing/pipelines/kernel_variants.toml
+	@find processing -name "*.nb[ic]" -delete
+	@echo "[5/5] Compiled kernels ..."
+	@$(BIN)/syntopic kernels
+	@touch $@
+
+# Browser, npm packages and other programs that only tests use.
+.venv/tests: .venv/ready bootstrap.sh tests/npm.lock
+	sh bootstrap.sh --tests
+	$(BIN)/python -m tests.npm
 	touch $@
+
+# The wheels of Syntopic, with its manual page, and of the photographs for the emulator.
+wheel: .venv/ready
+	rm -rf build/lib build/man build/scenes dist
+	mkdir -p build
+	$(BIN)/python -m daemon.cli.man_page build/man/syntopic.1
+	cp -r sim_hw/scenes build/scenes
+	$(BIN)/python -m pip wheel -q --no-deps --no-build-isolation --no-index -w dist . ./build/scenes
 
 demo: setup
 	$(BIN)/syntopic demo
 
-# Whole flights run in real time and have the right of way (tests/conftest.py).
-test: setup
-	$(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder
+# Whole flights run in real time and have the right of way (tests/conftest.py). STRICT=--fail-on-skip
+# where only skips of tests/expected_skips.toml are allowed.
+test: setup .venv/tests .venv/docs
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(STRICT)
 
-# V4L2 heads and pulses per second against the real kernel, in a virtual machine; REQUIRED=--required where skipping is no
-# answer.
+# The tests that need real time, five times in a row, with four busy loops next to them.
+test-busy: setup .venv/tests
+	$(BIN)/python -m tests.busy
+
+# `make demo` and `make test` in a fresh root of each release; as root, with debootstrap.
+release-check:
+	$(PYTHON) -m tests.installed.release_check $(RELEASES)
+
+# V4L2 heads and pulses per second against the real kernel, in a virtual machine;
+# REQUIRED=--required where skipping is no answer.
 test-v4l2: .venv/ready
 	sh bootstrap.sh --machine
 	$(BIN)/python -m tests.kernel.machine $(REQUIRED)
@@ -40,15 +67,28 @@ check: .venv/ready
 	$(BIN)/python -m tests.licences
 	$(BIN)/python -m tests.audit
 
+# JSON Schemas of rig.toml and service.toml, after a change of their keys.
+schemas: .venv/ready
+	$(BIN)/python -m daemon.configuration.schemas
+
 # Known vulnerabilities of what is pinned; unlike in `check`, a database out of reach is a failure.
 audit: setup
 	$(BIN)/python -m tests.audit --required
+
+# The documents as a site in build/site. Once its packages are installed it needs no network.
+docs: .venv/docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
+	@echo "Built build/site/index.html"
+
+.venv/docs: .venv/ready requirements-docs.lock
+	$(BIN)/python -m pip install -q --disable-pip-version-check --require-hashes -r requirements-docs.lock
+	touch $@
 
 bench: setup
 	$(BIN)/python -m benchmarks.mini
 
 # The long form of what `make test` has in short.
-attack: setup
+attack: setup .venv/tests
 	SYNTOPIC_ATTACKED_EXPOSURES=32 $(BIN)/python -m pytest -m attack --timeout=900 -s
 
 # Until 30 CPU minutes bring no new edge, parser by parser: many hours. It goes on where it was ended.
@@ -56,7 +96,7 @@ fuzz: setup
 	$(BIN)/python -m pip install -q --require-hashes -r requirements-fuzz.lock
 	$(BIN)/python -m tests.fuzz all --quiet-minutes 30 --seconds 60 --work .fuzz
 
-soak: setup
+soak: setup .venv/tests
 	$(BIN)/python -m pytest -m soak --timeout=7200
 
 clean:

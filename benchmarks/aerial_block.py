@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from daemon.cli.benchmark.measurement import machine
+from daemon.postflight.adjustment.adjustment_plots import ResidualPanel, pattern_svg
 from processing.bundle.adjust import Adjustment, AdjustmentSettings, adjust
-from processing.bundle.adjustment_plots import ResidualPanel, pattern_svg
 from processing.bundle.adjustment_results import (
     PointDifferences,
     ResidualPattern,

@@ -32,7 +32,6 @@ from processing.bundle.network import (
     Points,
     Stations,
 )
-from processing.bundle.rotations import vectors_from_rotations
 from processing.calibration.boresight import (
     PARAMETER_SCALES,
     BoresightCalibration,
@@ -40,7 +39,8 @@ from processing.calibration.boresight import (
     calibrate_boresight,
     mounting_of,
 )
-from processing.geometry.orientation import BODY_FROM_CAMERA, ENU_FROM_NED, level_from_body
+from processing.geometry.orientation import BODY_FROM_CAMERA, ENU_FROM_NED
+from processing.geometry.rotation import level_from_body, vectors_from_rotations
 from sim_hw.blocks.calibration_flight import (
     F_MM,
     FULL,
@@ -129,7 +129,7 @@ def write_flight(flight: CalibrationFlight, folder: Path) -> None:
 def error_of(found: BoresightCalibration, flight: CalibrationFlight) -> Array:
     """Found less true, (10,), rad, m, s, in the order of the parameters."""
     truth = level_from_body(*flight.boresight_rad)
-    rotation = vectors_from_rotations((truth.T @ found.mounting.imu_from_body)[None])[0]
+    rotation = vectors_from_rotations(truth.T @ found.mounting.imu_from_body)
     return np.concatenate(
         [
             rotation,

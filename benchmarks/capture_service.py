@@ -12,10 +12,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from daemon.configuration.model import load
+from daemon.configuration.service_file import load
 from daemon.mission.exposure import Exposure
 from daemon.mission.layout import Mission
-from daemon.onboard.pipeline.pipeline_queue import PipelineQueue
+from daemon.onboard.pipeline.pipeline_queue import Messages, PipelineQueue
 from daemon.onboard.service import service
 from daemon.onboard.service.messages import Ping, Pong, Stop, WorkerBuilt
 from daemon.onboard.service.processes import ServiceConnection
@@ -38,11 +38,9 @@ class NoPipeline(PipelineQueue):
         super().__init__(*arguments)
         self.is_ready = True
 
-    def sealed(self, exposure: Exposure) -> None:
+    def sealed(self, exposure: Exposure) -> Messages:
         """See `PipelineQueue.sealed`."""
-        slots = self._in_memory.pop(exposure.number, None)
-        if slots is not None:
-            self.recycle(slots)
+        return self.finished(exposure.number)
 
 
 def idle_worker(link: ServiceConnection, _settings: Any, _rings: Any) -> None:

@@ -12,14 +12,16 @@ import argparse
 import json
 import math
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from daemon.cli.benchmark.measurement import machine
+from daemon.postflight.plots import FAINT, svg_of, titles
 from processing.geometry.conditions import for_sensors
 from processing.pipelines.stitched import Conditions, Pipeline, PipelineSettings, Product
 from processing.quality.report import Flag
@@ -178,66 +180,43 @@ def summary(points: Sequence[Point]) -> dict[str, Any]:
 
 
 def drawing(points: Sequence[Point]) -> str:
-    """Fig. 1: measured blue, estimated red with three sigmas; below, the difference by cone."""
-    wide, high = 760.0, 560.0
-    left, right = 60.0, 740.0
+    """Fig. 1: measured and estimated with three sigmas; below, the difference by cone."""
 
-    def x_of(minute: float) -> float:
-        return left + (right - left) * minute / MINUTES
-
-    def top(k: float) -> float:
-        return 170.0 - k * 8.0
-
-    def low(k: float) -> float:
-        return 430.0 - k * 14.0
-
-    body: list[str] = []
-    for k in range(-10, 16, 5):
-        body += [
-            _line(left, top(k), right, top(k), "#dddddd"),
-            _text(52, top(k) + 4, f"{k}", "end"),
+    def draw(figure: Figure) -> None:
+        above, below = figure.subplots(2, 1, sharex=True)
+        minutes = [p.minute for p in points]
+        others = [[k for c, k in p.measured_k.items() if c != STUCK_PROBE] for p in points]
+        above.plot(minutes, [np.mean(k) for k in others], label="measured by probes")
+        weights = [{c: p.sigma_k[c] ** -2 for c in p.estimated_k} for p in points]
+        totals = [sum(w.values()) for w in weights]
+        means = [
+            sum(p.estimated_k[c] * w[c] for c in w) / total
+            for p, w, total in zip(points, weights, totals, strict=True)
         ]
-    for k in range(-6, 9, 2):
-        body += [
-            _line(left, low(k), right, low(k), "#dddddd"),
-            _text(52, low(k) + 4, f"{k}", "end"),
-        ]
-    for minute in range(0, 41, 5):
-        body.append(_text(x_of(minute), 545.0, f"{minute}", "middle"))
-    body.append(_text(right, 528.0, "minutes of flight", "end"))
-    body.append(_text(left, 24.0, "dC, K: measured by probes (blue), estimated by stitching (red)"))
-    body.append(
-        _text(left, 308.0, "Estimated less measured, K, by cone, with 3 sigma; filled: flagged")
-    )
-    others = [[c for c in p.measured_k if c != STUCK_PROBE] for p in points]
-    blue = [
-        float(np.mean([p.measured_k[c] for c in o])) for p, o in zip(points, others, strict=True)
-    ]
-    body.append(_path((x_of(p.minute), top(k)) for p, k in zip(points, blue, strict=True)))
-    for p in points:
-        weights = {c: 1.0 / p.sigma_k[c] ** 2 for c in p.estimated_k}
-        total = sum(weights.values())
-        mean_k = sum(p.estimated_k[c] * w for c, w in weights.items()) / total
-        reach = 3.0 / math.sqrt(total)
-        x = x_of(p.minute)
-        body.append(_line(x, top(mean_k - reach), x, top(mean_k + reach), "#c0392b"))
-        body.append(_dot(x, top(mean_k), "#c0392b"))
-    colours = {"0": "#7f8c8d", "1": "#c0392b", "2": "#27ae60"}
-    for shift, (cone, colour) in enumerate(colours.items()):
-        body.append(_text(right - 180.0 + 60.0 * shift, 308.0, f"cone {cone}", fill=colour))
-        for p in points:
-            if cone in p.estimated_k:
-                x = x_of(p.minute) + 4.0 * (shift - 1)
-                off, reach = p.estimated_k[cone] - p.measured_k[cone], 3.0 * p.sigma_k[cone]
-                body.append(_line(x, low(off - reach), x, low(off + reach), colour))
-                body.append(_dot(x, low(off), colour, filled=cone in p.disagrees))
-    stuck = x_of(STUCK_AT_MIN)
-    body += [_line(stuck, 40.0, stuck, 530.0, "#888888"), _text(stuck + 4, 52.0, "probe 1 sticks")]
-    return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {wide:.0f} {high:.0f}" '
-        f'width="{wide:.0f}" height="{high:.0f}" font-family="system-ui, DejaVu Sans, sans-serif">'
-        '<rect width="100%" height="100%" fill="#ffffff"/>' + "".join(body) + "</svg>\n"
-    )
+        reach = [3.0 / math.sqrt(total) for total in totals]
+        above.errorbar(minutes, means, reach, fmt="o", markersize=3, label="estimated by stitching")
+        titles(above, "dC, with 3 sigma", "", "K")
+        for shift, cone in enumerate(("0", "1", "2")):
+            own = [p for p in points if cone in p.estimated_k]
+            x = np.array([p.minute for p in own]) + 0.2 * (shift - 1)
+            off = np.array([p.estimated_k[cone] - p.measured_k[cone] for p in own])
+            bars = below.errorbar(
+                x, off, [3.0 * p.sigma_k[cone] for p in own], fmt="o", markersize=4,
+                markerfacecolor="w", label=f"cone {cone}",
+            )  # fmt: skip
+            flagged = np.array([cone in p.disagrees for p in own], dtype=bool)
+            below.plot(
+                x[flagged], off[flagged], "o", markersize=4, color=bars[0].get_color(), zorder=3
+            )
+        titles(below, "Estimated less measured, 3 sigma; filled: flagged",
+               "minutes of flight", "K")  # fmt: skip
+        for plot in (above, below):
+            plot.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, borderaxespad=0.0)
+            plot.axvline(STUCK_AT_MIN, color=FAINT, linestyle="--", linewidth=1.0)
+        above.annotate("probe 1 sticks", (STUCK_AT_MIN, 0.02), xycoords=("data", "axes fraction"),
+                       xytext=(4, 2), textcoords="offset points", color=FAINT)  # fmt: skip
+
+    return svg_of(draw, (7.6, 5.6))
 
 
 def _point(minute: float, true_k: float, product: Product) -> Point:
@@ -253,27 +232,6 @@ def _point(minute: float, true_k: float, product: Product) -> Point:
         disagrees=tuple(e.cone for e in known if e.disagrees),
         flagged=bool(product.report.flags & Flag.DC_DISAGREEMENT),
     )
-
-
-def _line(x1: float, y1: float, x2: float, y2: float, stroke: str) -> str:
-    return f'<line x1="{x1:.1f}" y1="{y1:.1f}" x2="{x2:.1f}" y2="{y2:.1f}" stroke="{stroke}"/>'
-
-
-def _dot(x: float, y: float, colour: str, *, filled: bool = True) -> str:
-    fill = colour if filled else "#ffffff"
-    return f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3" stroke="{colour}" fill="{fill}"/>'
-
-
-def _text(x: float, y: float, content: str, anchor: str = "start", fill: str = "#333333") -> str:
-    return (
-        f'<text x="{x:.1f}" y="{y:.1f}" font-size="12" fill="{fill}" '
-        f'text-anchor="{anchor}">{content}</text>'
-    )
-
-
-def _path(points: Iterable[tuple[float, float]]) -> str:
-    path_data = " L ".join(f"{x:.1f} {y:.1f}" for x, y in points)
-    return f'<path d="M {path_data}" fill="none" stroke="#2980b9" stroke-width="2"/>'
 
 
 if __name__ == "__main__":

@@ -19,11 +19,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from benchmarks import uncertainty_consistency
-from benchmarks.chart import Chart
 from benchmarks.stitching_samples import (
     MatchingErrors,
     drawn_sample,
@@ -31,6 +31,7 @@ from benchmarks.stitching_samples import (
     world_and_rig,
 )
 from daemon.cli.benchmark.measurement import machine
+from daemon.postflight.plots import FAINT, legend, level_line, svg_of, titles
 from processing.mosaic.flight_validity import evaluate_flight
 from processing.mosaic.free_mosaic import Mosaic
 from processing.mosaic.stitch_record import stitch_record
@@ -423,25 +424,31 @@ def ideal(rig: Rig, *, dc_k: float, length_px: float) -> tuple[float, float]:
 
 def drawing(powers: Sequence[Power]) -> str:
     """Found (full) and rightly named (hollow) over the displacement, a colour for each dC."""
-    chart = Chart(
-        title=f"{uncertainty_consistency.RIG}: one master sensor moved, {powers[0].exposures} a point",
-        x_label="displacement, px",
-        y_label="share of exposures",
-        x_range=(0.0, 0.5),
-        y_range=(0.0, 1.0),
-    )
-    for dc_k, colour in zip(DC_K, COLOURS, strict=True):
-        some = [p for p in powers if p.dc_k == dc_k]
-        x = [p.length_px for p in some]
-        chart.line(x, [p.ideal_found for p in some], colour, dashed=True)
-        chart.line(x, [p.found for p in some], colour, label=f"found, dC {dc_k:g} K")
-        chart.dots(x, [p.found for p in some], colour)
-        chart.line(x, [p.named for p in some], colour, thin=True)
-        chart.dots(x, [p.named for p in some], colour, filled=False)
-    chart.note("filled: found; hollow: rightly named; dashed: found by the best test there is")
-    chart.level(0.8, "80 %")
-    chart.mark(0.15, "0.15 px")
-    return chart.svg()
+
+    def draw(figure: Figure) -> None:
+        plot = figure.subplots()
+        for dc_k, colour in zip(DC_K, COLOURS, strict=True):
+            some = [p for p in powers if p.dc_k == dc_k]
+            x = [p.length_px for p in some]
+            plot.plot(x, [p.ideal_found for p in some], "--", color=colour, linewidth=1.0)
+            label = f"found, dC {dc_k:g} K"
+            plot.plot(x, [p.found for p in some], "o-", color=colour, markersize=4, label=label)
+            named = [p.named for p in some]
+            plot.plot(
+                x, named, "o-", color=colour, markersize=4, markerfacecolor="w", linewidth=0.7
+            )
+        level_line(plot, 0.8, "80 %")
+        plot.axvline(0.15, color=FAINT, linestyle="--", linewidth=1.0)
+        plot.text(0.153, 0.03, "0.15 px", color=FAINT)
+        plot.set(xlim=(0.0, 0.5), ylim=(0.0, 1.02))
+        title = (
+            f"{uncertainty_consistency.RIG}: one master sensor moved, {powers[0].exposures} a point"
+        )
+        note = "filled: found; hollow: rightly named; dashed: found by the best test there is"
+        titles(plot, title, f"displacement, px\n{note}", "share of exposures")
+        legend(figure, plot)
+
+    return svg_of(draw)
 
 
 if __name__ == "__main__":

@@ -16,12 +16,14 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from benchmarks.fast_flight_score import Comparison, PulseTruth, Score
-from daemon.configuration.model import Configuration, from_mapping
+from daemon.configuration.model import Configuration
+from daemon.configuration.service_file import from_mapping
 from daemon.mission.exposure import CaptureRecord, Exposure
-from daemon.onboard.flight.flight import Flight, FlightIdentity
+from daemon.onboard.flight.flight import Flight
+from daemon.onboard.flight.flight_identity import FlightIdentity
 from daemon.onboard.flight.ledger import Ledger
 from daemon.onboard.service.flight_line import FlightLine, Order
-from daemon.onboard.timing.matching import FiredPulse
+from daemon.onboard.timing.matching import Cause, FiredPulse
 from drivers.contract import (
     DeviceError,
     EventMark,
@@ -234,7 +236,7 @@ class FastFlight:
             return
         for record in self._decoder.feed(data, now_ns):
             if isinstance(record, NavSample):
-                self.flight.navigation(record)
+                self.flight.take(record)
             elif isinstance(record, EventMark):
                 sent_marks = self.clockwork.receiver.sent_marks.get(record.gps_ns)
                 exposure = None if sent_marks is None else self._truth(sent_marks.exposure)
@@ -242,7 +244,7 @@ class FastFlight:
                     waited_ns = now_ns - exposure.ordered_ns
                     limit_ns = self.configuration.limits.mark_timeout_s * NS_PER_S
                     exposure.mark_received |= waited_ns < limit_ns and record.time_valid
-                self.flight.mark(record)
+                self.flight.take(record)
 
     def on_probe_data(self, data: bytes, now_ns: int) -> None:
         if self._requested_ns is None or now_ns - self._requested_ns > ANSWER_TIMEOUT_NS:
@@ -257,7 +259,7 @@ class FastFlight:
             if value_c not in (None, PROBE_C):
                 self.score.add_example(f"probe {probe} reported {value_c}, it is {PROBE_C}")
                 self.score.imbalances += 1
-            self.flight.temperature(TemperatureSample(probe, value_c, now_ns))
+            self.flight.take(TemperatureSample(probe, value_c, now_ns))
 
     def on_frame(self, frame: SentFrame, now_ns: int) -> None:
         session = self._sessions[frame.head]
@@ -274,7 +276,9 @@ class FastFlight:
             limit_ns = self.configuration.limits.frame_timeout_s * NS_PER_S
             if now_ns - truth.ordered_ns < limit_ns:
                 truth.frames.add(frame.head)
-        self.flight.frame(self._frame(frame, slot, session, now_ns))
+        cause = self.flight.take(self._frame(frame, slot, session, now_ns))
+        if cause is not Cause.USED:
+            self._slots[frame.head].append(slot)
 
     def _frame(self, frame: SentFrame, slot: int, session: _Session, now_ns: int) -> Frame:
         sensor = self.rig.sensor(frame.head)
@@ -346,18 +350,14 @@ class FastFlight:
             self._requested_ns, self._probe_bytes = now_ns, b""
             self.clockwork.poll_probes([PROBE_C] * len(self.rig.probes), now_ns)
         flight = self.flight
-        for due in flight.due_to_store(now_ns):
+        actions = flight.advance(now_ns)
+        for due in actions.store:
             number, slots = due.capture.number, dict(due.slots)
             self._captures[number] = due.capture
             self._stored_pixels[number] = {h: self._pixels[h, s] for h, s in slots.items()}
             self.timeline.at(now_ns + DISK_NS, functools.partial(self._stored, number, slots))
-        flight.due_to_give_up(now_ns)
-        for head, slot in flight.idle_slots:
-            self._slots[head].append(slot)
-        flight.idle_slots.clear()
-        exposure = flight.due_to_seal(now_ns)
-        if exposure is not None:
-            self._sealed(exposure, now_ns)
+        if actions.seal is not None:
+            self._sealed(actions.seal, now_ns)
 
     def _stored(self, number: int, slots: Mapping[str, int], now_ns: int) -> None:
         frames = tuple(
@@ -370,7 +370,7 @@ class FastFlight:
 
     def _sealed(self, exposure: Exposure, now_ns: int) -> None:
         flight = self.flight
-        flight.sealed(exposure.number, exposure.state)
+        flight.sealed(exposure.number)
         imbalances = flight.ledger.imbalances()
         self.score.imbalances += len(imbalances)
         for imbalance in imbalances:

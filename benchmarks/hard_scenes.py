@@ -20,6 +20,13 @@ import cv2
 from benchmarks.rendered import errors_of, process, radiometry_of, take, world_settings
 from daemon.cli.benchmark.measurement import machine
 from processing.pipelines.stitched import Pipeline, PipelineSettings, Product
+from processing.quality.figures.stitching import (
+    DisplacedSensorFigures,
+    PoorestOverlapFigures,
+    PrecisionFigures,
+    SupportFigures,
+    TiePointFigures,
+)
 from processing.quality.report import NO_FLAGS, Flag
 from processing.rig import find_rig
 from sim_hw.world.ground_types import GROUNDS
@@ -122,6 +129,7 @@ class Camera:
         figures, flags = product.report.figures, product.report.flags
         if self.without:
             flags &= ~Flag.FRAME_MISSING
+        points, poorest = figures.of(TiePointFigures), figures.of(PoorestOverlapFigures)
         outcome = Outcome(
             scene=name,
             inner_rms_px=float(free["inner_rms_px"]),
@@ -129,11 +137,11 @@ class Camera:
             absolute_rms_px=float(free["absolute_rms_px"]),
             absolute_max_px=float(free["absolute_max_px"]),
             fixed_rms_px=float(fixed["inner_rms_px"]),
-            stated_px=float(figures["stitched_sigma_px"] or math.nan),
-            tie_points=int(figures["tie_points_pp"] or 0) + int(figures["tie_points_pc"] or 0),
-            tie_points_min_overlap=int(figures["tie_points_min_overlap"] or 0),
-            weak_sensors=str(figures["resting_on_calibration"] or ""),
-            displaced=str(figures["displaced_sensor"] or ""),
+            stated_px=float(figures.of(PrecisionFigures).stitched_sigma_px or math.nan),
+            tie_points=(points.tie_points_pp or 0) + (points.tie_points_pc or 0),
+            tie_points_min_overlap=poorest.tie_points_min_overlap or 0,
+            weak_sensors=", ".join(figures.of(SupportFigures).resting_on_calibration),
+            displaced=figures.of(DisplacedSensorFigures).displaced_sensor or "",
             flags=flags or NO_FLAGS,
             verdict=product.report.verdict.value,
         )
@@ -182,7 +190,8 @@ def table(outcomes: Collection[Outcome]) -> str:
         "|---|---|---|---|---|---|---|---|---|",
     ]
     lines += [
-        f"| `{o.scene}`: {SCENES[o.scene].description} | ![{o.scene}](hard-scenes/{o.scene}.jpg) | "
+        f"| `{o.scene}`: {SCENES[o.scene].description} | "
+        f"![{o.scene}](../../images/hard-scenes/{o.scene}.jpg) | "
         f"{o.inner_rms_px:.3f} / {o.inner_max_px:.3f} | {o.absolute_rms_px:.3f} | "
         f"{o.stated_px:.3f} | {o.fixed_rms_px:.3f} | {o.tie_points:,} ({o.tie_points_min_overlap}) | "
         f"{_weak_sensors_text(o.weak_sensors)} | {o.verdict}{_flag_text(o)} |"

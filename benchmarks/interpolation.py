@@ -5,7 +5,7 @@
 
 Everything follows from the weights; that the compiled resampling has them is tested in
 `tests/processing/image/test_interpolation_phase.py`. `--design` finds the weights of the
-phase-corrected kernel again. Record in docs/accuracy.md.
+phase-corrected kernel again. Record in docs/reference/results/accuracy.md.
 """
 
 from __future__ import annotations

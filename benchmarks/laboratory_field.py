@@ -30,8 +30,7 @@ from daemon.postflight.calibration.laboratory.field_report import (
     covariance_of,
     estimated_parameters,
 )
-from processing.bundle.rotations import vectors_from_rotations
-from processing.geometry.rotation import rotation_matrix
+from processing.geometry.rotation import rotation_matrix, vectors_from_rotations
 from processing.rig import Rig, find_rig
 from sim_hw.laboratory import calibration_field
 
@@ -114,7 +113,7 @@ def errors_of(
                     truth.rig.cone(cone.name)
                 )
                 axis = ("omega", "phi", "kappa").index(row.what)
-                errors.append(-float(vectors_from_rotations(rotation[None])[0, axis]))
+                errors.append(-float(vectors_from_rotations(rotation)[axis]))
             else:
                 errors.append(row.value - float(getattr(truth.rig.cone(cone.name).lens, row.what)))
             continue

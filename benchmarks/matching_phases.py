@@ -14,10 +14,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from benchmarks.chart import Chart
 from daemon.cli.benchmark.measurement import machine
+from daemon.postflight.plots import COLOURS, legend, level_line, svg_of, titles
 from processing.matching.patches import INTERPOLATION, match_patches
 from processing.matching.tie_points import TiePointSettings
 
@@ -208,22 +209,22 @@ def expose_texture(
 
 def drawing(results: Sequence[Found]) -> str:
     """Mean errors in x over the phase in x, every phase in y a dot; a colour for each kind."""
-    chart = Chart(
-        title="Mean error of matching over sub-pixel phase (same in x and y), own pixels",
-        x_label="phase",
-        y_label="mean error, px",
-        x_range=(0.0, 1.0),
-        y_range=(-0.012, 0.012),
-    )
-    for ratio, colour, label in ((1, "#2980b9", "P/P"), (RATIO, "#c0392b", "P/C")):
-        chart.line([], [], colour, label=label)
-        for found in results:
-            if found.case.ratio == ratio and found.case.contrast > 0.1:
-                for axis in (0, 1):
-                    chart.dots(found.phases[:, axis], found.means[:, axis], colour, filled=False)
-    chart.level(0.01, "0.01 px")
-    chart.level(-0.01, "")
-    return chart.svg()
+
+    def draw(figure: Figure) -> None:
+        plot = figure.subplots()
+        for ratio, colour, label in ((1, COLOURS[0], "P/P"), (RATIO, COLOURS[1], "P/C")):
+            some = [f for f in results if f.case.ratio == ratio and f.case.contrast > 0.1]
+            phases = np.concatenate([found.phases.T.ravel() for found in some])
+            means = np.concatenate([found.means.T.ravel() for found in some])
+            plot.plot(phases, means, "o", color=colour, markersize=4, fillstyle="none", label=label)
+        level_line(plot, 0.01, "0.01 px")
+        level_line(plot, -0.01, "")
+        plot.set(xlim=(0.0, 1.0), ylim=(-0.012, 0.012))
+        title = "Mean error of matching over sub-pixel phase (same in x and y), own pixels"
+        titles(plot, title, "phase", "mean error, px")
+        legend(figure, plot)
+
+    return svg_of(draw)
 
 
 def _without_blunders(error: Array) -> NDArray[np.bool_]:

@@ -20,8 +20,8 @@ from daemon.configuration.model import PlanSection
 from daemon.mission.layout import Mission
 from daemon.mission.store import store
 from daemon.mission.store.radiometry_folder import RadiometryFolder
-from daemon.onboard.pipeline.pipeline_pool import PipelinePool
 from daemon.products.exposure_conditions import conditions_of
+from daemon.products.pipeline_pool import PipelinePool
 from processing.pipelines.stitched import Pipeline, PipelineSettings
 from processing.quality.report import Flag
 from processing.rig import find_rig, load_rig

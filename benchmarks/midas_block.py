@@ -35,8 +35,12 @@ from processing.bundle.point_intersection import (
     orientation_layout,
     propagated_covariance,
 )
-from processing.bundle.rotations import rotations_from_vectors, vectors_from_rotations
 from processing.calibration.relative_orientation import relative_orientations
+from processing.geometry.rotation import (
+    phi_omega_kappa,
+    rotations_from_vectors,
+    vectors_from_rotations,
+)
 from sim_hw.blocks.oblique import (
     F_MM,
     HALF_HEIGHT_MM,
@@ -243,7 +247,7 @@ def _boresight(block: ObliqueBlock, result: Adjustment) -> Array:
     mean = relative[0]
     for _ in range(5):
         off = vectors_from_rotations(np.einsum("ji,njk->nik", mean, relative))
-        mean = mean @ rotations_from_vectors(off.mean(axis=0)[None])[0]
+        mean = mean @ rotations_from_vectors(off.mean(axis=0))
     return np.asarray(mean)
 
 
@@ -254,12 +258,7 @@ def _head_sigma(result: Adjustment, head: int) -> Array:
 
 def _phi_omega_kappa_grad(r: Array) -> list[float]:
     """Angles of R = Ry(phi) Rx(omega) Rz(kappa), grads, as the paper lists them."""
-    angles = (
-        np.arctan2(r[0, 2], r[2, 2]),
-        -np.arcsin(np.clip(r[1, 2], -1.0, 1.0)),
-        np.arctan2(r[1, 0], r[1, 1]),
-    )
-    return [float(a) * 200.0 / np.pi for a in angles]
+    return [float(a) * 200.0 / np.pi for a in phi_omega_kappa(r)]
 
 
 def _block_figures(result: Adjustment) -> dict[str, Any]:

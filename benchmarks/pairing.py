@@ -164,7 +164,7 @@ COLUMNS = (
 
 
 def row(case: Case, score: Score) -> str:
-    """A row of the table in docs/faults.md."""
+    """A row of the table in docs/reference/results/faults.md."""
     cells = (
         case.title,
         case.device,

@@ -2,8 +2,9 @@
 
 Processes the exposure of `syntopic bench` and counts the CPU time of the process, all threads, in
 each function that serves the quality report alone: tests of frames, stated accuracy, judgement.
-Their sum is compared with the CPU time of the pipeline. The valid area counts as a product.
-Nothing is written to disk.
+What the radiometric pass takes for them is its time with line sums less that without. The sum is
+compared with the CPU time of the pipeline. The valid area counts as a product. Nothing is written
+to disk.
 """
 
 from __future__ import annotations
@@ -16,13 +17,13 @@ import statistics
 import time
 import tomllib
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
-import processing.pipelines.stitched as composed
 from daemon.cli.benchmark.measurement import machine
 from daemon.cli.benchmark.pipeline import benchmark_exposure
 from daemon.configuration.model import PlanSection
@@ -30,9 +31,13 @@ from daemon.mission.layout import Mission
 from daemon.mission.store.radiometry_folder import RadiometryFolder
 from daemon.mission.store.store import load_level0
 from daemon.products.exposure_conditions import conditions_of
-from processing.pipelines.stitched import Pipeline, PipelineSettings
+from processing.pipelines import exposure_pipeline, stitched, stitched_stages
+from processing.pipelines.stitched import Conditions, Pipeline, PipelineSettings
 from processing.quality.report import Flag
+from processing.radiometry.level1 import Corrector, corrector_for, level1_from_level0
 from processing.rig import find_rig, load_rig
+
+Array = NDArray[Any]
 
 STEPS: Final = (
     "unread_figures",
@@ -45,10 +50,10 @@ STEPS: Final = (
     "estimate_dc",
     "held_quantities",
     "uncertainty_contribution_of",
-    "frame_figures",
+    "signal_figures",
+    "sharpness_figures",
     "stitching_figures",
     "relative_sharpness_figures",
-    "line_means_of",
     "signal_steps",
     "block_edges",
     "measure_common_windows",
@@ -58,7 +63,8 @@ STEPS: Final = (
     "precision_figures",
     "evaluate",
 )
-"""Functions by their name in `processing.pipelines.stitched`."""
+"""Functions by their name in `MODULES`."""
+MODULES: Final = (stitched, stitched_stages, exposure_pipeline)
 
 
 def main() -> None:
@@ -91,13 +97,16 @@ def measure(rig_name: str, *, runs: int, threads: int) -> dict[str, Any]:
     conditions = conditions_of(exposure, rig, PlanSection.model_validate(plan), Flag(0))
     used: dict[str, float] = defaultdict(float)
     for name in STEPS:
-        setattr(composed, name, _counted(getattr(composed, name), name, used))
+        module = next(module for module in MODULES if hasattr(module, name))
+        setattr(module, name, _counted(getattr(module, name), name, used))
+    correctors = {s.name: corrector_for(s, radiometry.get(s.name)) for s in rig.sensors}
     by_run: list[dict[str, float]] = []
     for _ in range(runs + 1):
         used.clear()
         began = time.process_time()
         pipeline.process(frames, conditions)
         whole = time.process_time() - began
+        used["line sums in level1_from_level0"] = _line_sums_s(correctors, frames, conditions)
         by_run.append({**used, "all steps": sum(used.values()), "pipeline": whole})
     # The first exposure fills caches.
     of = {key: statistics.median(run[key] for run in by_run[1:]) for key in by_run[0]}
@@ -105,12 +114,35 @@ def measure(rig_name: str, *, runs: int, threads: int) -> dict[str, Any]:
     return {"machine": machine(), "rig": rig.name, "runs": runs, "cpu_s": of, "share": share}
 
 
+def _line_sums_s(
+    correctors: Mapping[str, Corrector], frames: Mapping[str, Array], conditions: Conditions
+) -> float:
+    """CPU seconds that the line sums add to the radiometric pass over all frames."""
+    used = {False: 0.0, True: 0.0}
+    for name, corrector in correctors.items():
+        out = np.zeros_like(frames[name])
+        for measure_lines in (True, False, True, False):
+            began = time.process_time()
+            level1_from_level0(
+                corrector,
+                frames[name],
+                temperature_c=None,
+                exposure_time_s=conditions.exposure_time_s.get(name, 0.0),
+                tdi_shifts=conditions.tdi_shifts.get(name, 0),
+                out=out,
+                measure_lines=measure_lines,
+            )
+            used[measure_lines] += 0.5 * (time.process_time() - began)
+    return used[True] - used[False]
+
+
 def _counted(function: Callable[..., Any], name: str, used: dict[str, float]) -> Callable[..., Any]:
     @functools.wraps(function)
     def timed(*args: Any, **others: Any) -> Any:
         began = time.process_time()
         try:
-            return function(*args, **others)
+            found = function(*args, **others)
+            return tuple(found) if isinstance(found, Iterator) else found
         finally:
             used[name] += time.process_time() - began
 

@@ -34,8 +34,8 @@ from processing.bundle.network import (
     Points,
     Stations,
 )
-from processing.bundle.rotations import rotations_from_vectors
 from processing.bundle.self_calibration import SETS, SetName, parts_of, with_self_calibration
+from processing.geometry.rotation import rotations_from_vectors
 from processing.matching.patches import INTERPOLATION, match_patches, select_features
 from processing.pipelines.stitched import Pipeline, PipelineSettings
 from processing.rig import VirtualImage

@@ -23,8 +23,8 @@ from daemon.postflight.adjustment.project_file import ProjectFile
 from daemon.postflight.adjustment.project_writer import write_project
 from processing.bundle.adjust import adjust
 from processing.bundle.network import Network
-from processing.bundle.rotations import vectors_from_rotations
 from processing.calibration.relative_orientation import RelativeOrientations, relative_orientations
+from processing.geometry.rotation import vectors_from_rotations
 from sim_hw.blocks.oblique import (
     HEADS,
     NADIR,

@@ -18,6 +18,7 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from benchmarks.time_truth import Fired, Host, delay_error_ns, inside, receiver_stamp
@@ -28,6 +29,7 @@ from daemon.onboard.flight.temperatures import TemperatureHistory
 from daemon.onboard.timing.gps_clock import GpsClock
 from daemon.onboard.timing.matching import FiredPulse
 from daemon.orientation.navigation import Track
+from daemon.postflight.plots import COLOURS, svg_of, titles
 from drivers.contract import EventMark
 from processing.quality.report import Flag
 from processing.rig import find_rig
@@ -145,7 +147,7 @@ def stamps(runs: int, *, first: int = 0, temperature_factor: float = 1.0) -> Map
 
 
 def row(name: str, errors: Errors) -> str:
-    """A row of the table in docs/time.md."""
+    """A row of the table in docs/explanation/time.md."""
     off, sigma = errors
     shares = " | ".join(f"{100 * inside(off, sigma, k):.1f} %" for k in (1.0, 2.0, 3.0))
     worst = float(np.max(np.abs(off) / sigma))
@@ -185,50 +187,26 @@ def drawing(
     after_s: Sequence[float], errors: NDArray[np.float64], sigmas: NDArray[np.float64]
 ) -> str:
     """Errors of coasting clocks over time in units of the sigma that was stated with each."""
-    wide, high, left, low, reach = 720.0, 380.0, 46.0, 58.0, 4.0
+    relative = np.clip(errors / sigmas, -4.0, 4.0)
+    within = np.percentile(np.abs(errors / sigmas), 95.45, axis=0)
 
-    def x(seconds: float) -> float:
-        return left + (wide - left - 20) * seconds / max(after_s)
+    def draw(figure: Figure) -> None:
+        plot = figure.subplots()
+        plot.plot(after_s, relative[:120].T, color="#9bb8d3", linewidth=0.5)
+        for sign in (1.0, -1.0):
+            plot.plot(after_s, sign * within, "--", color="#1b4f72", linewidth=1.6)
+            plot.axhline(2.0 * sign, color=COLOURS[1], linewidth=0.8)
+        whole = [k for k, seconds in enumerate(after_s) if seconds % 10 == 0]
+        medians_us = np.median(sigmas, axis=0) * 1e-3
+        ticks = [f"{after_s[k]:.0f}\n{medians_us[k]:.1f} us" for k in whole]
+        plot.set_xticks([after_s[k] for k in whole], ticks)
+        plot.set(xlim=(0.0, max(after_s)), ylim=(-4.0, 4.0))
+        title = f"Errors of {len(errors)} coasting clocks over the stated sigma"
+        note = "120 hosts drawn; dashed: 95.45 % lie between, two sigmas if sigmas are true"
+        x_label = f"coasting, s; below, median stated sigma\n{note}"
+        titles(plot, title, x_label, "error / stated sigma")
 
-    def y(sigmas_off: float) -> float:
-        clipped = min(max(sigmas_off, -reach), reach)
-        return (high - low) / 2 + 10 - clipped / reach * ((high - low) / 2 - 10)
-
-    def path(values: NDArray[np.float64], colour: str, stroke: float, dash: str = "none") -> str:
-        points = " ".join(f"{x(t):.1f},{y(v):.1f}" for t, v in zip(after_s, values, strict=True))
-        return (
-            f'<polyline points="{points}" fill="none" stroke="{colour}" '
-            f'stroke-width="{stroke}" stroke-dasharray="{dash}"/>'
-        )
-
-    relative = errors / sigmas
-    within = np.percentile(np.abs(relative), 95.45, axis=0)
-    body = [
-        f'<text x="{left - 6}" y="{y(label) + 4:.1f}" text-anchor="end">{label:+d}</text>'
-        f'<line x1="{left}" x2="{wide - 20}" y1="{y(label):.1f}" y2="{y(label):.1f}" '
-        f'stroke="{"#c0392b" if abs(label) == 2 else "#dddddd"}" stroke-width="1"/>'
-        for label in range(-4, 5)
-    ]
-    body += [path(relative[run], "#9bb8d3", 0.6) for run in range(min(len(errors), 120))]
-    body += [path(sign * within, "#1b4f72", 2.0, "6 4") for sign in (1, -1)]
-    for seconds, sigma_ns in zip(after_s, np.median(sigmas, axis=0), strict=True):
-        if seconds % 10 == 0:
-            body.append(
-                f'<text x="{x(seconds):.1f}" y="{high - 40}" text-anchor="middle">{seconds:.0f} s'
-                f'</text><text x="{x(seconds):.1f}" y="{high - 24}" text-anchor="middle" '
-                f'fill="#c0392b">{sigma_ns * 1e-3:.1f} us</text>'
-            )
-    body.append(
-        f'<text x="{left}" y="{high - 40}">coasting</text>'
-        f'<text x="{left}" y="{high - 24}" fill="#c0392b">median sigma</text>'
-        f'<text x="{left}" y="{high - 8}">Error over stated sigma; dashed: 95.45 % of '
-        f"{len(errors)} hosts lie between, two sigmas if sigmas are true; 120 hosts drawn</text>"
-    )
-    return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {wide:.0f} {high:.0f}" '
-        'font-family="sans-serif" font-size="11">'
-        '<rect width="100%" height="100%" fill="#ffffff"/>' + "".join(body) + "</svg>\n"
-    )
+    return svg_of(draw)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -17,9 +17,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from daemon.cli.benchmark.measurement import machine
+from daemon.postflight.plots import field_of_vectors, svg_of
 from processing.geometry.conditions import Conditions, for_sensors, parallax_px
 from processing.geometry.placement import (
     SensorPlacement,
@@ -403,44 +405,22 @@ def drawn(
     image: VirtualImage, panels: Sequence[tuple[str, tuple[Array, Array]]], title: str
 ) -> str:
     """Residual vectors side by side in one scale, as an SVG."""
-    gap, wide = 40.0, 510.0
-    scale = wide / image.width_px
-    high = image.height_px * scale
     longest = max(float(np.hypot(*errors.T).max()) for _, (_, errors) in panels)
-    enlarge = 22.0 / longest
-    bar_um = 1.0 if 7.2 * longest > 1.0 else 0.5
-    bar = bar_um / image.pitch_um * enlarge
-    width, height = 2 * wide + 3 * gap, high + 125
-    body = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:.0f} {height:.0f}" '
-        f'width="{width:.0f}" height="{height:.0f}" font-family="DejaVu Sans, sans-serif">'
-        '<rect width="100%" height="100%" fill="#ffffff"/>',
-        f'<text x="{gap}" y="30" font-size="17" font-weight="bold" fill="#1c2733">'
-        f"Remaining systematic image residuals: {title}</text>",
-    ]
-    for k, (name, (places, errors)) in enumerate(panels):
-        left, top = gap + k * (wide + gap), 72.0
-        rms_um = float(np.sqrt(np.mean(np.sum(errors**2, axis=1)))) * image.pitch_um
-        body.append(
-            f'<text x="{left}" y="58" font-size="12" fill="#1c2733">'
-            f"{name}: RMS {rms_um:.3f} um</text>"
-            f'<rect x="{left}" y="{top}" width="{wide}" height="{high:.1f}" fill="#f6f8fa" '
-            'stroke="#8796a5"/>'
-        )
-        for (c, r), (dx, dy) in zip(places, errors, strict=True):
-            x, y = left + (c + 0.5) * scale, top + (r + 0.5) * scale
-            body.append(
-                f'<line x1="{x:.1f}" y1="{y:.1f}" x2="{x + dx * enlarge:.1f}" '
-                f'y2="{y + dy * enlarge:.1f}" stroke="#b3361e" stroke-width="1.1"/>'
-                f'<circle cx="{x:.1f}" cy="{y:.1f}" r="1.1" fill="#1c2733"/>'
-            )
-    y = 72.0 + high + 28
-    body.append(
-        f'<line x1="{gap}" y1="{y}" x2="{gap + bar:.1f}" y2="{y}" stroke="#b3361e" '
-        f'stroke-width="2"/><text x="{gap + bar + 8:.1f}" y="{y + 4}" font-size="12" '
-        f'fill="#1c2733">{bar_um:g} um = {bar_um / image.pitch_um:.2f} px</text></svg>'
-    )
-    return "".join(body)
+    half = (image.width_px / 2.0, image.height_px / 2.0)
+
+    def draw(figure: Figure) -> None:
+        whole = f"Remaining systematic image residuals: {title}"
+        figure.suptitle(whole, weight="bold", x=0.01, ha="left")
+        plots = figure.subplots(1, len(panels), squeeze=False)[0]
+        for plot, (name, (places, errors)) in zip(plots, panels, strict=True):
+            rms_um = float(np.sqrt(np.mean(np.sum(errors**2, axis=1)))) * image.pitch_um
+            # Rows count down, the plot's y up.
+            up = (places + 0.5 - half) * [1.0, -1.0]
+            unit = ("um", image.pitch_um)
+            field_of_vectors(plot, up, errors * [1.0, -1.0], half, longest, unit)
+            plot.set_title(f"{name}: RMS {rms_um:.3f} um", weight="normal")
+
+    return svg_of(draw, (0.4 + 5.2 * len(panels), 1.4 + 5.0 * half[1] / half[0]))
 
 
 if __name__ == "__main__":

@@ -14,8 +14,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Final, Protocol
 
+from drivers.errors import DriverError
 
-class DeviceError(Exception):
+
+class DeviceError(DriverError):
     """A device failed to do what was requested; the message states device, cause and remedy."""
 
 
@@ -327,5 +329,8 @@ class Trigger(Protocol):
 
     def fire(self, sequence: int) -> TriggerPulse:
         """Fire one pulse. DeviceError if none was fired or if that is unknown."""
+
+    def statistics(self) -> Mapping[str, int]:
+        """Counters since creation, by stable name; from any thread."""
 
     def close(self) -> None: ...

@@ -45,7 +45,7 @@ def parser() -> argparse.ArgumentParser:
         action="append",
         default=[],
         metavar="NAME@TIME[:DEVICE][,DURATION]",
-        help="plan a fault, see docs/faults.md; may be repeated",
+        help="plan a fault, see docs/reference/results/faults.md; may be repeated",
     )
     add("--scenario", type=Path, help="a file with faults")
     add("--pps", action="store_true", help="a pulse per second as well")

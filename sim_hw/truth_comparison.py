@@ -18,6 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import RectBivariateSpline
 
+from sim_hw.errors import SimulatorError
+
 Array = NDArray[np.float64]
 
 METHODS = {
@@ -29,7 +31,7 @@ MATCH_WITHIN_NS = 500_000_000
 """A mark further from every true one belongs to no exposure of the emulator."""
 
 
-class ComparisonError(RuntimeError):
+class ComparisonError(SimulatorError):
     """A mission or a truth that cannot be judged."""
 
 

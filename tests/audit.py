@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, Final
 
 ROOT: Final = Path(__file__).parents[1]
-LOCKS: Final = ("requirements.lock", "requirements-fuzz.lock")
+LOCKS: Final = ("requirements.lock", "requirements-docs.lock", "requirements-fuzz.lock")
 VENDOR: Final = ROOT / "daemon/onboard/monitoring/web/page/vendor"
 DATABASE: Final = "https://api.osv.dev/v1/querybatch"
 TIMEOUT_S: Final = 20.0

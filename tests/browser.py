@@ -17,6 +17,8 @@ from typing import Any
 
 import pytest
 
+from tests.stopwatch import Stopwatch
+
 START_TIMEOUT_S = 60.0
 CALL_TIMEOUT_S = 60.0
 FLAGS = (
@@ -59,9 +61,9 @@ class Browser:
             env={**os.environ, **(environment or {})},
         )
         port_file = profile / "DevToolsActivePort"
-        deadline = time.monotonic() + START_TIMEOUT_S
+        watch = Stopwatch()
         while not (port_file.exists() and port_file.read_text().count("\n")):
-            assert time.monotonic() < deadline, "Chromium did not start"
+            assert watch.is_within(START_TIMEOUT_S), "Chromium did not start"
             assert self._process.poll() is None, "Chromium ended at once"
             time.sleep(0.05)
         port = port_file.read_text().splitlines()[0]
@@ -69,7 +71,8 @@ class Browser:
             pages = [one for one in json.load(answer) if one["type"] == "page"]
         self._open = ExitStack()
         self._link = self._open.enter_context(
-            connect(pages[0]["webSocketDebuggerUrl"], max_size=64_000_000)
+            # Every call has a limit of its own: a browser that has no core answers no pings.
+            connect(pages[0]["webSocketDebuggerUrl"], max_size=64_000_000, ping_interval=None)
         )
         self._number = 0
         self.requested: list[str] = []
@@ -98,8 +101,13 @@ class Browser:
         """Call a method of the protocol; record the other messages that arrive meanwhile."""
         self._number += 1
         self._link.send(json.dumps({"id": self._number, "method": method, "params": parameters}))
+        watch = Stopwatch()
         while True:
-            message = json.loads(self._link.recv(timeout=CALL_TIMEOUT_S))
+            try:
+                message = json.loads(self._link.recv(timeout=5.0))
+            except TimeoutError:
+                assert watch.is_within(CALL_TIMEOUT_S), f"no answer to {method}"
+                continue
             if message.get("id") == self._number:
                 assert "error" not in message, message
                 result: dict[str, Any] = message["result"]
@@ -119,12 +127,11 @@ class Browser:
 
     def wait_for(self, script: str, within_s: float) -> float:
         """Wait until an expression is true; returns how long that took, in seconds."""
-        begun = time.monotonic()
+        watch = Stopwatch()
         while not self.evaluate(script):
-            waited = time.monotonic() - begun
-            assert waited < within_s, f"waited {waited:.1f} s for {script}"
+            assert watch.is_within(within_s), f"waited {watch.elapsed_s:.1f} s for {script}"
             time.sleep(0.05)
-        return time.monotonic() - begun
+        return watch.elapsed_s
 
     def text(self, selector: str) -> str:
         return str(

@@ -14,6 +14,11 @@ from typing import Any
 import pytest
 from hypothesis import settings
 
+from tests.skips import pytest_addoption, pytest_sessionfinish, pytest_terminal_summary
+from tests.stopwatch import slowdown
+
+__all__ = ["pytest_addoption", "pytest_sessionfinish", "pytest_terminal_summary"]
+
 FLIGHTS = Path(__file__).parent / "system"
 NICENESS = 10
 
@@ -34,9 +39,18 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     return FlightsFirstScheduling(config, log)
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The longest first."""
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """The longest first; time-outs against hanging grow with the load of the machine."""
     items.sort(key=lambda item: not _is_flight(item))
+    factor = slowdown()
+    for item in items:
+        if _is_flight(item):
+            item.add_marker(pytest.mark.realtime)
+        marked = item.get_closest_marker("timeout")
+        timeout_s = marked.args[0] if marked else config.getoption("timeout")
+        if timeout_s:
+            item.add_marker(pytest.mark.timeout(timeout_s * factor), append=False)
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:

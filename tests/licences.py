@@ -1,7 +1,8 @@
 """`python -m tests.licences`: the licence of everything in requirements.lock, and what may not be.
 
-Licences are those the installed packages state of themselves. `--write` writes docs/licences.md;
-without it the exit status is 1 where a licence is on no list or the page is not current.
+Licences are those the installed packages state of themselves. `--write` writes
+docs/reference/licences.md; without it the exit status is 1 where a licence is on no list or the
+page is not current.
 """
 
 from __future__ import annotations
@@ -15,15 +16,16 @@ from importlib import metadata
 from pathlib import Path
 from typing import Final
 
+from packaging.markers import Marker
 from packaging.requirements import Requirement
 
 ROOT: Final = Path(__file__).parents[1]
-PAGE: Final = ROOT / "docs" / "licences.md"
+PAGE: Final = ROOT / "docs/reference/licences.md"
 
 PERMISSIVE: Final = frozenset(
     {
         *("0BSD", "Apache-2.0", "Apache-2.0 WITH LLVM-exception", "BSD-2-Clause", "BSD-3-Clause"),
-        *("BSD", "CC0-1.0", "ISC", "MIT", "PSF-2.0", "Zlib"),
+        *("BSD", "CC0-1.0", "ISC", "MIT", "MIT-CMU", "PSF-2.0", "Zlib"),
     }
 )
 """May be part of anything. BSD: one of its permissive forms, not stated which."""
@@ -43,10 +45,13 @@ TOOLS_ONLY: Final = frozenset({"MPL-2.0"})
 
 _NAMES: Final[Mapping[str, str]] = {
     "Apache Software License": "Apache-2.0",
+    # GenICam's own identifier for the text of BSD-3-Clause.
+    "LicenseRef-GenICam-1.6": "BSD-3-Clause",
     "BSD License": "BSD",
     "ISC License (ISCL)": "ISC",
     "MIT License": "MIT",
     "Mozilla Public License 2.0 (MPL 2.0)": "MPL-2.0",
+    "Python Software Foundation License": "PSF-2.0",
     "GNU Lesser General Public License v2 or later (LGPLv2+)": "LGPL-2.1-or-later",
     "GNU Lesser General Public License v3 (LGPLv3)": "LGPL-3.0",
 }
@@ -76,12 +81,14 @@ class Package:
         )
 
 
-def packages() -> tuple[list[Package], list[str]]:
-    """Those of the lock that are installed here, and the names of those that are not."""
+def packages(lock: str = "requirements.lock") -> tuple[list[Package], list[str]]:
+    """Those of a lock that are installed here, and the names of those that are not."""
     delivered = _closure(_product_requirements())
     found, absent = [], []
-    for name in _locked():
+    for name, is_meant in _locked(lock).items():
         try:
+            if not is_meant:
+                raise metadata.PackageNotFoundError(name)
             about = metadata.metadata(name).json
         except metadata.PackageNotFoundError:
             absent.append(name)
@@ -101,6 +108,8 @@ def stated(expression: str, text: str, classifiers: Iterable[str]) -> str:
     if expression:
         return expression
     text = text.strip()
+    if text in _NAMES:
+        return _NAMES[text]
     classified = [
         _NAMES.get(name, name)
         for entry in classifiers
@@ -113,7 +122,7 @@ def stated(expression: str, text: str, classifiers: Iterable[str]) -> str:
 
 
 def page(found: Iterable[Package]) -> str:
-    """The page docs/licences.md."""
+    """The page docs/reference/licences.md."""
     listed = sorted(found, key=lambda package: package.name)
     lines = [
         "# Licences",
@@ -135,6 +144,7 @@ def page(found: Iterable[Package]) -> str:
         "them. Wheels carry libraries of their own whose licences are in the wheels: OpenBLAS and",
         "the GCC runtime in numpy and scipy, FFmpeg (LGPL) in opencv, GDAL and PROJ in rasterio",
         "and pyproj.",
+        "Vendored with the documents' site: iframe-worker (MIT), with its licence next to it.",
         "From Debian, never delivered with it: Aravis (LGPL-2.1+), gpsd (BSD-2-Clause).",
         "",
         "## Tools of development, never delivered",
@@ -142,6 +152,9 @@ def page(found: Iterable[Package]) -> str:
         "| package | licence |",
         "|---|---|",
         *(f"| {p.name} | {p.licence} |" for p in listed if p.is_tool),
+        "",
+        "The packages of requirements-docs.lock build the documents' site. A test requires of them",
+        "the same licences.",
         "",
     ]
     return "\n".join(lines)
@@ -168,9 +181,12 @@ def _is_allowed(licence: str, allowed: frozenset[str]) -> bool:
     )
 
 
-def _locked() -> list[str]:
-    text = (ROOT / "requirements.lock").read_text(encoding="utf-8")
-    return sorted(set(re.findall(r"^([A-Za-z0-9][A-Za-z0-9._-]*)==", text, re.MULTILINE)))
+def _locked(lock: str) -> dict[str, bool]:
+    """Packages of a lock, and whether this system is one that it pins them for."""
+    text = (ROOT / lock).read_text(encoding="utf-8")
+    pinned = re.findall(r"^([\w.-]+)==[^\s;]+ *(?:; *([^\\\n]+))?", text, re.MULTILINE)
+    meant = {name for name, marker in pinned if not marker or Marker(marker).evaluate()}
+    return {name: name in meant for name in sorted({name for name, _ in pinned})}
 
 
 def _product_requirements() -> list[str]:

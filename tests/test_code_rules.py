@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import builtins
 import re
 import subprocess
 import sys
@@ -13,6 +14,13 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 PACKAGES = ("daemon", "drivers", "processing", "sim_hw")
+ERROR_ROOTS = {
+    "daemon": "DaemonError",
+    "drivers": "DriverError",
+    "processing": "ProcessingError",
+    "sim_hw": "SimulatorError",
+}
+"""Root of the exception classes of each package, in its module `errors`."""
 
 
 @pytest.mark.parametrize("package", PACKAGES)
@@ -62,3 +70,46 @@ def test_only_kernels_go_without_types() -> None:
                     assert any("njit" in ast.unparse(d) for d in node.decorator_list), (
                         f"{path.relative_to(ROOT)}: {node.name} has no types and is no kernel"
                     )
+
+
+def _class_bases(package: str) -> dict[str, tuple[str, ...]]:
+    """Names of the base classes of every class of a package."""
+    return {
+        node.name: tuple(ast.unparse(base).rpartition(".")[2] for base in node.bases)
+        for path in (ROOT / package).rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.ClassDef)
+    }
+
+
+def _ancestors(name: str, bases: dict[str, tuple[str, ...]]) -> set[str]:
+    """All direct and indirect base classes by name."""
+    found: set[str] = set()
+    waiting = [name]
+    while waiting:
+        new = set(bases.get(waiting.pop(), ())) - found
+        found |= new
+        waiting += new
+    return found
+
+
+@pytest.mark.parametrize(("package", "root"), ERROR_ROOTS.items())
+def test_every_exception_class_of_a_package_derives_from_its_root(package: str, root: str) -> None:
+    assert f"class {root}(Exception)" in (ROOT / package / "errors.py").read_text()
+    bases = _class_bases(package)
+    built_in = {
+        name
+        for name, value in vars(builtins).items()
+        if isinstance(value, type) and issubclass(value, BaseException)
+    }
+    own = [name for name in bases if _ancestors(name, bases) & built_in and name != root]
+    assert own
+    astray = [name for name in own if root not in _ancestors(name, bases)]
+    assert not astray, f"{astray} of {package} do not derive from {root}"
+
+
+def test_no_package_raises_a_bare_exception() -> None:
+    for package in PACKAGES:
+        for path in (ROOT / package).rglob("*.py"):
+            found = re.search(r"raise (Base)?Exception\b", path.read_text())
+            assert not found, f"{path.relative_to(ROOT)} raises Exception; raise an own class"

@@ -13,7 +13,7 @@ import typer
 from daemon.cli import app
 
 ROOT = Path(__file__).parents[1]
-PAGE = (ROOT / "docs/papers.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs/reference/results/papers.md").read_text(encoding="utf-8")
 QUOTED = sorted(set(re.findall(r"`([^`\n]+)`", PAGE)))
 
 

@@ -1,10 +1,10 @@
-"""The paths of docs/contributing/finding-things.md."""
+"""The paths of docs/reference/contributing/finding-things.md."""
 
 import re
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-PAGE = ROOT / "docs/contributing/finding-things.md"
+PAGE = ROOT / "docs/reference/contributing/finding-things.md"
 
 
 def test_every_path_leads_to_a_module() -> None:
@@ -23,5 +23,5 @@ def test_the_first_level_of_each_package_has_ten_entries_at_most() -> None:
             path.name
             for path in (ROOT / package).iterdir()
             if (path.is_dir() and any(path.rglob("*.py"))) or path.suffix == ".py"
-        } - {"__init__.py", "__main__.py"}
+        } - {"__init__.py", "__main__.py", "errors.py"}  # in every package, for the same purpose
         assert len(entries) <= 10, (package, sorted(entries))

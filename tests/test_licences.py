@@ -15,6 +15,13 @@ def test_every_licence_is_on_a_list() -> None:
     assert [problem for package in found if (problem := package.problem)] == []
 
 
+def test_every_licence_of_what_builds_the_site_is_on_a_list() -> None:
+    found, absent = packages("requirements-docs.lock")
+    if "mkdocs" in absent:
+        pytest.skip("MkDocs is not installed here; `make docs` installs it")
+    assert [problem for package in found if (problem := package.problem)] == []
+
+
 def test_no_exception_is_left_of_a_package_that_is_gone() -> None:
     found, _ = packages()
     assert set(EXCEPTIONS) <= {package.name for package in found if not package.is_tool}

@@ -15,6 +15,8 @@ ROOT = Path(__file__).parents[1]
 LOCK = ROOT / "requirements.lock"
 FUZZ = ROOT / "requirements-fuzz.lock"
 """What `make fuzz` needs in addition."""
+DOCS = ROOT / "requirements-docs.lock"
+"""What `make docs` needs in addition."""
 
 pytestmark = pytest.mark.trust
 
@@ -25,7 +27,9 @@ def requirements(lock: Path) -> list[str]:
     return [line for line in text.replace("\\\n", " ").splitlines() if line.strip()]
 
 
-@pytest.mark.parametrize(("lock", "least"), [(LOCK, 60), (FUZZ, 1)], ids=lambda one: str(one))
+@pytest.mark.parametrize(
+    ("lock", "least"), [(LOCK, 60), (FUZZ, 1), (DOCS, 20)], ids=lambda one: str(one)
+)
 def test_every_package_has_a_version_and_hashes(lock: Path, least: int) -> None:
     assert len(requirements(lock)) >= least
     for line in requirements(lock):
@@ -34,7 +38,11 @@ def test_every_package_has_a_version_and_hashes(lock: Path, least: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("where", "lock"), [("bootstrap.sh", LOCK), ("docs/installation.md", LOCK), ("Makefile", FUZZ)]
+    ("where", "lock"),
+    [
+        *(("bootstrap.sh", LOCK), ("docs/how-to/flight/installation.md", LOCK)),
+        *(("Makefile", FUZZ), ("Makefile", DOCS)),
+    ],
 )
 def test_installing_insists_on_hashes(where: str, lock: Path) -> None:
     lines = [one for one in (ROOT / where).read_text("utf-8").splitlines() if lock.name in one]
@@ -66,3 +74,13 @@ def test_a_file_that_was_exchanged_is_refused(tmp_path: Path) -> None:
         )
         assert (tried.returncode == 0) == is_accepted, tried.stderr
     assert "DO NOT MATCH THE HASHES" in tried.stderr
+
+
+def test_what_two_locks_pin_has_one_version() -> None:
+    pinned = [
+        dict(re.findall(r"^([\w.-]+)==(\S+)", "\n".join(requirements(lock)), re.MULTILINE))
+        for lock in (LOCK, DOCS)
+    ]
+    both = pinned[0].keys() & pinned[1].keys()
+    assert len(both) > 5
+    assert {name for name in both if pinned[0][name] != pinned[1][name]} == set()

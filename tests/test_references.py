@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import unicodedata
@@ -12,9 +13,12 @@ from typing import Final
 
 import pytest
 
+from docs._site.pages import generated_pages
+
 ROOT: Final = Path(__file__).parents[1]
-REFERENCES: Final = ROOT / "docs/references.md"
-MATHEMATICS: Final = ROOT / "docs/mathematics"
+DOCS: Final = ROOT / "docs"
+REFERENCES: Final = ROOT / "docs/reference/references.md"
+MATHEMATICS: Final = ROOT / "docs/explanation/mathematics"
 READ: Final = {".py", ".md", ".toml", ".html", ".js", ".css", ".sh", ".service", ".rules", ".txt"}
 OURSELVES: Final = Path(__file__).relative_to(ROOT).as_posix()
 
@@ -84,6 +88,10 @@ def anchors_of(page: Path) -> set[str]:
 
 def problem_of(target: Path, anchor: str) -> str | None:
     """What is wrong with a reference to a page and a section of it; None if nothing is."""
+    generated = generated_pages().get(os.path.relpath(target, DOCS))
+    if generated is not None:
+        is_there = not anchor or anchor in anchors(generated)
+        return None if is_there else "the generated page has no such section"
     if not target.exists():
         return "there is no such file"
     if anchor and target.suffix == ".md" and anchor not in anchors_of(target):
@@ -135,7 +143,7 @@ def own() -> list[tuple[str, str]]:
     return [
         (name, re.sub(r"\s+(?:#\s+)?", " ", text))
         for name, text in texts()
-        if "/data/" not in name and name != "docs/references.md"
+        if "/data/" not in name and name != "docs/reference/references.md"
     ]
 
 

@@ -1,7 +1,7 @@
 """Words that are not used here, and where they occur: `python -m tests.vocabulary [PATH ...]`.
 
 Names are taken apart at underscores and capitals, so that `heard_ns` and `HeardNs` both count as
-`heard`. What to write instead is in docs/glossary.md.
+`heard`. What to write instead is in docs/reference/glossary.md.
 """
 
 from __future__ import annotations
@@ -66,29 +66,25 @@ SUFFIXES: Final = {".py", ".md", ".toml", ".html", ".js", ".css", ".service", ".
 # Files that quote foreign or old words, each with its reason.
 EXCEPTED: Final = {
     "tests/vocabulary.py": "lists the words",
-    "docs/glossary.md": "lists the words with what replaces them",
+    "docs/reference/glossary.md": "lists the words with what replaces them",
     "CHANGELOG.md": "names what was renamed",
 }
 
 # One word in one file (or below one folder), each with its reason.
 ALLOWED: Final[dict[tuple[str, str], str]] = {
-    ("docs/formats.md", "burnt"): "key of quality.json",
+    ("docs/reference/formats.md", "burnt"): "key of quality.json",
     ("daemon/configuration/model.py", "burnt"): "a former key that is refused",
     ("tests/daemon/configuration/test_configuration.py", "burnt"): "a former key that is refused",
-    ("docs/decisions/0010-names-and-packages.md", "tell"): "quotes a former name",
-    ("processing/pipelines/stitched.py", "burnt"): "key of quality.json",
-    ("processing/quality/report.py", "burnt"): "key of quality.json",
+    ("docs/explanation/decisions/0010-names-and-packages.md", "tell"): "quotes a former name",
+    ("processing/quality/figures/stitching.py", "burnt"): "key of quality.json",
     ("processing/quality/stitching_findings.py", "burnt"): "key of quality.json",
     ("tests/processing/quality/test_report.py", "burnt"): "key of quality.json",
     ("sim_hw/world/traffic.py", "lane"): "lanes of a road",
     ("sim_hw/world/traffic.py", "lanes"): "lanes of a road",
     ("sim_hw/world/ground_types.py", "lane"): "lanes of a road",
     ("sim_hw/world/ground_types.py", "lanes"): "lanes of a road",
-    ("daemon/onboard/flight/decisions.py", "foreseen"): "a key of recorded flight logs",
-    ("tests/daemon/onboard/flight/test_decisions.py", "foreseen"): "a key of recorded flight logs",
     ("daemon/mission/log/flight_log.py", "tell"): "method of a binary stream",
     ("daemon/mission/mirror/mirrored_log.py", "tell"): "method of a binary stream",
-    ("daemon/postflight/replay/flight_replay.py", "foreseen"): "key of recorded decisions",
 }
 
 _WORD: Final = re.compile(r"[A-Za-z]+")

@@ -16,7 +16,24 @@ from benchmarks.silent_errors.exposures import healthy, remeasured
 from benchmarks.silent_errors.faults import FAULTS
 from benchmarks.silent_errors.limits import LIMITS
 from benchmarks.silent_errors.truth import Found, compare, detail_of
-from processing.quality.report import Figure, QualityReport, Verdict
+from processing.quality.figures.circumstances import EstimatedDcFigures
+from processing.quality.figures.image import (
+    BalanceFigures,
+    ContentFigures,
+    RelativeSharpnessFigures,
+    SignalStepFigures,
+    WordFormatFigures,
+)
+from processing.quality.figures.stitching import (
+    DisplacedSensorFigures,
+    DisplacementFigures,
+    HeadScaleFigures,
+    LayerFigures,
+    MisreadProbeFigures,
+    PlatformFigures,
+    SlipFigures,
+)
+from processing.quality.report import Flag, QualityReport, Verdict
 
 EXPOSURES: Final = 2
 """Healthy exposures of a rig, over other ground and at other temperatures."""
@@ -24,7 +41,7 @@ SMALLEST, LARGEST = 0.5, 4.0
 COVERED: Final = 2.15
 """True RMS error over stated sigma: the 99.9 % point of the datum's four parameters."""
 RADIANCE: Final = 0.08
-"""What the radiance of a region of a good image may be off by (docs/validity.md)."""
+"""What the radiance of a region of a good image may be off by (docs/explanation/validity.md)."""
 BAND_PX: Final = 0.5
 DETAIL: Final = 0.5
 """Of the fine detail of the same image without a fault."""
@@ -164,35 +181,40 @@ def _result(
 
 def named_causes(report: QualityReport) -> dict[str, frozenset[str]]:
     """Who is named as a cause, by what he is accused of; alternatives among them."""
-    raised = {flag.name for flag in report.flags}
     figures = report.figures
-    # Of frames of other ground, signal and sharpness are not evaluated.
-    signal = {} if figures.get("mismatched_sensors") else figures
+    displaced = figures.of(DisplacedSensorFigures).displaced_sensor
+    slip, platform = figures.of(SlipFigures), figures.of(PlatformFigures)
+    other_ground = figures.of(ContentFigures).mismatched_sensors
+    displacement, misread = figures.of(DisplacementFigures), figures.of(MisreadProbeFigures)
     found = {
-        "displaced": _names(figures, "displaced_sensor", "displaced_alternatives"),
-        "slip": _names(figures, "slip_sensors", "slip_alternatives"),
-        "gain": _names(signal, "gain_outlier"),
-        "blur": _names(signal, "blurred_sensor"),
-        "step": _names(signal, "signal_step_sensor"),
-        "ground": _names(figures, "mismatched_sensors"),
-        "words": _names(figures, "word_format_sensors"),
-        "temperature": _names(figures, "dc_disagreement"),
-        "misread": _names(figures, "misread_probe"),
+        "displaced": _names(_one(displaced), displacement.displaced_alternatives),
+        "slip": _names(slip.slip_sensors, slip.slip_alternatives),
+        "ground": _names(other_ground),
+        "words": _names(figures.of(WordFormatFigures).word_format_sensors),
+        "temperature": _names(figures.of(EstimatedDcFigures).dc_disagreement),
+        "misread": _names(_one(misread.misread_probe)),
     }
-    if "CALIBRATION_EXPIRED" in raised:
-        causes = _names(figures, "platform_causes", "platform_alternatives")
-        found["platform"] = causes or _names(
-            figures, "platform_shift_head", "platform_alternatives", "platform_scale_head"
+    # Of frames of other ground, signal and sharpness are not evaluated.
+    if not other_ground:
+        found["gain"] = _names(_one(figures.of(BalanceFigures).gain_outlier))
+        found["blur"] = _names(_one(figures.of(RelativeSharpnessFigures).blurred_sensor))
+        found["step"] = _names(_one(figures.of(SignalStepFigures).signal_step_sensor))
+    if Flag.CALIBRATION_EXPIRED in report.flags:
+        causes, other = figures.of(LayerFigures).platform_causes, platform.platform_alternatives
+        scaled = _one(figures.of(HeadScaleFigures).platform_scale_head)
+        found["platform"] = _names(causes, other) or _names(
+            _one(platform.platform_shift_head), other, scaled
         )
     return {what: names for what, names in found.items() if names}
 
 
-def _names(figures: Mapping[str, Figure], *keys: str) -> frozenset[str]:
-    if not figures.get(keys[0]):
-        return frozenset()
-    return frozenset(
-        name for key in keys for name in str(figures.get(key) or "").split(", ") if name
-    )
+def _one(name: str | None) -> tuple[str, ...]:
+    return () if name is None else (name,)
+
+
+def _names(first: Sequence[str], *others: Sequence[str]) -> frozenset[str]:
+    """All names, if there is a first one."""
+    return frozenset(first).union(*others) if first else frozenset()
 
 
 @cache

@@ -26,7 +26,7 @@ from benchmarks.rendered import (
 )
 from benchmarks.silent_errors.scenes import SCENES, Tone
 from processing.geometry.conditions import Conditions
-from processing.pipelines.perspective import HeadPipeline, HeadsProduct
+from processing.pipelines.perspective import HeadPipeline, HeadSettings, HeadsProduct
 from processing.pipelines.stitched import Pipeline, PipelineSettings, Product
 from processing.radiometry.calibration import RadiometricCalibration
 from processing.rig import Cone, Rig, Sensor, find_rig
@@ -77,7 +77,7 @@ class EmulatedExposure:
             return Pipeline(self.rig, self.radiometry, PipelineSettings(threads=1)).process(
                 self.frames, self.conditions
             )
-        heads = HeadPipeline(self.rig, self.radiometry, threads=1)
+        heads = HeadPipeline(self.rig, self.radiometry, HeadSettings(threads=1))
         return heads.process(self.frames, self.conditions)
 
     def with_frame(self, name: str, change: Callable[[Array], Array]) -> EmulatedExposure:

@@ -1,6 +1,7 @@
 """Published detection limits: from which size on a wrong input does not pass as good.
 
-The table of docs/validity.md is made from these: `python -m benchmarks.silent_errors --limits`.
+The table of docs/explanation/validity.md is made from these: `python -m benchmarks.silent_errors
+--limits`.
 """
 
 from __future__ import annotations

@@ -21,6 +21,7 @@ from processing.geometry.projective import apply_projective
 from processing.mosaic.precision import disturbance_covariance_px, placed_covariance_px
 from processing.pipelines.perspective import HeadsProduct
 from processing.pipelines.stitched import Product
+from processing.quality.figures.stitching import PrecisionFigures
 from processing.radiometry.demosaic import BAYER_BANDS, is_bayer
 from processing.rig import Sensor
 from sim_hw.truth_comparison import on_sensor, true_positions
@@ -75,7 +76,7 @@ def compare(
         return Found(None, None, None, None, 0.0, regions.get(worst, 0.0), worst, min(shares))
     errors = _errors(emulated, product)
     every = np.concatenate(list(errors.values()))
-    stated = product.report.figures["stitched_sigma_px"]
+    stated = product.report.figures.of(PrecisionFigures).stitched_sigma_px
     points = _check_points(emulated, product)
     return Found(
         error_px=float(np.sqrt(np.mean(every**2))),
@@ -113,8 +114,8 @@ def _true(emulated: EmulatedExposure, name: str, raw: Array) -> Array:
 
 
 def _worst(errors: Mapping[str, Array], product: Product) -> float | None:
-    stated = product.report.figures["stitched_sigma_worst_px"]
-    if not isinstance(stated, float):
+    stated = product.report.figures.of(PrecisionFigures).stitched_sigma_worst_px
+    if stated is None:
         return None
     return max(float(np.sqrt(np.mean(e**2))) for e in errors.values()) / stated
 

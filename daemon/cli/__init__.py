@@ -16,13 +16,14 @@ import typer
 
 from daemon.cli import interrupt_messages
 from daemon.cli.command_table import CommandGroup
+from daemon.cli.exit_status import ExitStatus
 
 app = typer.Typer(
     name="syntopic",
     cls=CommandGroup,
     help="Onboard software of an aerial camera made of several heads.\n\n"
     "Examples: `syntopic demo`, `syntopic run service.toml`, `syntopic calibrate lab --help`",
-    epilog="Begin with: syntopic demo",
+    epilog="Begin with: syntopic demo. Exit statuses of a command: syntopic COMMAND --help",
     no_args_is_help=True,
     add_completion=True,
     rich_markup_mode="markdown",
@@ -60,10 +61,10 @@ def main() -> NoReturn:
         app()
     except KeyboardInterrupt:
         interrupt_messages.print_notice(interrupt_messages.NOTHING_BEGUN)
-        sys.exit(interrupt_messages.STATUS)
+        sys.exit(ExitStatus.INTERRUPTED)
     except Exception as error:  # noqa: BLE001 - what is not understood is raised again
         _print_refusal(error)
-    sys.exit(0)
+    sys.exit(ExitStatus.DONE)
 
 
 def _print_refusal(error: Exception) -> NoReturn:
@@ -84,7 +85,7 @@ def _print_refusal(error: Exception) -> NoReturn:
         console.print(f"Refused: {count} error{'s' if count > 1 else ''}", style="bold red")
         for problem in error.problems:
             console.print(f"  {problem}", markup=False, highlight=False)
-        sys.exit(2)
+        sys.exit(ExitStatus.REFUSED)
     refusal: Exception | None = error
     if isinstance(error, ImportError):
         refusal = missing_module(error)
@@ -93,7 +94,7 @@ def _print_refusal(error: Exception) -> NoReturn:
     if not isinstance(refusal, DaemonError | MissingExtraError):
         raise error
     console.print(str(refusal), style="red", markup=False)
-    sys.exit(1)
+    sys.exit(ExitStatus.PROBLEM)
 
 
 def _disk_refusal(error: OSError) -> Exception:

@@ -13,6 +13,8 @@ from typing import Annotated
 import typer
 from rich.progress import Progress
 
+from daemon.cli.exit_status import ExitStatus
+from daemon.cli.options import AsJson
 from daemon.terminal.console import Console
 
 HELP = """Adjust a bundle from a project of text files.
@@ -22,7 +24,7 @@ The project is written by hand or by `syntopic import dbat`.
 Prints sigma0, redundancy, residuals by kind, interior orientation with standard deviations, and
 check points against their predicted accuracy. With --out the adjusted project, coordinates and
 residuals are written as tables. Parameters that cannot be determined are named. The format is
-described in docs/formats.md.
+described in docs/reference/formats.md.
 
 Examples: `syntopic adjust project.toml`, `syntopic adjust project.toml --reject 4 --out adjusted`
 """
@@ -44,7 +46,7 @@ def adjust(
         bool | None,
         typer.Option("--free-network/--no-free-network", help="Accept a network without datum."),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     from daemon.postflight.adjustment.csv_tables import ProjectError
     from daemon.postflight.adjustment.project import read_project
@@ -89,7 +91,7 @@ def adjust(
             console = Console(stderr=True, soft_wrap=True)
             for problem in problems:
                 console.print(problem, style="red", markup=False, highlight=False)
-        raise typer.Exit(1)
+        raise typer.Exit(ExitStatus.PROBLEM)
     report = report_of(
         result,
         given.checks,

@@ -11,6 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
+from daemon.cli.options import AsJson
 from daemon.terminal.console import Console
 from daemon.terminal.tables import light_table
 
@@ -37,10 +38,10 @@ def bench(
     folder: Annotated[
         Path | None, typer.Option(help="Folder of rendered exposures (default: cache).")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     from daemon.cli.benchmark import pipeline as measuring
-    from daemon.onboard.service.startup import thread_counts
+    from daemon.products.processing_threads import thread_counts
     from processing.rig import find_rig
 
     found = find_rig(rig)

@@ -18,6 +18,8 @@ from daemon.cli import (
     calibrate_radiometric,
     calibrate_rig,
 )
+from daemon.cli.exit_status import status_of
+from daemon.cli.options import AsJson
 from daemon.terminal.console import Console
 from daemon.terminal.tables import light_table
 
@@ -72,7 +74,7 @@ def thermal(
     out: Annotated[
         Path | None, typer.Option(help="New rig file (default: dated, next to the mission).")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     from daemon.postflight.calibration.calibration_report import content_digest
     from daemon.postflight.calibration.rig_writer import rig_toml
@@ -106,13 +108,13 @@ def thermal(
         typer.echo(json.dumps(_json(records, found, changes, seen, written)))
     else:
         _print(records, found, changes, seen, written)
-    raise typer.Exit(0 if changes else 1)
+    raise typer.Exit(status_of(is_good=bool(changes)))
 
 
 @app.command(name="validity", help=VALIDITY_HELP)
 def validity(
     mission: Annotated[Path, typer.Argument(help="A mission folder with Level-2.")],
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     from daemon.mission.layout import Mission
     from daemon.postflight.displacements import (
@@ -141,7 +143,7 @@ def validity(
         ):
             console.print(sentence)
         console.print(f"Written: {path}", soft_wrap=True)
-    raise typer.Exit(1 if displacements["steps"] else 0)
+    raise typer.Exit(status_of(is_good=not displacements["steps"]))
 
 
 def _json(

@@ -17,12 +17,12 @@ from daemon.terminal.tables import light_table
 
 HELP = """Estimate boresight, lever arm and time offset from a controlled block.
 
-PROJECT is an adjustment project (docs/formats.md) with control points. It is adjusted without its
-antenna positions and attitudes. The result is compared with the trajectory: `inertial.csv` in the
-project, or that of --mission (exposures are named as their folders). --crs is required unless
-`syntopic triangulate` wrote the project. Fly two heights, opposite and crossing lines and two
-speeds. Parameters the flight cannot separate are named and keep their given values. The rig (--rig,
-or the mission's) holds the serial numbers of heads, lenses and probes.
+PROJECT is an adjustment project (docs/reference/formats.md) with control points. It is adjusted
+without its antenna positions and attitudes. The result is compared with the trajectory:
+`inertial.csv` in the project, or that of --mission (exposures are named as their folders). --crs is
+required unless `syntopic triangulate` wrote the project. Fly two heights, opposite and crossing
+lines and two speeds. Parameters the flight cannot separate are named and keep their given values.
+The rig (--rig, or the mission's) holds the serial numbers of heads, lenses and probes.
 
 Writes a dated folder with mount.toml, report.html and calibration.json.
 

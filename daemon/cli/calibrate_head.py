@@ -40,19 +40,15 @@ def head(
     from daemon.postflight.calibration.calibration_report import calibration_folder, read_previous
     from daemon.postflight.calibration.laboratory.head_geometry import (
         FREE,
+        CollimatorSeries,
         calibrate_head,
-        targets_of,
     )
     from daemon.postflight.calibration.laboratory.head_report import calibrated_rig, head_report
     from daemon.postflight.calibration.laboratory.laboratory_series import read_series
     from daemon.postflight.calibration.rig_writer import rig_toml
     from processing.geometry.residual_grid import grid_bytes
 
-    given = read_series(series, kind="head")
-    targets = targets_of(given)
-    radius = given.table.number("target_radius_rad", positive=True)
-    angle_sigma = given.table.number("angle_sigma_rad", 1e-6, positive=True)
-    given.checked()
+    given = read_series(series, CollimatorSeries)
     today = f"{datetime.now(UTC):%Y-%m-%d}"
     place = calibration_folder(out, f"{given.rig.name}-head", today, next_to=series)
     before = (previous, read_previous(previous, kind="head")) if previous else None
@@ -64,14 +60,14 @@ def head(
             progress.update(task, description=what, completed=done, total=total)
 
         for sensor in given.rig.sensors:
-            own = [t for t in targets if t.sensor == sensor.name]
+            own = [t for t in given.file.images if t.sensor == sensor.name]
             if own:
                 found = calibrate_head(
                     given.rig.cone_of(sensor.name),
                     sensor,
                     own,
-                    target_radius_rad=radius,
-                    angle_sigma_rad=angle_sigma,
+                    target_radius_rad=given.file.target_radius_rad,
+                    angle_sigma_rad=given.file.angle_sigma_rad,
                     free=(*FREE, "k3") if k3 else FREE,
                     progress=show_progress,
                 )

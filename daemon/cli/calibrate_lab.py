@@ -39,6 +39,7 @@ def lab(
     from daemon.postflight.calibration.calibration_report import calibration_folder, read_previous
     from daemon.postflight.calibration.laboratory.calibration_field import calibrate_rig
     from daemon.postflight.calibration.laboratory.field_measurement import (
+        FieldSeries,
         field_exposures,
         field_of,
         measure_targets,
@@ -52,11 +53,8 @@ def lab(
     from daemon.postflight.calibration.laboratory.laboratory_series import read_series
     from daemon.postflight.calibration.rig_writer import rig_toml
 
-    given = read_series(series, kind="lab")
-    exposures, field = field_exposures(given), field_of(given)
-    offset_sigma = given.table.number("offset_sigma_mm", 0.2, positive=True)
-    skew_sigma = given.table.number("skew_sigma_per_mm", 5e-6, positive=True)
-    given.checked()
+    given = read_series(series, FieldSeries)
+    exposures, field = field_exposures(given.file), field_of(given.file)
     today = f"{datetime.now(UTC):%Y-%m-%d}"
     place = calibration_folder(out, f"{given.rig.name}-lab", today, next_to=series)
     before = (previous, read_previous(previous, kind="lab")) if previous else None
@@ -72,8 +70,8 @@ def lab(
             exposures,
             field,
             observations,
-            offset_sigma_mm=offset_sigma,
-            skew_sigma_per_mm=skew_sigma,
+            offset_sigma_mm=given.file.offset_sigma_mm,
+            skew_sigma_per_mm=given.file.skew_sigma_per_mm,
             progress=show_progress,
         )
     report = field_report(given, found, calibration_id=place.name, date=today, previous=before)

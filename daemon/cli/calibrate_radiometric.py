@@ -43,20 +43,19 @@ def radiometric(
     from daemon.postflight.calibration.calibration_report import calibration_folder, read_previous
     from daemon.postflight.calibration.laboratory.laboratory_series import read_series
     from daemon.postflight.calibration.laboratory.radiometric import (
+        RadiometricSeries,
         calibrate_sensor,
         checks_of,
         common_level,
+        refuse_mixed_sets,
         sets_of,
-        shots_of,
     )
     from daemon.postflight.calibration.laboratory.radiometric_maps import files_of
     from daemon.postflight.calibration.laboratory.radiometric_report import radiometric_report
 
-    given = read_series(series, kind="radiometric")
-    shots = shots_of(given)
-    temperature_sigma = given.table.number("temperature_sigma_c", 0.1)
-    monitor_sigma = given.table.number("monitor_sigma", 1e-3)
-    given.checked()
+    given = read_series(series, RadiometricSeries)
+    shots = given.file.images
+    refuse_mixed_sets(shots)
     today = f"{datetime.now(UTC):%Y-%m-%d}"
     place = calibration_folder(out, f"{given.rig.name}-radiometric", today, next_to=series)
     before = (previous, read_previous(previous, kind="radiometric")) if previous else None
@@ -73,8 +72,8 @@ def radiometric(
             head = calibrate_sensor(
                 given.rig.sensor(name),
                 own,
-                temperature_sigma_c=temperature_sigma,
-                monitor_sigma=monitor_sigma,
+                temperature_sigma_c=given.file.temperature_sigma_c,
+                monitor_sigma=given.file.monitor_sigma,
                 progress=show_progress,
             )
             heads.append(replace(head, checks=checks_of(head, own)))

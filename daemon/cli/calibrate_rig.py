@@ -17,11 +17,11 @@ from daemon.terminal.tables import light_table
 
 HELP = """Estimate the relative orientation of oblique heads to the nadir head, averaged over a block.
 
-PROJECT is an adjustment project (docs/formats.md) whose cameras are named like the rig's cones. The
-images of an exposure share a projection centre and have separate angles; or the exposure has one
-attitude, and the heads are free parameters. Printed in grads and degrees, phi
-first (R = Ry Rx Rz), with standard deviations. Writes a dated folder with rig.toml (orientations
-and lenses), report.html and calibration.json.
+PROJECT is an adjustment project (docs/reference/formats.md) whose cameras are named like the rig's
+cones. The images of an exposure share a projection centre and have separate angles; or the exposure
+has one attitude, and the heads are free parameters. Printed in grads and degrees, phi first (R = Ry
+Rx Rz), with standard deviations. Writes a dated folder with rig.toml (orientations and lenses),
+report.html and calibration.json.
 
 Examples: `syntopic calibrate rig block --rig midas`,
 `syntopic calibrate rig block --rig rig.toml --previous midas-rig-2026-05-02`

@@ -11,11 +11,14 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from daemon.cli.options import AsJson
+
 HELP = """Create a local authority and a TLS certificate for this machine.
 
 The certificate has the machine's names (mDNS and host name), its addresses, and those given with
---name. Install the authority on tablets and ground stations once (docs/tls.md); run the command
-again to renew the certificate, which a running service uses within seconds.
+--name. Install the authority on tablets and ground stations once
+(docs/how-to/flight/tls.md); run the command again to renew the certificate, which a running
+service uses within seconds.
 
 Examples: `syntopic certificate`, `syntopic certificate --folder tls --name camera1.example.org`
 """
@@ -39,7 +42,7 @@ def certificate(
     group: Annotated[
         str | None, typer.Option(help="Group that reads the key (default: syntopic, if it exists).")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     from daemon.onboard.monitoring.access.certificate_authority import issue_certificate
 

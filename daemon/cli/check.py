@@ -12,8 +12,10 @@ import typer
 from rich.text import Text
 from rich.tree import Tree
 
+from daemon.cli.exit_status import ExitStatus
 from daemon.cli.find_heads import find_heads
 from daemon.cli.find_ports import find as find_devices
+from daemon.cli.options import AsJson
 from daemon.terminal.console import Console
 
 if TYPE_CHECKING:
@@ -25,9 +27,8 @@ HELP = """Validate a configuration, build the service, and verify each device wi
 
 Prerequisites, pipeline, kernels, page and arming are checked with the functions that `run` uses.
 Only with `--fire` one exposure is fired to verify frames and event marks. While the
-service runs, it is queried over its control socket, and no device is opened. The exit status is 0 if
-all checks pass, 1 if one fails, 2 if the configuration is refused, and 3 if none fails and one is
-waiting, such as a receiver that searches.
+service runs, it is queried over its control socket, and no device is opened. An item is
+waiting if, for example, its receiver searches.
 
 With `--find`, detect the protocols at serial ports, tcp://host:port, udpin://host:port (those
 given, or all serial ports and the usual addresses): protocol, speed, and the configuration for it.
@@ -36,6 +37,11 @@ With `--find-heads`, search for GigE Vision, USB3 Vision and V4L2 heads.
 Examples: `syntopic check flights/sim/service.toml`, `syntopic check service.toml --fire --json`,
 `syntopic check --find`, `syntopic check --find /dev/ttyUSB0 tcp://10.0.0.5:3001`
 """
+STATUSES = {
+    "pass": ExitStatus.DONE,
+    "fail": ExitStatus.PROBLEM,
+    "waiting": ExitStatus.WAITING,
+}
 COLOURS = {"pass": "green", "waiting": "yellow", "fail": "red", "not tried": "dim"}
 
 
@@ -56,7 +62,7 @@ def check(
     fire: Annotated[
         bool, typer.Option("--fire", help="One exposure to verify frames and event marks.")
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     if find:
         find_devices(targets or [], as_json=as_json, ask=not listen_only)
@@ -71,8 +77,8 @@ def check(
 
 def check_flight(config: Path, *, fire: bool, as_json: bool) -> None:
     """Look at everything a flight with this configuration needs, and print it."""
-    from daemon.configuration.model import load
-    from daemon.onboard.preflight.check_results import EXIT_STATUS, CheckOutcome, worst_outcome
+    from daemon.configuration.service_file import load
+    from daemon.onboard.preflight.check_results import CheckOutcome, worst_outcome
 
     configuration, rig = load(config)
     console = Console(stderr=as_json)
@@ -90,18 +96,18 @@ def check_flight(config: Path, *, fire: bool, as_json: bool) -> None:
             console.print("Waiting for what is marked so; nothing fails.", style="yellow")
         else:
             console.print("Not ready; do as the sentences in red say.", style="bold red")
-    raise typer.Exit(EXIT_STATUS[outcome])
+    raise typer.Exit(STATUSES[outcome.value])
 
 
 def collect_results(
     configuration: Configuration, rig: Rig, config: Path, *, fire: bool
 ) -> list[CheckResult]:
     """All findings: of the running service where there is one, else of what `run` would build."""
+    from daemon.mission.interrupted_mission import interrupted_mission
     from daemon.onboard.monitoring.access.service_query import query_service
     from daemon.onboard.preflight.prerequisites import prerequisites
     from daemon.onboard.preflight.resumption import resumption_result
     from daemon.onboard.preflight.system_check import run_system_check
-    from daemon.onboard.service.startup import interrupted_mission
 
     mission = interrupted_mission(configuration)
     if mission is not None and mission.is_held():
@@ -114,10 +120,6 @@ def collect_results(
         results.append(result)
         if result.is_blocking:
             return results
-    if configuration.watch is not None:
-        from daemon.onboard.monitoring.monitoring_prerequisites import check_monitoring
-
-        results += check_monitoring(configuration.watch)
     return results + asyncio.run(run_system_check(configuration, rig, fire=fire))
 
 

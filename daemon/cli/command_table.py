@@ -15,6 +15,7 @@ from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command, get_group
 
 from daemon.cli import interrupt_messages
+from daemon.cli.exit_status import ExitStatus, help_line
 
 
 class CommandEntry(NamedTuple):
@@ -87,6 +88,7 @@ TABLE: Final = {
             "calibrate", _LABORATORY, "Compute calibrations, each a new file.", "calibrate:app"
         ),
         _command("adjust", _LABORATORY, "Adjust a bundle from a project of text files."),
+        _command("schema", _BENCH, "Print the JSON Schema of rig.toml or service.toml."),
         _command("demo", _BENCH, "Fly the first flight with emulated devices."),
         _command("sim", _BENCH, "Run the emulated devices of a rig until Ctrl-C."),
         _command("bench", _BENCH, "Time the pipeline on one exposure against other software."),
@@ -118,15 +120,28 @@ def load(entry: CommandEntry) -> Any:
     """The command as click runs it, its module imported."""
     found = getattr(importlib.import_module(entry.module), entry.object_name)
     if isinstance(found, typer.Typer):
-        interrupt_messages.make_interruptible(found, entry.name)
+        _complete(found, entry.name)
         group = get_group(found)
         group.name = entry.name
         return group
     app = typer.Typer(add_completion=False, rich_markup_mode="markdown")
     text = getattr(importlib.import_module(entry.module), entry.help_name)
     app.command(name=entry.name, help=text)(found)
-    interrupt_messages.make_interruptible(app)
+    _complete(app)
     return get_command(app)
+
+
+def _complete(app: typer.Typer, group: str = "") -> None:
+    """Give every command its sentence on Ctrl-C, and its exit statuses as last line of help."""
+    for command in app.registered_commands:
+        callback = command.callback
+        if callback is not None:
+            name = f"{group} {command.name or callback.__name__.replace('_', '-')}".strip()
+            command.callback = interrupt_messages.interruptible(callback, name)
+            command.epilog = help_line(name)
+    for below in app.registered_groups:
+        if below.typer_instance is not None and isinstance(below.name, str):
+            _complete(below.typer_instance, f"{group} {below.name}".strip())
 
 
 class _Loaded(MutableMapping[str, Any]):
@@ -171,7 +186,7 @@ class CommandGroup(TyperGroup):
             return super().invoke(ctx)
         except KeyboardInterrupt:
             interrupt_messages.print_notice(interrupt_messages.NOTHING_BEGUN)
-            raise typer.Exit(interrupt_messages.STATUS) from None
+            raise typer.Exit(ExitStatus.INTERRUPTED) from None
 
     def list_commands(self, ctx: Any) -> list[str]:
         """The names, in the order of `TABLE`."""

@@ -21,17 +21,26 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from daemon.cli.exit_status import ExitStatus, status_of
+from daemon.cli.options import AsJson
 from daemon.cli.sim import (
     Emulator,
-    EmulatorError,
     free_first_address,
     service_toml,
     simulator_arguments,
 )
+from daemon.errors import DaemonError
 from daemon.mission.store.durable import replace_file
 from daemon.terminal.console import Console
 from daemon.terminal.tables import light_table
 from drivers.base.extras import require
+from processing.quality.figures import QualityFigures
+from processing.quality.figures.circumstances import DcFigures
+from processing.quality.figures.stitching import (
+    AdjustmentFigures,
+    DisplacedSensorFigures,
+    TiePointFigures,
+)
 from processing.rig import Rig, RigError, find_rig
 
 HELP = """Fly a first flight with an emulated rig: capture, stitching and verdict.
@@ -45,7 +54,7 @@ Examples: `syntopic demo`, `syntopic demo --rig ultracam-l-mini`, `syntopic demo
 EVENT_TIMEOUT_S = 180.0
 
 
-class DemoError(RuntimeError):
+class DemoError(DaemonError):
     """The demonstration cannot continue; the message states where to look."""
 
 
@@ -65,7 +74,7 @@ def demo(
     ] = "ublox",
     seed: Annotated[int, typer.Option(help="Seed for all random generators.")] = 1,
     out: Annotated[Path, typer.Option(help="Folder of the flights.")] = Path("flights"),
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     require("aravis", "watch", *(["mavlink"] if receiver == "mavlink" else []))
     console = Console(stderr=as_json)
@@ -74,28 +83,24 @@ def demo(
         displace = _displacement(find_rig(rig)) if displace is None else displace
     except RigError as error:
         console.print(str(error), style="bold red")
-        raise typer.Exit(1) from error
+        raise typer.Exit(ExitStatus.REFUSED) from error
     arguments = simulator_arguments(
         rig, folder / "sim", seed=seed, dc=dc, displace=[displace] if displace else []
     )
     arguments += ["--scene-cache", str(out / "scenes"), "--exposures", str(exposures + 1)]
     arguments += ["--first-address", free_first_address(), "--receiver", receiver]
     console.print(f"Emulating {rig} at dC = {dc:+g} K, displaced: {displace or 'none'}")
+    emulator = Emulator(arguments)
     try:
-        emulator = Emulator(arguments)
-        try:
-            mission, ledger = _fly(console, emulator, folder, exposures)
-        finally:
-            emulator.end()
-        result = _compare_with_truth(console, mission, Path(emulator.ready["truth"]), ledger)
-    except (DemoError, EmulatorError) as error:
-        console.print(str(error), style="bold red")
-        raise typer.Exit(1) from error
+        mission, ledger = _fly(console, emulator, folder, exposures)
+    finally:
+        emulator.end()
+    result = _compare_with_truth(console, mission, Path(emulator.ready["truth"]), ledger)
     if as_json:
         typer.echo(json.dumps(result))
     else:
         _print_result(console, result, ledger)
-    raise typer.Exit(0 if result["lost"] == 0 and result["ledger_balanced"] else 1)
+    raise typer.Exit(status_of(is_good=result["lost"] == 0 and result["ledger_balanced"]))
 
 
 def _displacement(rig: Rig) -> str:
@@ -203,15 +208,16 @@ def _cells(events: Mapping[str, Any]) -> list[str | Text]:
     if "processed" not in events:
         return [*cells, "", "", "", "", "", "sealed"]
     report = events["processed"]["report"]
-    figures = report["figures"]
+    figures = QualityFigures.from_json(report["figures"])
+    adjustment, points = figures.of(AdjustmentFigures), figures.of(TiePointFigures)
     colour = {"good": "green", "usable": "yellow", "refly": "red"}[report["verdict"]]
     return [
         *cells,
-        _number(figures.get("dc_k"), "+.1f"),
-        f"{figures.get('tie_points_pp', 0)}+{figures.get('tie_points_pc', 0)}",
-        _number(figures.get("sigma0_px"), ".3f"),
-        _number(figures.get("sigma0_um"), ".2f"),
-        str(figures.get("displaced_sensor") or "-"),
+        _number(figures.of(DcFigures).dc_k, "+.1f"),
+        f"{points.tie_points_pp or 0}+{points.tie_points_pc or 0}",
+        _number(adjustment.sigma0_px, ".3f"),
+        _number(adjustment.sigma0_um, ".2f"),
+        figures.of(DisplacedSensorFigures).displaced_sensor or "-",
         Text(str(report["verdict"]), colour),
     ]
 
@@ -252,7 +258,10 @@ def _compare_with_truth(
     reports = [
         json.loads(path.read_text()) for path in sorted((mission / "L2").glob("*/quality.json"))
     ]
-    named = [report["figures"].get("displaced_sensor") for report in reports]
+    named = [
+        QualityFigures.from_json(report["figures"]).of(DisplacedSensorFigures).displaced_sensor
+        for report in reports
+    ]
     counts = ledger["triggers"]
     free = geometry["methods"].get("free", {})
     return {

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from daemon.cli.options import AsJson
+
 HELP = """Read the health of every disk with smartctl and store it for the service.
 
-A timer runs this as root every two minutes (syntopic-disk-health.timer). If no disk can be read,
-the exit status is 1 and the service reports it.
+A timer runs this as root every two minutes (syntopic-disk-health.timer). If no disk can be
+read, the service reports it.
 
 Examples: `syntopic disk-health`, `syntopic disk-health --out /tmp/disks.json`
 """
@@ -18,6 +21,7 @@ Examples: `syntopic disk-health`, `syntopic disk-health --out /tmp/disks.json`
 
 def disk_health(
     out: Annotated[Path | None, typer.Option(help="File to write (default: in /run).")] = None,
+    as_json: AsJson = False,
 ) -> None:
     from daemon.mission.store import health
 
@@ -28,6 +32,9 @@ def disk_health(
         health.write_report(path, health.failed_report(error))
         raise
     health.write_report(path, report)
+    if as_json:
+        typer.echo(json.dumps(report))
+        return
     for name, stated in report["disks"].items():
         found = health.health_of(stated)
         verdict = "; ".join(found.problems) or "healthy"

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from daemon.cli.exit_status import ExitStatus
+from daemon.cli.options import AsJson
 from daemon.terminal.console import Console
 from daemon.terminal.tables import light_table
 
@@ -27,9 +29,9 @@ Examples: `syntopic explain lost`, `syntopic explain TILT`, `syntopic explain --
 
 def explain(
     name: Annotated[str, typer.Argument(help="An event or a flag, or part of its name.")] = "",
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
     markdown: Annotated[
-        bool, typer.Option("--markdown", help="Output as the page docs/events.md.")
+        bool, typer.Option("--markdown", help="Output as the page docs/reference/flight/events.md.")
     ] = False,
 ) -> None:
     from daemon.onboard.flight.event_table import TABLE, as_markdown, entry_of
@@ -54,7 +56,7 @@ def explain(
     else:
         _print(events, flags, name)
     if not events and not flags:
-        raise typer.Exit(1)
+        raise typer.Exit(ExitStatus.PROBLEM)
 
 
 def _print(events: Sequence[EventDefinition], flags: Sequence[FlagDefinition], name: str) -> None:

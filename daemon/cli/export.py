@@ -10,6 +10,7 @@ import typer
 from rich.progress import Progress
 
 from daemon.cli.exposure_failures import exit_if_failed
+from daemon.cli.options import AsJson
 from daemon.terminal.console import Console
 from daemon.terminal.tables import light_table
 from drivers.base.extras import require
@@ -63,7 +64,7 @@ def export() -> None:
 @app.command()
 def raw(
     mission: Annotated[Path, typer.Argument(help="Mission folder.")],
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """The receivers' own bytes, one file each in its native format, and the event file.
 
@@ -96,7 +97,7 @@ def raw(
 @app.command()
 def foxglove(
     mission: Annotated[Path, typer.Argument(help="Mission folder.")],
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Track, thumbnails and messages as one MCAP file that Foxglove opens.
 
@@ -132,7 +133,7 @@ def pictures(
     only: Annotated[
         list[int] | None, typer.Option(help="Number of an exposure; repeatable.")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     from daemon.mission.layout import Mission
     from daemon.postflight.export.level2_export import KINDS, PictureError, export_pictures
@@ -168,7 +169,7 @@ def pictures(
 @app.command(help=CERTIFICATE_HELP)
 def certificate(
     mission: Annotated[Path, typer.Argument(help="Mission folder.")],
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     from daemon.mission.layout import Mission
     from daemon.postflight.export.camera_certificate import write_certificate
@@ -209,7 +210,7 @@ def orientation(
     dem: Annotated[
         Path | None, typer.Option(help="Height model for footprints: GeoTIFF or .asc.")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     from daemon.mission.layout import Mission
     from daemon.postflight.export import orientation_set as orientation_export

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import typer
 from rich.text import Text
 
+from daemon.cli.exit_status import ExitStatus
 from daemon.mission.exposure_batch import ExposureFailure
 from daemon.terminal.console import Console
 from daemon.terminal.tables import light_table
@@ -26,4 +27,4 @@ def exit_if_failed(failures: Sequence[ExposureFailure]) -> None:
     for failure in failures:
         table.add_row(f"{failure.exposure} ", Text(failure.cause, overflow="fold"))
     Console(stderr=True).print(table)
-    raise typer.Exit(1)
+    raise typer.Exit(ExitStatus.PROBLEM)

@@ -7,6 +7,7 @@ from typing import Any, NoReturn
 
 import typer
 
+from daemon.cli.exit_status import status_of
 from daemon.terminal.console import Console
 from daemon.terminal.tables import light_table
 
@@ -33,8 +34,8 @@ def find_heads(*, as_json: bool) -> NoReturn:
             console.print("Next: paste this into the service configuration, and name the sensors.")
             console.print(f"\n{sections}\n", markup=False, highlight=False, soft_wrap=True)
         else:
-            console.print("No head was found. Check power and cables; see docs/drivers.")
-    raise typer.Exit(0 if found else 1)
+            console.print("No head was found. Check power and cables; see docs/reference/drivers.")
+    raise typer.Exit(status_of(is_good=bool(found)))
 
 
 def found_heads() -> tuple[list[dict[str, Any]], list[str]]:

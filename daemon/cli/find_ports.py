@@ -12,6 +12,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from daemon.cli.exit_status import status_of
 from daemon.terminal.console import Console
 from daemon.terminal.tables import light_table
 from drivers.base.extras import MissingExtraError, require
@@ -44,7 +45,7 @@ def find(ports: Sequence[str], *, as_json: bool, ask: bool) -> NoReturn:
         typer.echo(json.dumps({"ports": [_as_json(one) for one in found], "toml": sections}))
     else:
         _print(console, found, sections)
-    raise typer.Exit(0 if any(one.detected for one in found) else 1)
+    raise typer.Exit(status_of(is_good=any(one.detected for one in found)))
 
 
 class _Progress:
@@ -129,7 +130,7 @@ def _print(console: Console, found: Sequence[DetectionResult], sections: str) ->
     console.print(table)
     if not sections:
         console.print(
-            "Nothing was found. Check power and cables; see docs/drivers for each device."
+            "Nothing was found. Check power and cables; see docs/reference/drivers for each device."
         )
         return
     console.print("Next: paste this into the service configuration, then syntopic check it.")

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 from rich.progress import Progress
 
+from daemon.cli.options import AsJson
 from daemon.terminal.console import Console
 
 app = typer.Typer(
@@ -32,7 +33,7 @@ def rededge(
         Path, typer.Argument(help="Folder with IMG_0000_1.tif ..., searched recursively.")
     ],
     out: Annotated[Path, typer.Option(help="New mission folder.")],
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Import MicaSense RedEdge images; lens and radiance calibration come from their tags.
 
@@ -72,7 +73,7 @@ def rededge(
 def dbat(
     script: Annotated[Path, typer.Argument(help="Script (XML) of a camera calibration.")],
     out: Annotated[Path, typer.Option(help="Folder for the adjustment project; must be new.")],
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Import a camera calibration of the Damped Bundle Adjustment Toolbox for `syntopic adjust`.
 

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from daemon.cli.exit_status import status_of
+from daemon.cli.options import AsJson
 from daemon.terminal.console import Console
 
 if TYPE_CHECKING:
@@ -29,7 +31,6 @@ Example: `sudo /opt/syntopic/bin/syntopic uninstall`
 """
 
 Root = Annotated[Path, typer.Option(help="Root folder of an image (default: this machine).")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 
 
 def install(
@@ -40,7 +41,7 @@ def install(
     replace: Annotated[bool, typer.Option(help="Overwriting of files edited by hand.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    from daemon.configuration.model import load
+    from daemon.configuration.service_file import load
     from daemon.onboard import installation
 
     command = Path(sys.argv[0]).absolute()
@@ -94,4 +95,4 @@ def _print_outcome(done: InstallationReport, as_json: bool, verb: str, next_line
         for purpose, outcome in done.steps.items():
             console.print(f"{purpose}: {outcome}", highlight=False, soft_wrap=True)
         console.print(f"Next: {next_line}", highlight=False, soft_wrap=True)
-    raise typer.Exit(1 if done.failed else 0)
+    raise typer.Exit(status_of(is_good=not done.failed))

@@ -1,7 +1,7 @@
 """State after Ctrl-C, in one sentence for each command.
 
 Files appear complete or not at all (`daemon.mission.store.durable`), so that each sentence is true
-at any instant. The commands `run` and `sim` handle Ctrl-C themselves.
+at any instant. The command `run` handles Ctrl-C itself once its service is up.
 """
 
 from __future__ import annotations
@@ -12,8 +12,7 @@ from typing import Any
 
 import typer
 
-STATUS = 130
-"""Exit status after SIGINT, as shells give it: 128 + 2."""
+from daemon.cli.exit_status import ExitStatus
 
 RETRY_HINT = "run the same command again"
 NOTHING_BEGUN = f"Interrupted: nothing was begun; {RETRY_HINT}."
@@ -22,6 +21,7 @@ _COMPLETE_FILES = f"every file that has its name is complete, new or as it was b
 
 SENTENCES = {
     "demo": f"the exposures stored so far are complete; {RETRY_HINT} for a new flight",
+    "sim": f"all emulated devices are closed; {RETRY_HINT} to open them",
     "run": f"stored exposures are complete; {RETRY_HINT} to continue the flight",
     "monitor": f"the flight is not affected; {RETRY_HINT} to watch it",
     "send": "the service may have received the command; run `syntopic monitor` to see its state",
@@ -44,7 +44,7 @@ SENTENCES = {
     **dict.fromkeys(
         ("explain", "check", "verify", "replay", "reflights", "disk-health"), _NOTHING_WRITTEN
     ),
-    **dict.fromkeys(("bench", "rigs", "token list"), _NOTHING_WRITTEN),
+    **dict.fromkeys(("bench", "rigs", "schema", "token list"), _NOTHING_WRITTEN),
     "certificate": (
         f"every file is complete, and the service uses the certificate it had; {RETRY_HINT} to finish"
     ),
@@ -52,7 +52,7 @@ SENTENCES = {
         "the token file is complete; run `syntopic token list` to see whether it was changed"
     ),
     **dict.fromkeys(("report", "adjust", "triangulate", "orient", "intersect"), _COMPLETE_FILES),
-    **dict.fromkeys(("calibrate", "import", "export", "sim", "rigs show"), _COMPLETE_FILES),
+    **dict.fromkeys(("calibrate", "import", "export", "rigs show"), _COMPLETE_FILES),
 }
 """By the name of a command, or of a group whose commands have none of their own."""
 
@@ -67,16 +67,18 @@ def sentence_of(name: str) -> str:
     return f"Interrupted: {known}."
 
 
-def make_interruptible(app: typer.Typer, group: str = "") -> None:
-    """Let every command of an application end with its sentence on Ctrl-C."""
-    for command in app.registered_commands:
-        callback = command.callback
-        if callback is not None:
-            name = command.name or callback.__name__.replace("_", "-")
-            command.callback = _interruptible(callback, f"{group} {name}".strip())
-    for below in app.registered_groups:
-        if below.typer_instance is not None and isinstance(below.name, str):
-            make_interruptible(below.typer_instance, f"{group} {below.name}".strip())
+def interruptible(callback: Callable[..., Any], name: str) -> Callable[..., Any]:
+    """The same function, which ends with the sentence of its command on Ctrl-C."""
+
+    @functools.wraps(callback)
+    def run(*arguments: Any, **keywords: Any) -> Any:
+        try:
+            return callback(*arguments, **keywords)
+        except KeyboardInterrupt:
+            print_notice(sentence_of(name))
+            raise typer.Exit(ExitStatus.INTERRUPTED) from None
+
+    return run
 
 
 def print_notice(sentence: str) -> None:
@@ -85,15 +87,3 @@ def print_notice(sentence: str) -> None:
 
     console = Console(stderr=True, soft_wrap=True)
     console.print(sentence, style="yellow", markup=False, highlight=False)
-
-
-def _interruptible(callback: Callable[..., Any], name: str) -> Callable[..., Any]:
-    @functools.wraps(callback)
-    def run(*arguments: Any, **keywords: Any) -> Any:
-        try:
-            return callback(*arguments, **keywords)
-        except KeyboardInterrupt:
-            print_notice(sentence_of(name))
-            raise typer.Exit(STATUS) from None
-
-    return run

@@ -13,7 +13,6 @@ from daemon.cli.exposure_failures import exit_if_failed
 from daemon.cli.options import AsJson, AttitudeSigma, Crs, MountFile, PositionSigma, Trajectory
 from daemon.terminal.console import Console
 from daemon.terminal.tables import light_table
-from drivers.base.extras import require
 
 HELP = """Compute ground points from measurements in two or more oriented images, with accuracy.
 
@@ -49,7 +48,6 @@ def intersect(
     out: Annotated[Path | None, typer.Option(help="New table of the points.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    require("geodesy")
     from daemon.mission.layout import Mission
     from daemon.postflight.adjustment.csv_tables import write_table
     from daemon.postflight.triangulation.space_intersection import (

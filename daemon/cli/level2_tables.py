@@ -7,6 +7,13 @@ from typing import Any
 
 from daemon.terminal.console import Console
 from daemon.terminal.tables import light_table
+from processing.quality.figures import QualityFigures
+from processing.quality.figures.stitching import (
+    AdjustmentFigures,
+    BandShiftFigures,
+    MethodFigures,
+    TiePointFigures,
+)
 
 Reports = Sequence[Mapping[str, Any]]
 
@@ -14,7 +21,7 @@ Reports = Sequence[Mapping[str, Any]]
 def print_reports(console: Console, title: str, reports: Reports) -> None:
     """One table for all exposures, in the columns that their method has figures for, and beneath it
     why an exposure is not good."""
-    methods = {report["figures"].get("method") for report in reports}
+    methods = {_figures(report).of(MethodFigures).method for report in reports}
     show = _heads if "heads" in methods else _bands if "bands" in methods else _stitched
     show(console, title, reports)
     for report in reports:
@@ -29,12 +36,13 @@ def _stitched(console: Console, title: str, reports: Reports) -> None:
         title, (), ("exposure", "tie points", "sigma0 px", "sigma0 um", "verdict", "s")
     )
     for report in reports:
-        figures = report["figures"]
+        figures = _figures(report)
+        adjustment, points = figures.of(AdjustmentFigures), figures.of(TiePointFigures)
         table.add_row(
             str(report["exposure"]),
-            f"{figures.get('tie_points_pp', 0)} + {figures.get('tie_points_pc', 0)}",
-            _px(figures.get("sigma0_px"), 3),
-            _px(figures.get("sigma0_um"), 2),
+            f"{points.tie_points_pp or 0} + {points.tie_points_pc or 0}",
+            _px(adjustment.sigma0_px, 3),
+            _px(adjustment.sigma0_um, 2),
             report["verdict"],
             f"{report['duration_s']:.1f}",
         )
@@ -56,18 +64,23 @@ def _bands(console: Console, title: str, reports: Reports) -> None:
         ("exposure", "band", "tie points", "largest shift", "rms px", "rms x", "rms y", "verdict"),
     )
     for report in reports:
+        shifts_px = _figures(report).of(BandShiftFigures).shift_px_by_band
         for k, band in enumerate(report["bands"]):
             table.add_row(
                 str(report["exposure"]) if k == 0 else "",
                 band["band"],
                 f"{band['points']} of {band['sought']}",
-                _px(report["figures"].get(f"{band['band']}_shift_px"), 1),
+                _px(shifts_px.get(band["band"]), 1),
                 _px(band["rms_px"], 3),
                 _px(band["rms_x_px"], 3),
                 _px(band["rms_y_px"], 3),
                 report["verdict"] if k == 0 else "",
             )
     console.print(table)
+
+
+def _figures(report: Mapping[str, Any]) -> QualityFigures:
+    return QualityFigures.from_json(report["figures"])
 
 
 def _px(value: float | None, digits: int) -> str:

@@ -16,9 +16,11 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
+from daemon.cli.exit_status import ExitStatus
 from daemon.errors import DaemonError
 from daemon.onboard.monitoring.flight_state import EXPOSURES_MAX, PARTS, PREVIEW_PARTS
 from daemon.terminal.tables import light_table
+from processing.rig.problem_sentences import findings_of, sentences
 
 if TYPE_CHECKING:
     from daemon.onboard.monitoring.client.mdns_browser import AnnouncedService
@@ -88,7 +90,10 @@ class _Status(BaseModel):
 
 
 class _Record(BaseModel):
-    """What is drawn of a telemetry record (docs/telemetry.md); other keys are only passed on."""
+    """What is drawn of a telemetry record (docs/reference/flight/telemetry.md).
+
+    Other keys are only passed on.
+    """
 
     phase: str
     simulated: bool = False
@@ -167,7 +172,7 @@ def _single_service(console: Console, token: str) -> str:
         )
     if len(found) >= SERVICES_MAX:
         raise MonitorError(f"{SERVICES_MAX} services or more announce themselves; give an address")
-    raise typer.Exit(2)
+    raise typer.Exit(ExitStatus.REFUSED)
 
 
 class _MonitorState:
@@ -184,15 +189,13 @@ class _MonitorState:
         """Add a record.
 
         Raises:
-            MonitorError: it does not have the form of docs/telemetry.md.
+            MonitorError: it does not have the form of docs/reference/flight/telemetry.md.
         """
         try:
             validated = _Record.model_validate(record)
         except ValidationError as error:
-            first = error.errors()[0]
-            where = ".".join(str(part) for part in first["loc"])
             raise MonitorError(
-                f"the service sends invalid telemetry: {where}: {first['msg']}; look "
+                f"the service sends invalid telemetry: {sentences(findings_of(error))[0]}. Look "
                 "at the address, and at the version of both sides"
             ) from None
         self._record = validated

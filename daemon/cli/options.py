@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from daemon.mission.layout import Mission
+if TYPE_CHECKING:
+    from daemon.mission.layout import Mission
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 

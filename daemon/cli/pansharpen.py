@@ -12,6 +12,7 @@ import typer
 from rich.progress import Progress
 
 from daemon.cli.exposure_failures import exit_if_failed
+from daemon.cli.options import AsJson
 from daemon.configuration.model import ConfigurationError
 from daemon.mission.exposure_batch import for_each_exposure
 from daemon.mission.layout import Mission
@@ -28,7 +29,7 @@ One tone curve serves all exposures that have Level-2, so that neighbouring imag
 again from all of them in each run. Earlier images of an exposure are replaced.
 
 An exposure that cannot be pansharpened is listed at the end with its cause and excluded from the
-tone curve. The others are processed, and the exit status is 1.
+tone curve. The others are processed.
 
 Examples: `syntopic pansharpen MISSION`, `syntopic pansharpen MISSION --only 3 --image cir --bits 8`
 """
@@ -44,7 +45,7 @@ def pansharpen(
         list[int] | None, typer.Option(help="Bits per sample: 16 or 8; repeatable.")
     ] = None,
     threads: Annotated[int, typer.Option(help="Number of threads.", min=1)] = 2,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     import cv2
 

@@ -14,22 +14,24 @@ from rich.progress import Progress
 
 from daemon.cli.exposure_failures import exit_if_failed
 from daemon.cli.level2_tables import print_reports
+from daemon.cli.options import AsJson
 from daemon.configuration.model import ConfigurationError, PlanSection, ProcessingSection
 from daemon.configuration.problems import nested_value
 from daemon.mission.layout import Mission
 from daemon.orientation.exterior_orientation import mount_of
 from daemon.terminal.console import Console
 from processing.image.kernels import DEFAULT_INTERPOLATION, INTERPOLATIONS
+from processing.rig.problem_sentences import findings_of, sentences
 
 HELP = """Process the exposures of a mission folder again, Level-0 to Level-2.
 
-The folder is from a flight, imported, or written by hand after docs/formats.md. Level-0 is not
-changed; products are replaced. A rig without a virtual image gives one raster per band, or, if its
-heads have diverging axes, one perspective image per head.
+The folder is from a flight, imported, or written by hand after docs/reference/formats.md. Level-0
+is not changed; products are replaced. A rig without a virtual image gives one raster per band, or,
+if its heads have diverging axes, one perspective image per head.
 
 Every frame is compared with the hash in its record, and record, file and rig with each other
-(docs/formats.md). An exposure that cannot be processed is listed at the end with its cause; the
-others are done. The exit status is then 1. Only one command at a time writes into a mission.
+(docs/reference/formats.md). An exposure that cannot be processed is listed at the end with its
+cause; the others are done. Only one command at a time writes into a mission.
 
 Examples: `syntopic process MISSION`, `syntopic process MISSION --only 3 --method fixed`
 """
@@ -58,15 +60,16 @@ def process(
         bool, typer.Option(help="Comparison with the fixed method, with and without TDM.")
     ] = False,
     threads: Annotated[int, typer.Option(help="Number of threads.")] = 2,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     os.environ.setdefault("NUMBA_NUM_THREADS", str(threads))
     from daemon.mission.canonical_json import sha256_hex
     from daemon.mission.exposure_batch import for_each_exposure
     from daemon.mission.store import store
     from daemon.mission.store.level2 import recover_level2
-    from daemon.onboard.pipeline.worker import overlaps_of, process_exposure
     from daemon.orientation.ground_model import ground_of
+    from daemon.planning.overlaps import overlaps_of
+    from daemon.products.exposure_products import FlightGeometry, process_exposure
     from daemon.products.processor import processor_for
     from processing.radiometry.calibration import CalibrationError
     from processing.rig import load_rig
@@ -90,7 +93,7 @@ def process(
     )
     mount, _ = mount_of(folder)
     overlaps = overlaps_of(folder, rig)
-    ground = ground_of(rig, mount, plan)
+    geometry = FlightGeometry(mount, plan, ground_of(rig, mount, plan))
     with folder.held(), Progress(console=Console(stderr=True), transient=True) as progress:
         recover_level2(folder)
         task = progress.add_task("compiling kernels", total=None)
@@ -108,15 +111,8 @@ def process(
             frames, exposure = store.load_level0(
                 folder.level0(number), rig, calibration_sha256=calibration_sha256
             )
-            report, _ = process_exposure(
-                processor,
-                folder,
-                mount,
-                plan,
-                exposure,
-                frames,
-                overlap_shares=overlaps.of(number),
-                ground=ground,
+            report = process_exposure(
+                processor, folder, geometry, exposure, frames, overlaps.of(number)
             )
             return {**report, "duration_s": round(time.monotonic() - started, 3)}
 
@@ -144,10 +140,8 @@ def flown_thresholds(folder: Mission) -> dict[str, float]:
     try:
         return ProcessingSection.model_validate({"thresholds": given}).thresholds
     except ValidationError as error:
-        message = error.errors()[0]["msg"].removeprefix("Value error, ")
-        raise ConfigurationError(
-            [f"{folder.service_path}: processing.thresholds: {message}"]
-        ) from error
+        findings = [(("processing", *where), text) for where, text in findings_of(error)]
+        raise ConfigurationError(sentences(findings, str(folder.service_path))) from error
 
 
 def as_flown(

@@ -8,7 +8,9 @@ from typing import Annotated
 
 import typer
 
+from daemon.cli.exit_status import status_of
 from daemon.cli.exposure_failures import exit_if_failed
+from daemon.cli.options import AsJson
 from daemon.terminal.console import Console
 from daemon.terminal.tables import light_table
 
@@ -17,8 +19,8 @@ HELP = """List the segments of the plan that must be flown again.
 A point is covered if enough images for the overlaps have valid pixels of it in every band.
 
 The plan is GeoJSON, KML or QGroundControl's .plan. The mission may be in flight. Writes a
-GeoJSON, a KML and a MAVLink mission of the segments. The exit status is 1 if there are any. An
-exposure with an unreadable record counts as not flown and is listed at the end.
+GeoJSON, a KML and a MAVLink mission of the segments. An exposure with an unreadable record counts
+as not flown and is listed at the end.
 
 Examples: `syntopic reflights MISSION`, `syntopic reflights MISSION --plan block.geojson`
 """
@@ -30,7 +32,7 @@ def reflights(
     elevation: Annotated[
         Path | None, typer.Option(help="Height model (default: that of the mission).")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     from daemon.mission.layout import Mission
     from daemon.mission.store.level2 import write_folder
@@ -119,4 +121,4 @@ def reflights(
         for note in notes:
             console.print(note)
     exit_if_failed(read_records.failures)
-    raise typer.Exit(0 if advice.is_complete else 1)
+    raise typer.Exit(status_of(is_good=advice.is_complete))

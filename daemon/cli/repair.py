@@ -9,13 +9,15 @@ from typing import Annotated
 
 import typer
 
+from daemon.cli.exit_status import status_of
+from daemon.cli.options import AsJson
 from daemon.terminal.console import Console
 
 HELP = """Bring index, records, logs and disk of a mission together, as the service does on start.
 
 A lost or damaged index is rebuilt from the records. Stored exposures are sealed from the flight
-log, and incomplete ones are moved aside. Level-0 is not changed. The exit status is 1 if something
-cannot be repaired. With --rebuild the index is rebuilt even if it is intact.
+log, and incomplete ones are moved aside. Level-0 is not changed. What cannot be repaired
+is listed. With --rebuild the index is rebuilt even if it is intact.
 
 With --mirror two copies of a mission are synchronized: the leading copy is repaired, and the other
 copy is updated from it. Differing files are moved aside, and nothing is overwritten.
@@ -30,7 +32,7 @@ def repair(
     mirror: Annotated[
         Path | None, typer.Option("--mirror", help="Folder of the mission's other copy.")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     from daemon.mission.layout import Mission
     from daemon.mission.log.log_seals import close_run, seal_logs
@@ -81,4 +83,4 @@ def repair(
             console.print(sentence, markup=False, highlight=False)
         console.print(f"{len(report.finalized)} exposures are sealed and in the index.")
         console.print(f"Next: syntopic verify {folder.path}")
-    raise typer.Exit(1 if report.problems else 0)
+    raise typer.Exit(status_of(is_good=not report.problems))

@@ -12,6 +12,8 @@ import typer
 from pydantic import ValidationError
 from rich.progress import Progress
 
+from daemon.cli.exit_status import ExitStatus
+from daemon.cli.options import AsJson
 from daemon.cli.process import as_flown
 from daemon.configuration.model import Configuration, ConfigurationError
 from daemon.mission.layout import Mission, MissionError
@@ -22,8 +24,7 @@ HELP = """Replay a recorded mission through the code and compare the results.
 
 Bytes of receivers and probes pass their codecs, frames and marks pass matching and ledger, and
 Level-0 passes the pipeline, with one and with two parallel exposures. Records are compared as
-canonical JSON, images by the hash of their decoded pixels. Nothing is written. The exit status is
-1 if anything differs.
+canonical JSON, images by the hash of their decoded pixels. Nothing is written.
 
 Examples: `syntopic replay MISSION`, `syntopic replay MISSION --records-only --json`,
 `syntopic replay MISSION --elevation terrain.asc`
@@ -47,15 +48,14 @@ def replay(
     elevation: Annotated[
         Path | None, typer.Option(help="Height model (default: as recorded).")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     folder = Mission.open(mission)
     configuration = _flown_configuration(folder)
     threads = configuration.processing.threads
     os.environ.setdefault("NUMBA_NUM_THREADS", str(threads))
     from daemon.mission.log.flight_log import logs_of
-    from daemon.onboard.service.messages import WorkerSettings
-    from daemon.onboard.service.startup import identity
+    from daemon.onboard.flight.flight_identity import identity
     from daemon.postflight.replay.flight_replay import ReplayResult, replay_log
     from daemon.postflight.replay.product_comparison import compare_products, compare_records
     from processing.rig import load_rig
@@ -75,13 +75,6 @@ def replay(
             progress.advance(task)
         if not records_only:
             plan, radiometry = as_flown(folder, radiometry, elevation)
-            settings = WorkerSettings(
-                rig=str(folder.rig_path),
-                radiometry=radiometry,
-                plan_file=folder.plan_path,
-                plan=plan,
-                processing=configuration.processing,
-            )
             for count in parallel or [1, 2]:
                 progress.update(
                     task,
@@ -92,15 +85,17 @@ def replay(
                 compare_products(
                     folder,
                     rig,
-                    settings,
+                    configuration.processing,
+                    plan,
                     total,
+                    radiometry=radiometry,
                     parallel=count,
                     only=only or (),
                     progress=lambda _number: progress.advance(task),
                 )
     _show(folder, total.as_json(), as_json=as_json)
     if not total.agrees:
-        raise typer.Exit(1)
+        raise typer.Exit(ExitStatus.PROBLEM)
 
 
 def _show(folder: Mission, result: dict[str, Any], *, as_json: bool) -> None:

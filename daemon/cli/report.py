@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from daemon.cli.exposure_failures import exit_if_failed
-from daemon.cli.options import lock_for
+from daemon.cli.options import AsJson, lock_for
 from daemon.terminal.console import Console
 
 HELP = """Write the mission's report: one self-contained HTML file.
@@ -18,7 +18,7 @@ With --bundle also `export/support.zip`: configuration without secrets, records,
 of devices and service, versions. It contains no pixels, raw bytes or positions.
 
 With --out nothing is written into the mission; this also works during the flight. Unreadable files
-are listed in the report and at the end, and the exit status is 1.
+are listed in the report and at the end.
 
 Examples: `syntopic report MISSION --bundle`, `syntopic report MISSION --out FOLDER`
 """
@@ -30,7 +30,7 @@ def report(
     out: Annotated[
         Path | None, typer.Option(help="Folder to write into (default: the mission's export).")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     from daemon.mission.layout import Mission
     from daemon.mission.verification.verification import verify

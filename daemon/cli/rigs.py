@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from daemon.cli.options import AsJson
 from daemon.mission.store.durable import replace_file
 from daemon.terminal.console import Console
 from daemon.terminal.tables import light_table
@@ -25,7 +26,7 @@ Examples: `syntopic rigs`, `syntopic rigs show ultracam-x`
 @app.callback(invoke_without_command=True)
 def rigs(
     context: typer.Context,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     if context.invoked_subcommand is not None:
         return
@@ -56,7 +57,7 @@ def show(
     drawing: Annotated[
         Path | None, typer.Option(help="New drawing of the focal planes (SVG).")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Print topology, overlaps and the counts of the adjustment; on request, draw the focal planes.
 
@@ -129,7 +130,11 @@ def show(
         )
     console.print(strips)
     if has_diverging_axes(rig):
-        console.print("Nothing is stitched: each head is an image of its own (docs/midas.md)")
+        console.print(
+            "Nothing is stitched: each head is an image of its own "
+            "(docs/how-to/processing/midas.md)",
+            soft_wrap=True,
+        )
     else:
         console.print(
             f"Adjustment: {counts.parameters} parameters, {counts.constraints} constraints, "

@@ -13,6 +13,8 @@ from typing import Annotated, Any
 
 import typer
 
+from daemon.cli.exit_status import ExitStatus
+
 HELP = """Run the onboard service with a configuration, until SIGTERM or until the plan is flown.
 
 A service that was killed resumes the same mission with the rig it began with; where the configured
@@ -37,11 +39,11 @@ def run(
         typer.Option("--new-mission", help="New mission; an interrupted one is sealed and closed."),
     ] = False,
 ) -> None:
-    from daemon.configuration.model import load
+    from daemon.configuration.service_file import load
+    from daemon.mission.interrupted_mission import interrupted_mission
     from daemon.onboard.preflight.resumption import close_interrupted
     from daemon.onboard.service.processes import die_with_parent
     from daemon.onboard.service.service import Service
-    from daemon.onboard.service.startup import interrupted_mission
 
     if parent is not None:
         die_with_parent(parent, signal.SIGTERM)
@@ -55,7 +57,7 @@ def run(
         service = Service(configuration, rig, config, show)
         status = asyncio.run(service.run())
         continues = service.continues and status == 0
-    raise typer.Exit(status)
+    raise typer.Exit(ExitStatus(status))
 
 
 def _print_json(event: Mapping[str, Any]) -> None:

@@ -8,14 +8,16 @@ from typing import Annotated, Any
 
 import typer
 
+from daemon.cli.exit_status import ExitStatus
+from daemon.cli.options import AsJson
 from daemon.terminal.console import Console
 
 HELP = """Send a command to a running service.
 
-Commands are those of the API (docs/watching.md): arm, start, stop, trigger, interval, distance,
-land, acknowledge, exposure, new-mission, release-disk, accept-disk. They go over the service's Unix
-socket (`[watch] control`) and need no token: the service authorizes them by user and group.
-The exit status is 1 where the service refuses.
+Commands are those of the API (docs/how-to/flight/watching.md): arm, start, stop, trigger, interval,
+distance, land, acknowledge, exposure, new-mission, release-disk, accept-disk. They go over the
+service's Unix socket (`[watch] control`) and need no token: the service authorizes them by user and
+group.
 
 Examples: `syntopic send start`,
 `syntopic send arm --override --set reason="probe 3 is known to be broken"`,
@@ -35,7 +37,7 @@ def send(
     values: Annotated[
         list[str] | None, typer.Option("--set", help="KEY=VALUE of the command; repeatable.")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     from daemon.onboard.monitoring.access.control_socket import send_command
 
@@ -51,7 +53,7 @@ def send(
     else:
         Console(soft_wrap=True).print(sentence, style="" if done else "red", markup=False)
     if not done:
-        raise typer.Exit(1)
+        raise typer.Exit(ExitStatus.PROBLEM)
 
 
 def _read(value: str) -> Any:

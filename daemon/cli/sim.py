@@ -17,6 +17,8 @@ from typing import Annotated, Any
 
 import typer
 
+from daemon.cli.options import AsJson
+from daemon.errors import DaemonError
 from daemon.mission.store.durable import replace_file
 from daemon.terminal.console import Console
 from drivers.base.extras import require
@@ -35,7 +37,7 @@ Example: `syntopic sim ultracam-x-mini --out flights/sim --fault silent@60:recei
 GVCP_PORT = 3956
 
 
-class EmulatorError(RuntimeError):
+class EmulatorError(DaemonError):
     """The emulator did not start; the message is its last output."""
 
 
@@ -54,11 +56,15 @@ class Emulator:
         )
         assert self.process.stdout is not None
         self.ready: dict[str, Any] = {}
-        for line in self.process.stdout:
-            message = json.loads(line)
-            if message.get("event") == "ready":
-                self.ready = message
-                return
+        try:
+            for line in self.process.stdout:
+                message = json.loads(line)
+                if message.get("event") == "ready":
+                    self.ready = message
+                    return
+        except BaseException:
+            self.end()
+            raise
         raise EmulatorError(f"the emulator ended with status {self.process.wait(10)}; see above")
 
     def end(self) -> None:
@@ -86,7 +92,9 @@ def sim(
     packet_loss: Annotated[float, typer.Option(help="Share of image packets lost.")] = 0.0,
     fault: Annotated[
         list[str] | None,
-        typer.Option(help="NAME@TIME[:DEVICE][,DURATION], see docs/faults.md; repeatable."),
+        typer.Option(
+            help="NAME@TIME[:DEVICE][,DURATION], see docs/reference/results/faults.md; repeatable."
+        ),
     ] = None,
     scenario: Annotated[Path | None, typer.Option(help="Scenario file with faults.")] = None,
     receiver: Annotated[
@@ -100,7 +108,7 @@ def sim(
     scene: Annotated[
         Path | None, typer.Option(help="GeoTIFF as the ground (default: generated scene).")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     if scene is not None:
         require("geotiff")
@@ -113,12 +121,7 @@ def sim(
     for planned in fault or []:
         arguments += ["--fault", planned]
     arguments += ["--scenario", str(scenario)] if scenario else []
-    console = Console(stderr=True)
-    try:
-        emulator = Emulator(arguments)
-    except EmulatorError as error:
-        console.print(str(error), style="red")
-        raise typer.Exit(1) from error
+    emulator = Emulator(arguments)
     path = out / "service.toml"
     text = service_toml(emulator.ready, root="missions", watch_port=8470)
     replace_file(path, text.encode("utf-8"))
@@ -128,7 +131,7 @@ def sim(
         _print_addresses(emulator.ready, path)
     try:
         emulator.process.wait()
-    except KeyboardInterrupt:
+    finally:
         emulator.end()
 
 

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from daemon.cli.options import AsJson
 from daemon.terminal.console import Console
 from daemon.terminal.tables import light_table
 
@@ -30,6 +31,7 @@ def add(
         str, typer.Option(help="Role: observer, operator or administrator.")
     ] = "observer",
     file: TokenFile = DEFAULT_FILE,
+    as_json: AsJson = False,
 ) -> None:
     """Create a token and print it once.
 
@@ -41,7 +43,11 @@ def add(
     chosen = next((known for known in ROLES if known == role), None)
     if chosen is None:
         raise TokenError(f"--role {role}: it is one of {', '.join(ROLES)}")
-    typer.echo(add_token(file, name, chosen))
+    token = add_token(file, name, chosen)
+    if as_json:
+        typer.echo(json.dumps({"name": name, "role": role, "token": token, "file": str(file)}))
+        return
+    typer.echo(token)
     Console(stderr=True, soft_wrap=True).print(
         f"It is not shown again; {file} holds its hash. The service reads the file when it starts."
     )
@@ -49,7 +55,9 @@ def add(
 
 @app.command()
 def remove(
-    name: Annotated[str, typer.Argument(help="Name of the token.")], file: TokenFile = DEFAULT_FILE
+    name: Annotated[str, typer.Argument(help="Name of the token.")],
+    file: TokenFile = DEFAULT_FILE,
+    as_json: AsJson = False,
 ) -> None:
     """Revoke a token.
 
@@ -58,13 +66,15 @@ def remove(
     from daemon.onboard.monitoring.access.tokens import remove_token
 
     remove_token(file, name)
+    if as_json:
+        typer.echo(json.dumps({"name": name, "removed": True, "file": str(file)}))
     typer.echo(f"{name} has no token any more; restart the service to make it so")
 
 
 @app.command(name="list")
 def list_(
     file: TokenFile = DEFAULT_FILE,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """List the tokens with their roles.
 

@@ -15,6 +15,7 @@ from rich.progress import (
     TransferSpeedColumn,
 )
 
+from daemon.cli.options import AsJson
 from daemon.terminal.console import Console
 
 HELP = """Copy a mission to another disk and verify every file.
@@ -33,7 +34,7 @@ def transfer(
     remove_source: Annotated[
         bool, typer.Option("--remove-source", help="Remove the source after the copy is sealed.")
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     from daemon.mission.layout import Mission
     from daemon.mission.transfer.transfer import finish_transfer

@@ -22,7 +22,6 @@ from daemon.cli.options import (
 )
 from daemon.configuration.model import ConfigurationError
 from daemon.terminal.console import Console
-from drivers.base.extras import require
 
 if TYPE_CHECKING:
     from processing.bundle.self_calibration import SetName
@@ -33,7 +32,8 @@ Direct georeferencing gives the initial orientation. Tie points are matched betw
 exposures, also of opposite and crossing lines. Control and check points come from two tables: where they
 are on the ground (--points) and where in the images (--measured). Writes an adjustment project with
 its report (image residuals in um, control and checks in m and px, systematic image residuals on a
-grid), `exterior.csv` with the adjusted orientations, and all the tables docs/formats.md names.
+grid), `exterior.csv` with the adjusted orientations, and all the tables docs/reference/formats.md
+names.
 
 If the heads of a rig have diverging axes, heads with equal pixels and principal distance form a
 block (--head). Views of similar direction are matched, oblique ones by the plane of the ground.
@@ -51,7 +51,9 @@ def triangulate(
     set_name: Annotated[
         str,
         typer.Option(
-            "--set", help="Parameters: none, radial, sensors or sensors-full (docs/bundle.md)."
+            "--set",
+            help="Parameters: none, radial, sensors or sensors-full "
+            "(docs/reference/results/bundle.md).",
         ),
     ] = "none",
     interior: Annotated[
@@ -87,7 +89,6 @@ def triangulate(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    require("geodesy")
     from daemon.cli.adjust import _peak_mib
     from daemon.mission.layout import Mission
     from daemon.postflight.adjustment.csv_tables import ProjectError

@@ -12,6 +12,8 @@ from rich.progress import Progress
 from rich.table import Table
 from rich.text import Text
 
+from daemon.cli.exit_status import status_of
+from daemon.cli.options import AsJson
 from daemon.terminal.console import Console
 
 if TYPE_CHECKING:
@@ -19,9 +21,7 @@ if TYPE_CHECKING:
 
 HELP = """Check a mission folder against its hashes and list files without a hash.
 
-The exit status is 0 without errors, 1 if a file is missing, altered or foreign, and 2 for invalid
-arguments. Files without a hash do not change it. A mission
-may be verified while it is flown.
+Files without a hash do not change the exit status. A mission may be verified while it is flown.
 
 Example: `syntopic verify flights/demo/missions/20261121T101500Z-ultracam-x-mini`
 """
@@ -31,7 +31,7 @@ SHOWN = 5
 
 def verify(
     mission: Annotated[Path, typer.Argument(help="Mission folder.")],
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     from daemon.mission.layout import Mission
     from daemon.mission.store import store
@@ -47,7 +47,7 @@ def verify(
         typer.echo(json.dumps(asdict(report)))
     else:
         _print(report)
-    raise typer.Exit(1 if report.problems else 0)
+    raise typer.Exit(status_of(is_good=not report.problems))
 
 
 def _print(report: VerifyReport) -> None:

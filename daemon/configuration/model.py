@@ -1,100 +1,138 @@
-"""Configuration of the service: one TOML file. All errors of a file are reported together.
+"""Keys of `service.toml`: the sections, their types and limits.
 
-Drivers define the settings of devices; this module validates them through
-`drivers.base.registry`.
+Drivers declare the settings of devices. How a file is read is in
+`daemon.configuration.service_file`.
 """
 
 from __future__ import annotations
 
 import ipaddress
 import re
-import stat
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Final, Literal, TypeVar
 
 from pydantic import (
+    AfterValidator,
     BaseModel,
     ConfigDict,
     Field,
-    FiniteFloat,
-    ValidationError,
+    Strict,
+    ValidationInfo,
     field_validator,
     model_validator,
 )
 
-from daemon.configuration.problems import (
-    device_problems,
-    mirror_problems,
-    nested_value,
-    rig_problems,
-)
-from daemon.planning.plan_readers import PlanError, read_plan
+from daemon.errors import DaemonError
 from processing.image.kernels import DEFAULT_INTERPOLATION, Interpolation
 from processing.quality.report import Thresholds
-from processing.rig import Rig, RigError, find_rig
-from processing.rig.toml_text import TomlError, parse_toml
-
-CONFIGURATION_MAX_BYTES = 1_000_000
-_WATCH_FILES = ("tokens", "tls_certificate", "tls_key", "control")
-"""Keys of `[watch]` with paths relative to the folder of the file."""
+from processing.rig.problem_sentences import ProblemList
 
 SIGNING_STATE = ".mavlink-signing.json"
 """Below the missions: the last timestamps of signed MAVLink messages."""
 
+RENAMED_KEYS: Final[Mapping[str, str]] = {
+    "exposure.gain_most_db": "gain_max_db",
+    "exposure.time_least_us": "exposure_time_min_us",
+    "exposure.time_most_us": "exposure_time_max_us",
+    "exposure.tdi_most": "tdi_shifts_max",
+    "processing.exposures_in_work": "parallel_exposures",
+    "watch.certificate": "tls_certificate",
+    "watch.key": "tls_key",
+    "watch.open": "anonymous_read",
+}
+"""Former keys, which are refused, and their present names."""
 
-class ConfigurationError(ValueError):
+
+class ConfigurationError(ProblemList, DaemonError, ValueError):
     """An invalid configuration; `problems` holds one sentence per error."""
 
-    def __init__(self, problems: Sequence[str]) -> None:
-        self.problems = tuple(problems)
-        super().__init__("\n".join(problems))
+
+def _in_folder(path: Path, info: ValidationInfo) -> Path:
+    """The path relative to the folder of the file, if that is in the context of the validation."""
+    return info.context["folder"] / path if info.context else path
 
 
-def _refuse_old_keys(given: Any, renamed: Mapping[str, str]) -> Any:
-    """Raise a `ValueError` naming the new key when a section holds an old one."""
-    for old, new in renamed.items():
-        if isinstance(given, dict) and old in given:
-            raise ValueError(f"{old} is now named {new}; rename it")
-    return given
+def local_rig(name: str, folder: Path) -> str:
+    """The path of a rig file next to the configuration, or the name of a rig."""
+    path = folder / name
+    return str(path) if name.endswith(".toml") and path.exists() else name
+
+
+def _local_rig(name: str, info: ValidationInfo) -> str:
+    return local_rig(name, info.context["folder"]) if info.context else name
+
+
+Item = TypeVar("Item")
+Several = Annotated[tuple[Item, ...], Strict(False)]
+Vector = Annotated[tuple[float, float, float], Strict(False)]
+FilePath = Annotated[Path, Strict(False), AfterValidator(_in_folder)]
 
 
 class _ConfigurationSection(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, strict=True, allow_inf_nan=False, use_attribute_docstrings=True
+    )
+
+
+class _DriverSection(BaseModel):
+    """A section with further keys: the settings of its driver."""
+
+    model_config = ConfigDict(
+        extra="allow", frozen=True, strict=True, allow_inf_nan=False, use_attribute_docstrings=True
+    )
+
+    driver: str
+    """Name of the driver; its settings are further keys."""
 
 
 class MissionSection(_ConfigurationSection):
     """Storage of missions, and the rig.
 
-    With `mirror`, a folder on another disk, all files are stored on both (docs/mirror.md).
+    With `mirror`, a folder on another disk, all files are stored on both
+    (docs/reference/flight/mirror.md).
     """
 
-    root: Path
-    mirror: Path | None = None
-    rig: str
-    radiometry: Path | None = None
+    root: FilePath
+    """Folder of the missions; a relative path counts from the folder of this file."""
+    mirror: FilePath | None = None
+    """Folder on another disk for a second copy of every mission."""
+    rig: Annotated[str, AfterValidator(_local_rig)]
+    """Name of a shipped rig, or path of a rig file."""
+    radiometry: FilePath | None = None
+    """Folder with the radiometric calibrations of the aperture flown."""
     simulated: bool = False
+    """Whether the devices are emulated; every exposure is then flagged `SIMULATED`."""
     end_when_done: bool = False
+    """Whether the service ends after the last exposure is processed."""
 
 
 class PlanSection(_ConfigurationSection):
     """The planned flight; navigation data replace its values when they arrive.
 
-    `file` holds the lines (docs/plan.md). A position farther than `corridor_m` from a line (default:
-    a quarter of the image) belongs to no line. `line` names the line without a file.
-    `elevation` is a height model in `elevation_crs` (docs/dmc.md): it then gives the height
-    above the mean terrain of an image.
+    `file` holds the lines (docs/how-to/flight/plan.md). A position farther than `corridor_m` from a
+    line (default: a quarter of the image) belongs to no line. `line` names the line without a file.
+    `elevation` is a height model in `elevation_crs` (docs/explanation/cameras/dmc.md): it then
+    gives the height above the mean terrain of an image.
     """
 
     line: str = ""
-    file: Path | None = None
+    """Name of the line where no plan is given."""
+    file: FilePath | None = None
+    """Plan with the lines: GeoJSON, KML or QGroundControl's .plan."""
     corridor_m: float | None = Field(default=None, gt=0)
+    """Maximum distance from a line; default: a quarter of the image's width."""
     ground_height_m: float = 0.0
+    """Mean height of the ground above the ellipsoid."""
     height_above_ground_m: float = Field(default=1000.0, gt=0)
+    """Planned height of flight."""
     ground_speed_mps: float = Field(default=60.0, gt=0)
-    elevation: Path | None = None
+    """Planned speed."""
+    elevation: FilePath | None = None
+    """Height model of the ground: GeoTIFF or ESRI ASCII grid."""
     elevation_crs: str = ""
+    """Coordinate reference system of the height model, such as EPSG:25833+7837."""
 
     @model_validator(mode="after")
     def _requires_elevation_crs(self) -> PlanSection:
@@ -106,26 +144,34 @@ class PlanSection(_ConfigurationSection):
 
 
 class MountSection(_ConfigurationSection):
-    """Mounting of the camera relative to the navigation receiver (docs/orientation.md).
+    """Mounting of the camera relative to the navigation receiver.
+
+    Conventions: docs/how-to/processing/orientation.md.
 
     `antenna_m` is the point whose position the receiver reports, in the body frame of the rig;
     `boresight_deg` (roll, pitch, heading) rotates the rig's body axes into the inertial unit's.
     `time_offset_ms` is added to exposure times before the trajectory is interpolated.
     """
 
-    antenna_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    boresight_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    antenna_m: Vector = (0.0, 0.0, 0.0)
+    """Antenna in the body frame of the rig: forward, right, down."""
+    boresight_deg: Vector = (0.0, 0.0, 0.0)
+    """Roll, pitch and heading from the rig's body axes to those of the inertial unit."""
     time_offset_ms: float = 0.0
+    """Added to exposure times before the trajectory is interpolated."""
 
 
 class SerialsSection(_ConfigurationSection):
     """Serial numbers that no bus reports, from the labels of lenses (by cone) and probes.
 
-    They are compared with those of the calibration before a flight (docs/arming.md).
+    They are compared with those of the calibration before a flight
+    (docs/reference/flight/arming.md).
     """
 
-    lens: Mapping[str, str] = {}
-    probe: Mapping[str, str] = {}
+    lens: dict[str, str] = {}
+    """Serial number of each lens by the name of its cone."""
+    probe: dict[str, str] = {}
+    """Serial number of each probe by its name."""
 
     @property
     def parts(self) -> dict[str, str]:
@@ -134,17 +180,19 @@ class SerialsSection(_ConfigurationSection):
         return named | {f"probe {name}": serial for name, serial in self.probe.items()}
 
 
-class TriggerSection(BaseModel):
+class TriggerSection(_DriverSection):
     """Exposure times and the trigger. Further keys are settings of the trigger's driver."""
 
-    model_config = ConfigDict(extra="allow", frozen=True)
-
-    driver: str
     mode: Literal["interval", "distance", "plan"] = "interval"
+    """What causes an exposure: time, distance flown, or the places of the plan."""
     interval_s: float = Field(default=2.0, gt=0)
+    """Time between two exposures in mode `interval`."""
     distance_m: float | None = Field(default=None, gt=0)
+    """Distance between two exposures in mode `distance`."""
     count: int | None = Field(default=None, gt=0)
+    """Number of exposures; without it the line has no end."""
     start: Literal["immediate", "on command"] = "immediate"
+    """When the line begins: as soon as the service is ready, or on a command."""
 
     @field_validator("start", mode="before")
     @classmethod
@@ -162,12 +210,8 @@ class TriggerSection(BaseModel):
         return self
 
 
-class DeviceSection(BaseModel):
+class DeviceSection(_DriverSection):
     """One device: its driver, and the settings of that driver."""
-
-    model_config = ConfigDict(extra="allow", frozen=True)
-
-    driver: str
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -178,42 +222,39 @@ class HeadDeviceSection(DeviceSection):
     """The head that carries a sensor of the rig."""
 
     sensor: str
+    """Name of the sensor in the rig file."""
 
 
 class NamedDeviceSection(DeviceSection):
     """A thermometer, a navigator or a pulse per second."""
 
     name: str
+    """Name of the device in records and messages."""
 
 
 class ExposureSection(_ConfigurationSection):
-    """Control of the exposure settings of the heads, with limits (docs/exposure.md).
+    """Control of the exposure settings of the heads, with limits (docs/how-to/flight/exposure.md).
 
     `target` is the desired 99th percentile of the pixels, as a fraction of full scale. With `lock`
     "line" the settings do not change on a line after they meet the target.
     """
 
     control: Literal["manual", "automatic"] = "manual"
+    """Whether the service changes the settings of the heads in flight."""
     lock: Literal["line", "never"] = "line"
+    """Whether settings stay fixed on a line after they met the target."""
     target: float = Field(default=0.6, ge=0.1, le=0.95)
+    """Desired 99th percentile of the pixels as a fraction of full scale."""
     smear_px: float = Field(default=0.5, gt=0, le=10)
+    """Permitted motion blur that remains after TDI."""
     gain_max_db: float = Field(default=12.0, ge=0, le=48)
+    """Highest gain."""
     exposure_time_min_us: float = Field(default=100.0, gt=0)
+    """Shortest exposure time."""
     exposure_time_max_us: float = Field(default=20_000.0, gt=0)
+    """Longest exposure time."""
     tdi_shifts_max: int = Field(default=32, ge=0, le=1000)
-
-    @model_validator(mode="before")
-    @classmethod
-    def _refuse_old_keys(cls, given: Any) -> Any:
-        return _refuse_old_keys(
-            given,
-            {
-                "gain_most_db": "gain_max_db",
-                "time_least_us": "exposure_time_min_us",
-                "time_most_us": "exposure_time_max_us",
-                "tdi_most": "tdi_shifts_max",
-            },
-        )
+    """Highest number of TDI shifts."""
 
 
 class ProcessingSection(_ConfigurationSection):
@@ -223,17 +264,22 @@ class ProcessingSection(_ConfigurationSection):
     """
 
     method: Literal["free", "fixed"] = "free"
+    """Stitching by free image mosaicking, or by the fixed calibration."""
     interpolation: Interpolation = DEFAULT_INTERPOLATION
+    """Kernel of the one resampling from raw pixels."""
     baselines: bool = False
+    """Whether results of the fixed method are written for comparison."""
     geometry: bool = True
+    """Whether the geometry of each image is written to `geometry.npz`."""
     threads: int = Field(default=2, ge=1, le=256)
+    """Threads of the pipeline."""
     parallel_exposures: int = Field(default=2, ge=1, le=16)
-    thresholds: dict[str, FiniteFloat] = Field(default_factory=dict)
-
-    @model_validator(mode="before")
-    @classmethod
-    def _refuse_old_keys(cls, given: Any) -> Any:
-        return _refuse_old_keys(given, {"exposures_in_work": "parallel_exposures"})
+    """Exposures processed at the same time."""
+    thresholds: dict[str, float] = Field(
+        default_factory=dict,
+        json_schema_extra={"propertyNames": {"enum": [one.name for one in fields(Thresholds)]}},
+    )
+    """Thresholds of the flags that differ from their defaults, by name."""
 
     @field_validator("thresholds")
     @classmethod
@@ -245,13 +291,14 @@ class ProcessingSection(_ConfigurationSection):
         unknown = sorted(given.keys() - {field.name for field in fields(Thresholds)})
         if unknown:
             raise ValueError(
-                f"{', '.join(unknown)}: no such threshold; docs/formats.md lists them by flag"
+                f"{', '.join(unknown)}: no such threshold; "
+                "docs/reference/formats.md lists them by flag"
             )
         return given
 
 
 class MavlinkCameraSection(_ConfigurationSection):
-    """The rig as one camera of a vehicle (docs/mavlink-camera.md).
+    """The rig as one camera of a vehicle (docs/how-to/flight/mavlink-camera.md).
 
     `connect` is "udpout:HOST:PORT", the address of a ground station or autopilot, or
     "udpin:HOST:PORT". `commands` from others are executed when "signed" (with `signing_key`, a file
@@ -260,12 +307,19 @@ class MavlinkCameraSection(_ConfigurationSection):
     """
 
     connect: str = "udpout:127.0.0.1:14550"
+    """Address: `udpout:HOST:PORT` or `udpin:HOST:PORT`."""
     system_id: int = Field(default=1, ge=1, le=255)
+    """MAVLink system, that of the vehicle."""
     component_id: int = Field(default=100, ge=100, le=105)
+    """MAVLink component."""
     commands: Literal["signed", "any", "none"] = "none"
-    signing_key: Path | None = None
-    signing_state: Path | None = None
+    """Whose commands are executed."""
+    signing_key: FilePath | None = None
+    """File with the signing key of 64 hexadecimal digits."""
+    signing_state: FilePath | None = None
+    """File of the last timestamps of signed messages; default: below the missions."""
     feedback: bool = False
+    """Whether `CAMERA_FEEDBACK` is sent for autopilots."""
 
     @model_validator(mode="after")
     def _check_connection(self) -> MavlinkCameraSection:
@@ -282,39 +336,46 @@ class MavlinkCameraSection(_ConfigurationSection):
 
 
 class WatchSection(_ConfigurationSection):
-    """Access for monitoring and commands (docs/watching.md). Commands over the network require a
-    token. At the Unix socket `control` members of `control_group` are operators, and members of
-    `control_administrator_group` administrators.
+    """Access for monitoring and commands (docs/how-to/flight/watching.md).
+
+    Commands over the network require a token. At the Unix socket `control` members of
+    `control_group` are operators, and members of `control_administrator_group` administrators.
     """
 
     host: str = "127.0.0.1"
+    """Address on which page and API listen."""
     port: int = Field(default=8470, ge=0, le=65535)
+    """TCP port of page and API; 0 takes any free port."""
     anonymous_read: bool = True
-    tokens: Path | None = None
-    tls_certificate: Path | None = None
-    tls_key: Path | None = None
+    """Whether reading requires no token. Commands always require one."""
+    tokens: FilePath | None = None
+    """File with the hashes of the tokens; without it there are no commands over the network."""
+    tls_certificate: FilePath | None = None
+    """Certificate of the server, PEM."""
+    tls_key: FilePath | None = None
+    """Private key of the certificate, PEM."""
     announce: bool = True
-    udp: tuple[str, ...] = Field(default=(), max_length=8)
+    """Whether the service is announced by mDNS."""
+    udp: Several[str] = Field(default=(), max_length=8)
+    """Receivers of telemetry datagrams, `HOST:PORT` each."""
     udp_bytes_per_s: float = Field(default=4000.0, ge=1000)
+    """Highest rate of datagrams to each receiver."""
     mavlink: MavlinkCameraSection | None = None
-    control: Path | None = None
+    control: FilePath | None = None
+    """Path of the Unix socket for commands on this computer."""
     control_group: str | None = None
+    """Group whose members are operators; default: the group of the service."""
     control_administrator_group: str | None = None
-    hosts: tuple[str, ...] = Field(default=(), max_length=16)
-    proxies: tuple[str, ...] = Field(default=(), max_length=8)
+    """Group whose members are administrators, in addition to root."""
+    hosts: Several[str] = Field(default=(), max_length=16)
+    """Names under which the page is served, in addition to the computer's own."""
+    proxies: Several[str] = Field(default=(), max_length=8)
+    """IP addresses of reverse proxies whose forwarding headers count."""
 
     @property
     def udp_addresses(self) -> dict[str, tuple[str, int]]:
         """Addresses of datagrams by their text in the configuration."""
         return {text: (text.rpartition(":")[0], int(text.rpartition(":")[2])) for text in self.udp}
-
-    @model_validator(mode="before")
-    @classmethod
-    def _refuse_old_keys(cls, given: Any) -> Any:
-        return _refuse_old_keys(
-            given,
-            {"certificate": "tls_certificate", "key": "tls_key", "open": "anonymous_read"},
-        )
 
     @model_validator(mode="after")
     def _check_udp(self) -> WatchSection:
@@ -359,15 +420,25 @@ class LimitsSection(_ConfigurationSection):
     """Time limits, and the number of exposures in memory."""
 
     frame_timeout_s: float = Field(default=8.0, gt=0)
+    """Time after a trigger until a frame counts as missing."""
     mark_timeout_s: float = Field(default=3.0, gt=0)
+    """Time after a trigger until an event mark counts as missing."""
     ready_timeout_s: float = Field(default=60.0, gt=0)
+    """Time that the service waits for its devices at the start."""
     temperature_stale_s: float = Field(default=10.0, gt=0)
+    """Age from which a temperature is too old for arming."""
     navigation_stale_s: float = Field(default=5.0, gt=0)
+    """Age from which a position is too old for arming."""
     exposures_in_memory: int = Field(default=3, ge=2, le=16)
+    """Exposures whose frames have a place in memory."""
     disk_reserve_bytes: int = Field(default=500_000_000, ge=0)
+    """Space on a disk that exposures leave free."""
     disk_warn_exposures: int = Field(default=100, ge=0)
+    """Number of exposures that still fit below which low space is reported."""
     mirror_timeout_s: float = Field(default=2.0, gt=0)
+    """Time after which a disk that does not answer is dropped."""
     power_fail_s: float = Field(default=5.0, gt=0, le=60)
+    """Time in which open exposures are stored and sealed after a power failure."""
 
 
 class Configuration(_ConfigurationSection):
@@ -378,10 +449,10 @@ class Configuration(_ConfigurationSection):
     mount: MountSection = MountSection()
     serials: SerialsSection = SerialsSection()
     trigger: TriggerSection
-    head: tuple[HeadDeviceSection, ...] = Field(min_length=1)
-    thermometer: tuple[NamedDeviceSection, ...] = ()
-    navigator: tuple[NamedDeviceSection, ...] = ()
-    pps: tuple[NamedDeviceSection, ...] = Field(default=(), max_length=1)
+    head: Several[HeadDeviceSection] = Field(min_length=1)
+    thermometer: Several[NamedDeviceSection] = ()
+    navigator: Several[NamedDeviceSection] = ()
+    pps: Several[NamedDeviceSection] = Field(default=(), max_length=1)
     exposure: ExposureSection = ExposureSection()
     processing: ProcessingSection = ProcessingSection()
     limits: LimitsSection = LimitsSection()
@@ -404,136 +475,3 @@ class Configuration(_ConfigurationSection):
         if self.trigger.mode == "plan" and self.plan.file is None:
             raise ValueError("trigger.mode is 'plan' and there is no plan.file; give the plan")
         return self
-
-
-def load(path: Path) -> tuple[Configuration, Rig]:
-    """Read a service configuration and the rig it names.
-
-    Relative paths are relative to the folder of the file.
-
-    Raises:
-        ConfigurationError: with one sentence per error: file, key, value, and the correction.
-    """
-    try:
-        status = path.stat()
-        if not stat.S_ISREG(status.st_mode):
-            raise ConfigurationError([f"{path}: not a regular file; give a service.toml"])
-        if status.st_size > CONFIGURATION_MAX_BYTES:
-            raise ConfigurationError([f"{path.name}: too large for a configuration"])
-        content = parse_toml(path.read_bytes())
-    except OSError as error:
-        reason = error.strerror or type(error).__name__
-        raise ConfigurationError(
-            [f"{path}: cannot be read ({reason}); give the path of a service.toml"]
-        ) from error
-    except TomlError as error:
-        raise ConfigurationError([f"{path.name}: not valid TOML: {error}"]) from error
-    return from_mapping(content, path)
-
-
-def from_mapping(content: Mapping[str, Any], path: Path) -> tuple[Configuration, Rig]:
-    """Validate parsed TOML; `path` names the file in messages and anchors relative paths."""
-    file = path.name
-    problems = device_problems(content, file, frozenset(TriggerSection.model_fields))
-    rig: Rig | None = None
-    rig_name = nested_value(content, "mission", "rig")
-    if isinstance(rig_name, str):
-        try:
-            rig = find_rig(_rig_path(rig_name, path))
-        except RigError as error:
-            problems += [f"{file}: mission.rig: {problem}" for problem in error.problems]
-    configuration: Configuration | None = None
-    try:
-        configuration = Configuration.model_validate(content)
-    except ValidationError as error:
-        problems += [_sentence(file, detail) for detail in error.errors()]
-    if rig is not None:
-        problems += rig_problems(content, rig, file)
-    radiometry = nested_value(content, "mission", "radiometry")
-    if isinstance(radiometry, str) and not (path.parent / radiometry).is_dir():
-        problems.append(
-            f"{file}: mission.radiometry is {radiometry!r}, and there is no such folder; give the "
-            "folder with a calibration of each sensor, or leave the key out"
-        )
-    plan_file = nested_value(content, "plan", "file")
-    if isinstance(plan_file, str):
-        try:
-            read_plan(path.parent / plan_file)
-        except PlanError as error:
-            problems.append(f"{file}: plan.file: {error}")
-    if configuration is not None and rig is not None and configuration.mission.mirror is not None:
-        problems += mirror_problems(
-            path.parent / configuration.mission.root,
-            path.parent / configuration.mission.mirror,
-            configuration.limits.mirror_timeout_s,
-            configuration.limits.exposures_in_memory,
-            rig,
-            file,
-        )
-    model = nested_value(content, "plan", "elevation")
-    if isinstance(model, str) and not (path.parent / model).is_file():
-        problems.append(f"{file}: plan.elevation is {model!r}, and there is no such file")
-    if problems or configuration is None or rig is None:
-        raise ConfigurationError(problems)
-    return _with_absolute_paths(configuration, path.parent.resolve()), rig
-
-
-def _rig_path(name: str, path: Path) -> str:
-    local_path = path.parent / name
-    return str(local_path) if name.endswith(".toml") and local_path.exists() else name
-
-
-def _with_absolute_paths(configuration: Configuration, folder: Path) -> Configuration:
-    mission = configuration.mission
-    radiometry = None if mission.radiometry is None else folder / mission.radiometry
-    mission_section = mission.model_copy(
-        update={
-            "root": folder / mission.root,
-            "mirror": None if mission.mirror is None else folder / mission.mirror,
-            "radiometry": radiometry,
-            "rig": _rig_path(mission.rig, folder / "service.toml"),
-        }
-    )
-    plan = configuration.plan
-    if plan.file is not None:
-        plan = plan.model_copy(update={"file": folder / plan.file})
-    if plan.elevation is not None:
-        plan = plan.model_copy(update={"elevation": folder / plan.elevation})
-    watch = configuration.watch
-    if watch is not None:
-        files = {name: getattr(watch, name) for name in _WATCH_FILES}
-        update: dict[str, Any] = {
-            name: folder / path for name, path in files.items() if path is not None
-        }
-        if watch.mavlink is not None and watch.mavlink.signing_key is not None:
-            signing = {
-                "signing_key": folder / watch.mavlink.signing_key,
-                "signing_state": mission_section.root / SIGNING_STATE
-                if watch.mavlink.signing_state is None
-                else folder / watch.mavlink.signing_state,
-            }
-            update["mavlink"] = watch.mavlink.model_copy(update=signing)
-        watch = watch.model_copy(update=update)
-    return configuration.model_copy(
-        update={"mission": mission_section, "plan": plan, "watch": watch}
-    )
-
-
-def _sentence(file: str, detail: Any) -> str:
-    key = _key(detail["loc"])
-    message = str(detail["msg"]).removeprefix("Value error, ")
-    kind = detail["type"]
-    if kind == "missing":
-        return f"{file}: {key} is missing; {message.lower()}"
-    if kind == "extra_forbidden":
-        return f"{file}: {key} is not a key of this section; check the spelling"
-    shown = repr(detail["input"])
-    shown = shown if len(shown) <= 60 else shown[:57] + "..."
-    return f"{file}: {key} is {shown}; {message[0].lower()}{message[1:]}"
-
-
-def _key(location: Sequence[int | str]) -> str:
-    key = ""
-    for part in location:
-        key += f"[{part}]" if isinstance(part, int) else f".{part}" if key else part
-    return key

@@ -1,44 +1,42 @@
 """Errors between sections of a configuration: devices, triggers, ports, the rig.
 
-Each is a sentence with file, key, value and the correction. The rules of a single section are in
+Each is a key, and its value with the correction. The rules of a single section are in
 `daemon.configuration.model`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from drivers.base import registry
 from drivers.contract import DeviceError
 from processing.rig import Rig
+from processing.rig.problem_sentences import Finding, Location, key_of
 
 
-def device_problems(
-    content: Mapping[str, Any], file: str, trigger_keys: frozenset[str]
-) -> list[str]:
+def device_problems(content: Mapping[str, Any], trigger_keys: frozenset[str]) -> list[Finding]:
     """Errors in the devices of a configuration, independent of the rig.
 
     Args:
         content: parsed TOML.
-        file: names the file in the sentences.
         trigger_keys: keys of `[trigger]` that are not the driver's.
     """
     return [
-        *_driver_problems(content, file, trigger_keys),
-        *_name_problems(content, file),
-        *_trigger_problems(content, file),
-        *_port_problems(content, file),
+        *_driver_problems(content, trigger_keys),
+        *_name_problems(content),
+        *_trigger_problems(content),
+        *_port_problems(content),
     ]
 
 
-def rig_problems(content: Mapping[str, Any], rig: Rig, file: str) -> list[str]:
+def rig_problems(content: Mapping[str, Any], rig: Rig) -> list[Finding]:
     """Conflicts between the devices of a configuration and the rig."""
     return [
-        *_sensor_problems(content, rig, file),
-        *_serial_problems(content, rig, file),
-        *_tdi_problems(content, rig, file),
+        *_sensor_problems(content, rig),
+        *_serial_problems(content, rig),
+        *_tdi_problems(content, rig),
     ]
 
 
@@ -50,9 +48,7 @@ def nested_value(content: Mapping[str, Any], *keys: str) -> Any:
     return value
 
 
-def _driver_problems(
-    content: Mapping[str, Any], file: str, trigger_keys: frozenset[str]
-) -> list[str]:
+def _driver_problems(content: Mapping[str, Any], trigger_keys: frozenset[str]) -> Iterator[Finding]:
     """Errors that the drivers find in their settings."""
     own_keys = {
         "head": {"driver", "sensor"},
@@ -61,21 +57,20 @@ def _driver_problems(
         "pps": {"driver", "name"},
         "trigger": set(trigger_keys),
     }
-    problems: list[str] = []
     for kind, own in own_keys.items():
         sections = content.get(kind)
         listed = sections if isinstance(sections, list) else [sections]
         for index, section in enumerate(listed):
             if not isinstance(section, Mapping) or not isinstance(section.get("driver"), str):
                 continue
-            key = kind if kind == "trigger" else f"{kind}[{index}]"
+            place = (kind,) if kind == "trigger" else (kind, index)
             settings = {name: value for name, value in section.items() if name not in own}
-            found = registry.problems(kind, section["driver"], settings)
-            problems += [f"{file}: {key}.{problem}" for problem in found]
-    return problems
+            for problem in registry.problems(kind, section["driver"], settings):
+                key, _, text = problem.partition(" ")
+                yield (*place, key), text
 
 
-def _sensor_problems(content: Mapping[str, Any], rig: Rig, file: str) -> list[str]:
+def _sensor_problems(content: Mapping[str, Any], rig: Rig) -> Iterator[Finding]:
     """Conflicts between the heads and the sensors of the rig."""
     heads = content.get("head")
     given = [
@@ -84,14 +79,12 @@ def _sensor_problems(content: Mapping[str, Any], rig: Rig, file: str) -> list[st
         if isinstance(head, Mapping) and isinstance(head.get("sensor"), str)
     ]
     known = {sensor.name for sensor in rig.sensors}
-    problems = []
     for index, name in enumerate(given):
+        place = ("head", index, "sensor")
         if name not in known:
-            listed = ", ".join(sorted(known))
-            problems.append(f"{file}: head[{index}].sensor is {name!r}; {rig.name} has {listed}")
+            yield place, f"is {name!r}; {rig.name} has {', '.join(sorted(known))}"
         elif name in given[:index]:
-            problems.append(f"{file}: head[{index}].sensor is {name!r} for the second time")
-    return problems
+            yield place, f"is {name!r} for the second time; give each head a sensor of its own"
 
 
 def _sections(content: Mapping[str, Any], kind: str) -> list[Mapping[str, Any]]:
@@ -99,33 +92,28 @@ def _sections(content: Mapping[str, Any], kind: str) -> list[Mapping[str, Any]]:
     return [one for one in listed if isinstance(one, Mapping)] if isinstance(listed, list) else []
 
 
-def _name_problems(content: Mapping[str, Any], file: str) -> list[str]:
+def _name_problems(content: Mapping[str, Any]) -> Iterator[Finding]:
     """Devices of one name: records of one would be taken for the other's."""
-    problems = []
-    used_by: dict[str, str] = {}
+    used_by: dict[str, Location] = {}
     for kind, key in (("head", "sensor"), ("thermometer", "name"), ("navigator", "name")):
         for index, section in enumerate(_sections(content, kind)):
-            name, place = section.get(key), f"{kind}[{index}].{key}"
+            name, place = section.get(key), (kind, index, key)
             if not isinstance(name, str):
                 continue
             # A sensor named twice is reported with the rig's sensors.
-            if name in used_by and not (kind == "head" and used_by[name].startswith("head")):
-                problems.append(
-                    f"{file}: {place} is {name!r}, as is {used_by[name]}; give each device a name "
-                    "of its own"
-                )
+            if name in used_by and not (kind == "head" and used_by[name][0] == "head"):
+                other = key_of(used_by[name])
+                yield place, f"is {name!r}, as is {other}; give each device a name of its own"
             used_by.setdefault(name, place)
-    return problems
 
 
-def _trigger_problems(content: Mapping[str, Any], file: str) -> list[str]:
+def _trigger_problems(content: Mapping[str, Any]) -> Iterator[Finding]:
     """Heads that wait for another start of exposure than the trigger gives."""
     driver_name = nested_value(content, "trigger", "driver")
-    problems = []
     try:
         trigger: Any = registry.driver_for("trigger", str(driver_name))
     except DeviceError:
-        return []
+        return
     for index, section in enumerate(_sections(content, "head")):
         try:
             head: Any = registry.driver_for("head", str(section.get("driver")))
@@ -139,18 +127,16 @@ def _trigger_problems(content: Mapping[str, Any], file: str) -> list[str]:
             cure = f'set trigger_source = "{trigger.head_trigger_source}"'
         else:
             cure = f"a head of driver {section.get('driver')} has {', '.join(choices)}"
-        problems.append(
-            f"{file}: head[{index}].trigger_source is {source!r}, and trigger.driver "
-            f"{driver_name!r} starts exposures by {trigger.head_trigger_source!r}; {cure}, or "
-            "choose another trigger.driver"
+        yield (
+            ("head", index, "trigger_source"),
+            f"is {source!r}, and trigger.driver {driver_name!r} starts exposures by "
+            f"{trigger.head_trigger_source!r}; {cure}, or choose another trigger.driver",
         )
-    return problems
 
 
-def _port_problems(content: Mapping[str, Any], file: str) -> list[str]:
+def _port_problems(content: Mapping[str, Any]) -> Iterator[Finding]:
     """Two devices at one port or address."""
-    problems = []
-    used_by: dict[tuple[str, str], str] = {}
+    used_by: dict[tuple[str, str], Location] = {}
     for kind, key in (
         ("head", "address"),
         ("head", "device"),
@@ -159,22 +145,20 @@ def _port_problems(content: Mapping[str, Any], file: str) -> list[str]:
         ("pps", "device"),
     ):
         for index, section in enumerate(_sections(content, kind)):
-            value, place = section.get(key), f"{kind}[{index}].{key}"
+            value, place = section.get(key), (kind, index, key)
             if not isinstance(value, str) or section.get("driver") == "gpsd":
                 continue
             if (key, value) in used_by:
-                problems.append(
-                    f"{file}: {place} is {value!r}, as is {used_by[key, value]}; one of them is wrong"
-                )
+                other = key_of(used_by[key, value])
+                yield place, f"is {value!r}, as is {other}; one of them is wrong"
             used_by.setdefault((key, value), place)
-    return problems
 
 
-def _serial_problems(content: Mapping[str, Any], rig: Rig, file: str) -> list[str]:
+def _serial_problems(content: Mapping[str, Any], rig: Rig) -> list[Finding]:
     """Parts that the rig does not have."""
     available = {"lens": [cone.name for cone in rig.cones], "probe": list(rig.probes)}
     return [
-        f"{file}: serials.{kind}.{name} is of nothing {rig.name} has: {', '.join(names) or 'none'}"
+        (("serials", kind, name), f"is of nothing {rig.name} has: {', '.join(names) or 'none'}")
         for kind, names in available.items()
         if isinstance(given := nested_value(content, "serials", kind), Mapping)
         for name in given
@@ -183,36 +167,38 @@ def _serial_problems(content: Mapping[str, Any], rig: Rig, file: str) -> list[st
 
 
 def mirror_problems(
-    root: Path, mirror: Path, timeout_s: float, exposures_in_memory: int, rig: Rig, file: str
-) -> list[str]:
+    root: Path, mirror: Path, timeout_s: float, exposures_in_memory: int, rig: Rig
+) -> Iterator[Finding]:
     """Whether the mirror is another place, and is given up before the memory for frames is full."""
-    problems = []
     one, other = root.resolve(), mirror.resolve()
     if one == other or one in other.parents or other in one.parents:
-        problems.append(
-            f"{file}: mission.mirror is {mirror}, which is mission.root, in it or around it; give "
-            "a folder on another disk"
+        yield (
+            ("mission", "mirror"),
+            f"is {mirror}, which is mission.root, in it or around it; give a folder on another disk",
         )
     # One exposure is being written when a disk stalls; the others find room in memory meanwhile.
     bridged_s = (exposures_in_memory - 1) * rig.frame_interval_s
     if timeout_s >= bridged_s:
         required_depth = 2 + int(timeout_s / rig.frame_interval_s)
-        problems.append(
-            f"{file}: limits.mirror_timeout_s is {timeout_s:g}; memory for {exposures_in_memory} "
-            f"exposures bridges {bridged_s:g} s at one every {rig.frame_interval_s:g} s: give a "
-            f"shorter time, or set limits.exposures_in_memory to {required_depth}"
+        yield (
+            ("limits", "mirror_timeout_s"),
+            f"is {timeout_s:g}; memory for {exposures_in_memory} exposures bridges "
+            f"{bridged_s:g} s at one every {rig.frame_interval_s:g} s: give a shorter time, or set "
+            f"limits.exposures_in_memory to {required_depth}",
         )
-    return problems
 
 
-def _tdi_problems(content: Mapping[str, Any], rig: Rig, file: str) -> list[str]:
+def _tdi_problems(content: Mapping[str, Any], rig: Rig) -> list[Finding]:
     """TDI moves charge from row to row, and on a Bayer head from colour to colour."""
     heads = content.get("head")
     bayer = {s.name: s for s in rig.sensors if s.colour_filter_array != "none"}
     return [
-        f"{file}: head[{index}].tdi_shifts is {head['tdi_shifts']}; {head['sensor']} is a Bayer "
-        f"head ({bayer[head['sensor']].colour_filter_array}), where moving charge would mix "
-        "colours: set 0 and expose shorter"
+        (
+            ("head", index, "tdi_shifts"),
+            f"is {head['tdi_shifts']}; {head['sensor']} is a Bayer head "
+            f"({bayer[head['sensor']].colour_filter_array}), where moving charge would mix "
+            "colours: set 0 and expose shorter",
+        )
         for index, head in enumerate(heads if isinstance(heads, list) else [])
         if isinstance(head, Mapping)
         and head.get("sensor") in bayer

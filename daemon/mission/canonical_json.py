@@ -9,17 +9,16 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import re
-import sys
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from daemon.errors import DaemonError
-from processing.rig.toml_table import plain_name as plain_name
+from processing.rig.problem_sentences import ProblemList
 from processing.rig.toml_text import is_nested_deeper
+from processing.rig.value_types import plain_name as plain_name
 
 RECORD_MAX_BYTES = 4_000_000
 """No record of ours comes near this; more is refused unread."""
@@ -28,19 +27,10 @@ RECORD_DEPTH_MAX = 32
 
 EXACT_INTEGER_LIMIT = 2**53
 """Larger integers do not survive a JSON reader that knows only doubles."""
-_LARGEST = sys.float_info.max
-
-_INSTANT = re.compile(r"-?(0|[1-9][0-9]{0,18})")
-_SHA256 = re.compile(r"[0-9a-f]{64}")
-_REQUIRED: Any = object()
 
 
-class RecordError(DaemonError, ValueError):
+class RecordError(ProblemList, DaemonError, ValueError):
     """A record that cannot be used; `problems` holds one message for each mistake found."""
-
-    def __init__(self, problems: Sequence[str]) -> None:
-        self.problems = tuple(problems)
-        super().__init__("\n".join(problems))
 
 
 def canonical_bytes(content: Mapping[str, Any]) -> bytes:
@@ -91,200 +81,6 @@ def parse_record(data: bytes, name: str) -> dict[str, Any]:
     return content
 
 
-class Fields:
-    """A JSON object that answers typed questions and notes every mistake with its full key."""
-
-    def __init__(
-        self, content: Mapping[str, Any], path: str, file: str, problems: list[str]
-    ) -> None:
-        self.content = content
-        self.path = path
-        self.file = file
-        self.problems = problems
-        self.known_keys: set[str] = set()
-
-    def add_problem(self, key: str, expected: str) -> None:
-        found = f"is {_shown(self.content[key])}" if key in self.content else "is missing"
-        self.problems.append(f"{self.file}: {self._key(key)} {found}; {expected}")
-
-    def instant(self, key: str, default: int | None = None) -> int | None:
-        """Nanoseconds as a decimal string, within 64 bits; null where nothing is known."""
-        value = self._get(key, default)
-        if value is None or value is default:
-            return default if value is default else None
-        if isinstance(value, str) and _INSTANT.fullmatch(value) and abs(int(value)) < 2**63:
-            return int(value)
-        self.add_problem(key, 'an instant is a decimal string of nanoseconds, such as "1447500000"')
-        return default
-
-    def integer(self, key: str, default: int = _REQUIRED, *, minimum: int = 0) -> int:
-        value = self.integer_or_none(key, default, minimum=minimum)
-        if value is None:
-            if self.content.get(key, _REQUIRED) is None:
-                self.add_problem(key, "a whole number is needed")
-            return 0
-        return value
-
-    def integer_or_none(
-        self, key: str, default: int | None = None, *, minimum: int = 0
-    ) -> int | None:
-        value = self._get(key, default)
-        if value is None:
-            return None
-        if isinstance(value, bool) or not isinstance(value, int):
-            self.add_problem(key, "a whole number is needed")
-        elif not minimum <= value <= EXACT_INTEGER_LIMIT:
-            self.add_problem(key, f"it must be between {minimum} and 2^53")
-        else:
-            return value
-        return None if default is _REQUIRED else default
-
-    def number(self, key: str, default: float = _REQUIRED) -> float:
-        value = self.number_or_none(key, default)
-        if value is None:
-            if self.content.get(key, _REQUIRED) is None:
-                self.add_problem(key, "a number is needed")
-            return 0.0
-        return value
-
-    def number_or_none(self, key: str, default: float | None = None) -> float | None:
-        value = self._get(key, default)
-        if value is None:
-            return None
-        if isinstance(value, int | float) and not isinstance(value, bool):
-            try:
-                number = float(value)
-            except OverflowError:
-                number = math.inf
-            if math.isfinite(number):
-                return number
-        self.add_problem(key, "a finite number is needed")
-        return None if default is _REQUIRED else default
-
-    def text(self, key: str, default: str = _REQUIRED) -> str:
-        value = self._get(key, default)
-        if isinstance(value, str) and len(value) <= 10_000:
-            return value
-        if key in self.content:
-            self.add_problem(key, "a text of at most 10000 characters is needed")
-        return ""
-
-    def name(self, key: str, default: str = _REQUIRED) -> str:
-        """A text that is safe as a file name."""
-        value = self.text(key, default)
-        if value and value is not default and not plain_name(value):
-            self.add_problem(key, "letters, digits, '_', '-' and inner dots only, 64 at most")
-            return ""
-        return value
-
-    def choice(self, key: str, allowed: Sequence[str], default: str = _REQUIRED) -> str:
-        value = self._get(key, default)
-        if isinstance(value, str) and value in allowed:
-            return value
-        if key in self.content:
-            self.add_problem(key, f"it is one of {', '.join(allowed)}")
-        return allowed[0]
-
-    def flag(self, key: str, *, default: bool) -> bool:
-        value = self._get(key, default)
-        if isinstance(value, bool):
-            return value
-        self.add_problem(key, "true or false is needed")
-        return default
-
-    def sha256(self, key: str) -> str:
-        """64 lower-case hexadecimal digits, or an empty text where there is no hash."""
-        value = self.text(key, "")
-        if value and not _SHA256.fullmatch(value):
-            self.add_problem(key, "a SHA-256 has 64 hexadecimal digits in lower case")
-            return ""
-        return value
-
-    def velocity(self, key: str) -> tuple[float, float, float | None] | None:
-        """North, east, down; null, also of down alone, where it is not known."""
-        value = self._get(key, None)
-        if value is None:
-            return None
-        good = (
-            isinstance(value, list)
-            and len(value) == 3
-            and all(
-                isinstance(v, int | float) and not isinstance(v, bool) and abs(v) < 1e300
-                for v in (value[:2] if value[2] is None else value)
-            )
-        )
-        if not good:
-            self.add_problem(key, "three numbers are needed, of which the last may be null")
-            return None
-        down = None if value[2] is None else float(value[2])
-        return (float(value[0]), float(value[1]), down)
-
-    def scalars(self, key: str) -> dict[str, float | int | str]:
-        """A flat object of numbers and texts; empty where the key is absent."""
-        value = self._get(key, {})
-        if not isinstance(value, dict):
-            self.add_problem(key, "an object of numbers and texts is needed")
-            return {}
-        found: dict[str, float | int | str] = {}
-        for inner, item in value.items():
-            usable = isinstance(item, str) or (
-                isinstance(item, int | float)
-                and not isinstance(item, bool)
-                and abs(item) <= (EXACT_INTEGER_LIMIT if isinstance(item, int) else _LARGEST)
-            )
-            if usable:
-                found[inner] = item
-            else:
-                problem = (
-                    f"{self._key(key)}.{inner} is {_shown(item)}; a number or a text is needed"
-                )
-                self.problems.append(f"{self.file}: {problem}")
-        return found
-
-    def object(self, key: str) -> Fields | None:
-        value = self._get(key, None)
-        if value is None:
-            return None
-        if not isinstance(value, dict):
-            self.add_problem(key, "an object is needed")
-            return None
-        return Fields(value, self._key(key), self.file, self.problems)
-
-    def objects(self, key: str) -> Iterator[Fields]:
-        """The objects of a list; none where the key is absent."""
-        value = self._get(key, [])
-        if not (isinstance(value, list) and all(isinstance(item, dict) for item in value)):
-            self.add_problem(key, "a list of objects is needed")
-            return
-        for index, item in enumerate(value):
-            yield Fields(item, f"{self._key(key)}[{index}]", self.file, self.problems)
-
-    def names(self, key: str) -> tuple[str, ...]:
-        """A list of texts that are safe as file names; empty where the key is absent."""
-        value = self._get(key, [])
-        if isinstance(value, list) and all(isinstance(v, str) and plain_name(v) for v in value):
-            return tuple(value)
-        self.add_problem(key, "a list of names is needed")
-        return ()
-
-    def refuse_unknown(self) -> None:
-        for key in self.content:
-            if key not in self.known_keys:
-                self.add_problem(key, "no such key; check the spelling")
-
-    def _get(self, key: str, default: Any) -> Any:
-        self.known_keys.add(key)
-        if key in self.content:
-            return self.content[key]
-        if default is _REQUIRED:
-            self.add_problem(key, "it is needed")
-            return None
-        return default
-
-    def _key(self, key: str) -> str:
-        return f"{self.path}.{key}" if self.path else key
-
-
 def _plain(value: Any, path: str, problems: list[str]) -> Any:
     """The same value in types of JSON; what does not fit is named in `problems`."""
     if isinstance(value, np.generic):
@@ -324,8 +120,3 @@ def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 def _no_constant(name: str) -> float:
     raise ValueError(f"{name} is not a number of JSON")
-
-
-def _shown(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."

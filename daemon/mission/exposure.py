@@ -8,21 +8,60 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, cast, get_args
+from operator import attrgetter
+from typing import Annotated, Any, Final, Literal
 
-from daemon.mission.canonical_json import Fields, RecordError, canonical_bytes
-from drivers.contract import Velocity
+from pydantic import BaseModel, ConfigDict
+from pydantic_core import CoreSchema, core_schema
+
+from daemon.mission.canonical_json import canonical_bytes
+from daemon.mission.record_types import (
+    Count,
+    FileName,
+    Finite,
+    Instant,
+    InstantOrZero,
+    Integer,
+    LeapSeconds,
+    LongText,
+    NedVelocity,
+    Ordinal,
+    Scalars,
+    Sha256,
+    distinct,
+    read_record,
+)
+from processing.rig.problem_sentences import Finding, shown
+from processing.rig.value_types import Flag, Name
 
 TimeSource = Literal["event-mark", "pps", "interpolated", "host", "none"]
 RecordState = Literal["complete", "degraded", "lost"]
-MissingFrames = tuple[tuple[str, str], ...]
+_KNOWN_KEYS_ONLY: Final = ConfigDict(extra="forbid")
+
+
+class _MissingFrame(BaseModel):
+    """A frame that is missing, as the record has it."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    sensor: LongText
+    cause: LongText = "not stated"
+
+
+class _FromObject:
+    """Reads a pair from an object of two keys."""
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, _source: Any, handler: Any) -> CoreSchema:
+        return core_schema.no_info_after_validator_function(
+            lambda frame: (frame.sensor, frame.cause), handler.generate_schema(_MissingFrame)
+        )
+
+
+MissingFrames = tuple[Annotated[tuple[str, str], _FromObject], ...]
 """Missing frames of an exposure: (sensor, cause) pairs."""
 
 EXPOSURE_FORMAT = 1
-TIME_SOURCES: tuple[str, ...] = get_args(TimeSource)
-RECORD_STATES: tuple[str, ...] = get_args(RecordState)
-NAVIGATION_METHODS = ("interpolated", "extrapolated", "nearest")
-HEIGHT_REFERENCES = ("ellipsoid", "geoid")
 
 
 @dataclass(frozen=True)
@@ -33,34 +72,38 @@ class FrameRecord:
     before the frame is stored. `mid_exposure_gps_ns` is final when the exposure is sealed.
     """
 
-    sensor: str
-    head_serial: str
-    file: str
-    sha256: str
-    width_px: int
-    height_px: int
-    pixel_format: str
-    device_ns: int | None
-    counter: int | None
-    exposure_time_us: float | None
-    temperature_c: float | None
-    mono_ns: int
-    mid_exposure_gps_ns: int | None = None
-    time_sigma_ns: int | None = None
+    __pydantic_config__ = _KNOWN_KEYS_ONLY
+
+    sensor: Name
+    head_serial: LongText = ""
+    file: FileName = ""
+    sha256: Sha256 = ""
+    width_px: Count = 0
+    height_px: Count = 0
+    pixel_format: LongText = "Mono16"
+    device_ns: Instant | None = None
+    counter: Count | None = None
+    exposure_time_us: Finite | None = None
+    temperature_c: Finite | None = None
+    mono_ns: InstantOrZero = 0
+    mid_exposure_gps_ns: Instant | None = None
+    time_sigma_ns: Count | None = None
     time_source: TimeSource = "none"
-    settings: Mapping[str, float | int | str] = field(default_factory=dict)
+    settings: Scalars = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class TemperatureRecord:
     """A probe's reading that belongs to the exposure; `age_ns` is its age at the trigger."""
 
-    probe: str
-    value_c: float | None
-    age_ns: int = 0
+    __pydantic_config__ = _KNOWN_KEYS_ONLY
+
+    probe: LongText
+    value_c: Finite | None = None
+    age_ns: Integer = 0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class NavigationRecord:
     """Position, velocity and attitude at the event mark.
 
@@ -71,27 +114,34 @@ class NavigationRecord:
     GPS time come from (`drivers.contract.NavSample`).
     """
 
-    receiver: str
-    gps_ns: int
-    method: Literal["interpolated", "extrapolated", "nearest"]
-    gap_ns: int
-    fix: str
-    satellites: int | None
-    latitude_deg: float
-    longitude_deg: float
-    height_m: float | None
-    horizontal_sigma_m: float | None
-    vertical_sigma_m: float | None
-    velocity_ned_mps: Velocity | None
-    speed_sigma_mps: float | None
-    roll_rad: float | None = None
-    pitch_rad: float | None = None
-    heading_rad: float | None = None
-    leap_seconds: int | None = None
-    crs: str = "EPSG:4979"
+    __pydantic_config__ = _KNOWN_KEYS_ONLY
+
+    receiver: LongText = ""
+    gps_ns: Instant
+    method: Literal["interpolated", "extrapolated", "nearest"] = "nearest"
+    gap_ns: Count = 0
+    fix: LongText = "none"
+    satellites: Count | None = None
+    latitude_deg: Finite
+    longitude_deg: Finite
+    height_m: Finite | None = None
+    horizontal_sigma_m: Finite | None = None
+    vertical_sigma_m: Finite | None = None
+    velocity_ned_mps: NedVelocity | None = None
+    speed_sigma_mps: Finite | None = None
+    roll_rad: Finite | None = None
+    pitch_rad: Finite | None = None
+    heading_rad: Finite | None = None
+    leap_seconds: LeapSeconds | None = None
+    crs: LongText = "EPSG:4979"
     height_reference: Literal["ellipsoid", "geoid"] = "ellipsoid"
-    sigma_source: str = "receiver"
-    leap_source: str = "receiver"
+    sigma_source: LongText = "receiver"
+    leap_source: LongText = "receiver"
+
+
+Frames = Annotated[
+    tuple[FrameRecord, ...], distinct(attrgetter("sensor")), distinct(attrgetter("file"))
+]
 
 
 @dataclass(frozen=True)
@@ -102,21 +152,23 @@ class CaptureRecord:
     of the boot `boot_id`.
     """
 
-    number: int
-    trigger_sequence: int = 0
-    trigger_mono_ns: int = 0
-    trigger_sigma_ns: int = 0
-    boot_id: str = ""
-    frames: tuple[FrameRecord, ...] = ()
+    __pydantic_config__ = _KNOWN_KEYS_ONLY
+
+    number: Ordinal
+    trigger_sequence: Count = 0
+    trigger_mono_ns: InstantOrZero = 0
+    trigger_sigma_ns: Count = 0
+    boot_id: LongText = ""
+    frames: Frames = ()
     missing: MissingFrames = ()
-    line_id: str = ""
-    strip_id: str = ""
-    calibration_id: str = ""
-    calibration_sha256: str = ""
-    configuration_sha256: str = ""
-    software: str = ""
-    simulated: bool = False
-    flags: int = 0
+    line_id: LongText = ""
+    strip_id: LongText = ""
+    calibration_id: LongText = ""
+    calibration_sha256: Sha256 = ""
+    configuration_sha256: Sha256 = ""
+    software: LongText = ""
+    simulated: Flag = False
+    flags: Count = 0
 
 
 @dataclass(frozen=True)
@@ -131,31 +183,33 @@ class Exposure:
     this one.
     """
 
-    number: int
-    trigger_sequence: int = 0
-    trigger_mono_ns: int = 0
-    trigger_sigma_ns: int = 0
-    boot_id: str = ""
-    mark_gps_ns: int | None = None
-    mark_sigma_ns: int | None = None
+    __pydantic_config__ = _KNOWN_KEYS_ONLY
+
+    number: Ordinal
+    trigger_sequence: Count = 0
+    trigger_mono_ns: InstantOrZero = 0
+    trigger_sigma_ns: Count = 0
+    boot_id: LongText = ""
+    mark_gps_ns: Instant | None = None
+    mark_sigma_ns: Count | None = None
     mark_source: TimeSource = "none"
-    mark_count: int | None = None
-    time_budget_ns: Mapping[str, int] = field(default_factory=dict)
-    frames: tuple[FrameRecord, ...] = ()
+    mark_count: Count | None = None
+    time_budget_ns: Mapping[str, Count] = field(default_factory=dict)
+    frames: Frames = ()
     missing: MissingFrames = ()
-    temperatures: tuple[TemperatureRecord, ...] = ()
+    temperatures: Annotated[tuple[TemperatureRecord, ...], distinct(attrgetter("probe"))] = ()
     navigation: NavigationRecord | None = None
-    line_id: str = ""
-    strip_id: str = ""
-    calibration_id: str = ""
-    calibration_sha256: str = ""
-    configuration_sha256: str = ""
-    software: str = ""
-    simulated: bool = False
+    line_id: LongText = ""
+    strip_id: LongText = ""
+    calibration_id: LongText = ""
+    calibration_sha256: Sha256 = ""
+    configuration_sha256: Sha256 = ""
+    software: LongText = ""
+    simulated: Flag = False
     state: RecordState = "complete"
-    flags: int = 0
-    disks: tuple[str, ...] = ()
-    previous_sha256: str = ""
+    flags: Count = 0
+    disks: tuple[Name, ...] = ()
+    previous_sha256: Sha256 = ""
 
     def frame(self, sensor: str) -> FrameRecord | None:
         """The frame of a sensor, or None where it is missing."""
@@ -198,48 +252,17 @@ def from_json(content: Mapping[str, Any], file: str = "exposure.json") -> Exposu
     Raises:
         RecordError: with one sentence per mistake: file, key, value, and what would be right.
     """
-    problems: list[str] = []
-    fields = Fields(content, "", file, problems)
-    shared = _shared_from(fields, "exposure")
-    navigation = fields.object("navigation")
-    exposure = Exposure(
-        **shared,
-        mark_gps_ns=fields.instant("mark_gps_ns"),
-        mark_sigma_ns=fields.integer_or_none("mark_sigma_ns"),
-        mark_source=cast(TimeSource, fields.choice("mark_source", TIME_SOURCES, "none")),
-        mark_count=fields.integer_or_none("mark_count"),
-        time_budget_ns=_budget(fields),
-        temperatures=tuple(_temperature(item) for item in fields.objects("temperatures")),
-        navigation=_navigation(navigation) if navigation else None,
-        state=cast(RecordState, fields.choice("state", RECORD_STATES, "complete")),
-        disks=fields.names("disks"),
-        previous_sha256=fields.sha256("previous_sha256"),
-    )
-    _refuse_duplicates([t.probe for t in exposure.temperatures], "temperatures", fields)
-    fields.refuse_unknown()
-    if problems:
-        raise RecordError(problems)
-    return exposure
+    return read_record(Exposure, *_without_header(content, "exposure", file))
 
 
 def capture_from_json(content: Mapping[str, Any], file: str = "capture.json") -> CaptureRecord:
     """Read what `capture_bytes` wrote. RecordError as for `from_json`."""
-    problems: list[str] = []
-    fields = Fields(content, "", file, problems)
-    capture = CaptureRecord(**_shared_from(fields, "capture"))
-    fields.refuse_unknown()
-    if problems:
-        raise RecordError(problems)
-    return capture
+    return read_record(CaptureRecord, *_without_header(content, "capture", file))
 
 
 def navigation_from_json(content: Mapping[str, Any]) -> NavigationRecord:
     """Read what `navigation_to_json` wrote. RecordError as for `from_json`."""
-    problems: list[str] = []
-    navigation = _navigation(Fields(content, "", "navigation", problems))
-    if problems:
-        raise RecordError(problems)
-    return navigation
+    return read_record(NavigationRecord, content, "navigation")
 
 
 def navigation_to_json(navigation: NavigationRecord) -> dict[str, Any]:
@@ -314,116 +337,17 @@ def _shared_json(record: Exposure | CaptureRecord, kind: str) -> dict[str, Any]:
     }
 
 
-def _shared_from(fields: Fields, kind: str) -> dict[str, Any]:
-    if fields.integer("format", EXPOSURE_FORMAT) != EXPOSURE_FORMAT:
-        fields.add_problem("format", f"this version reads format {EXPOSURE_FORMAT}")
-    fields.choice("kind", (kind,), kind)
-    frames = tuple(_frame(item) for item in fields.objects("frames"))
-    _refuse_duplicates([frame.sensor for frame in frames], "frames", fields)
-    _refuse_duplicates([frame.file for frame in frames if frame.file], "frames", fields)
-    return {
-        "number": fields.integer("number", minimum=1),
-        "trigger_sequence": fields.integer("trigger_sequence", 0),
-        "trigger_mono_ns": fields.instant("trigger_mono_ns", 0) or 0,
-        "trigger_sigma_ns": fields.integer("trigger_sigma_ns", 0),
-        "boot_id": fields.text("boot_id", ""),
-        "frames": frames,
-        "missing": tuple(_missing(item) for item in fields.objects("missing")),
-        "line_id": fields.text("line_id", ""),
-        "strip_id": fields.text("strip_id", ""),
-        "calibration_id": fields.text("calibration_id", ""),
-        "calibration_sha256": fields.sha256("calibration_sha256"),
-        "configuration_sha256": fields.sha256("configuration_sha256"),
-        "software": fields.text("software", ""),
-        "simulated": fields.flag("simulated", default=False),
-        "flags": fields.integer("flags", 0),
-    }
-
-
-def _frame(fields: Fields) -> FrameRecord:
-    frame = FrameRecord(
-        sensor=fields.name("sensor"),
-        head_serial=fields.text("head_serial", ""),
-        file=fields.name("file", ""),
-        sha256=fields.sha256("sha256"),
-        width_px=fields.integer("width_px", 0),
-        height_px=fields.integer("height_px", 0),
-        pixel_format=fields.text("pixel_format", "Mono16"),
-        device_ns=fields.instant("device_ns"),
-        counter=fields.integer_or_none("counter"),
-        exposure_time_us=fields.number_or_none("exposure_time_us"),
-        temperature_c=fields.number_or_none("temperature_c"),
-        mono_ns=fields.instant("mono_ns", 0) or 0,
-        mid_exposure_gps_ns=fields.instant("mid_exposure_gps_ns"),
-        time_sigma_ns=fields.integer_or_none("time_sigma_ns"),
-        time_source=cast(TimeSource, fields.choice("time_source", TIME_SOURCES, "none")),
-        settings=fields.scalars("settings"),
-    )
-    fields.refuse_unknown()
-    return frame
-
-
-def _temperature(fields: Fields) -> TemperatureRecord:
-    record = TemperatureRecord(
-        probe=fields.text("probe"),
-        value_c=fields.number_or_none("value_c"),
-        age_ns=fields.integer("age_ns", 0, minimum=-(2**53)),
-    )
-    fields.refuse_unknown()
-    return record
-
-
-def _missing(fields: Fields) -> tuple[str, str]:
-    pair = (fields.text("sensor"), fields.text("cause", "not stated"))
-    fields.refuse_unknown()
-    return pair
-
-
-def _navigation(fields: Fields) -> NavigationRecord:
-    gps_ns = fields.instant("gps_ns")
-    if gps_ns is None:
-        fields.add_problem("gps_ns", "the instant of the position is needed")
-    method = fields.choice("method", NAVIGATION_METHODS, "nearest")
-    reference = fields.choice("height_reference", HEIGHT_REFERENCES, "ellipsoid")
-    record = NavigationRecord(
-        receiver=fields.text("receiver", ""),
-        gps_ns=gps_ns or 0,
-        method=cast(Literal["interpolated", "extrapolated", "nearest"], method),
-        gap_ns=fields.integer("gap_ns", 0),
-        fix=fields.text("fix", "none"),
-        satellites=fields.integer_or_none("satellites"),
-        latitude_deg=fields.number("latitude_deg"),
-        longitude_deg=fields.number("longitude_deg"),
-        height_m=fields.number_or_none("height_m"),
-        horizontal_sigma_m=fields.number_or_none("horizontal_sigma_m"),
-        vertical_sigma_m=fields.number_or_none("vertical_sigma_m"),
-        velocity_ned_mps=fields.velocity("velocity_ned_mps"),
-        speed_sigma_mps=fields.number_or_none("speed_sigma_mps"),
-        roll_rad=fields.number_or_none("roll_rad"),
-        pitch_rad=fields.number_or_none("pitch_rad"),
-        heading_rad=fields.number_or_none("heading_rad"),
-        leap_seconds=fields.integer_or_none("leap_seconds", minimum=-1000),
-        crs=fields.text("crs", "EPSG:4979"),
-        height_reference=cast(Literal["ellipsoid", "geoid"], reference),
-        sigma_source=fields.text("sigma_source", "receiver"),
-        leap_source=fields.text("leap_source", "receiver"),
-    )
-    fields.refuse_unknown()
-    return record
-
-
-def _budget(fields: Fields) -> dict[str, int]:
-    found = fields.scalars("time_budget_ns")
-    if not all(isinstance(value, int) and value >= 0 for value in found.values()):
-        fields.add_problem(
-            "time_budget_ns", "whole nanoseconds, by what they come from, are needed"
-        )
-    return {name: value for name, value in found.items() if isinstance(value, int)}
-
-
-def _refuse_duplicates(names: list[str], key: str, fields: Fields) -> None:
-    for name in dict.fromkeys(n for n in names if names.count(n) > 1):
-        fields.problems.append(f"{fields.file}: {key} names {name!r} twice; once is right")
+def _without_header(
+    content: Mapping[str, Any], kind: str, file: str
+) -> tuple[dict[str, Any], str, list[Finding]]:
+    """The record without the keys that state its format, its file, and what is wrong with them."""
+    right = {"format": EXPOSURE_FORMAT, "kind": kind}
+    findings: list[Finding] = [
+        ((key,), f"is {shown(content[key])}; this version reads {value!r} here")
+        for key, value in right.items()
+        if content.get(key, value) != value
+    ]
+    return {key: value for key, value in content.items() if key not in right}, file, findings
 
 
 def _instant(value: int | None) -> str | None:

@@ -6,10 +6,12 @@ from typing import NoReturn
 from xml.etree import ElementTree
 from xml.parsers import expat
 
+from daemon.errors import DaemonError
+
 DEPTH_MAX = 100
 
 
-class XmlError(ValueError):
+class XmlError(DaemonError, ValueError):
     """XML that cannot be used; the message states what was found."""
 
 

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyproj
 
 from daemon.errors import DaemonError
 from daemon.mission.foreign_files import ForeignFileError, open_regular_file
@@ -111,8 +112,7 @@ def _ascii_heights(descriptor: int, begin: int, count: int) -> np.ndarray[Any, A
 
 
 def _geotiff(path: Path, descriptor: int, georeference: Georeference) -> HeightModel:
-    require("geotiff", "geodesy")
-    import pyproj
+    require("geotiff")
     import rasterio
 
     # The descriptor, not the path: a name such as /vsicurl/... never reaches GDAL.

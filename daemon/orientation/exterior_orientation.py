@@ -24,16 +24,10 @@ from daemon.mission.exposure_batch import BatchResult, for_each_exposure
 from daemon.mission.foreign_files import read_regular_file
 from daemon.mission.layout import Mission
 from daemon.mission.store.level0_folder import read_sealed
+from daemon.orientation.geodesy import metres_per_degree
 from daemon.orientation.georeference import ProjectedPoint
-from daemon.orientation.navigation import metres_per_degree
-from processing.geometry.orientation import (
-    BODY_FROM_CAMERA,
-    grid_from_camera,
-    grid_from_enu,
-    level_from_body,
-    omega_phi_kappa,
-)
-from processing.geometry.rotation import rotation_matrix
+from processing.geometry.orientation import BODY_FROM_CAMERA, grid_from_camera, grid_from_enu
+from processing.geometry.rotation import level_from_body, omega_phi_kappa, rotation_matrix
 from processing.rig import Cone, Rig
 from processing.rig.toml_text import parse_toml
 

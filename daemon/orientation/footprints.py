@@ -17,15 +17,11 @@ from daemon.configuration.model import MountSection
 from daemon.mission.exposure import NavigationRecord
 from daemon.mission.layout import Mission
 from daemon.orientation.exterior_orientation import ExteriorOrientation
-from daemon.orientation.navigation import metres_per_degree
+from daemon.orientation.local_frame import LocalFrame
 from daemon.orientation.orientation_files import image_extent_mm
 from drivers.timescales.leap_seconds import leap_seconds_at
-from processing.geometry.orientation import (
-    BODY_FROM_CAMERA,
-    grid_from_camera,
-    level_from_body,
-    on_level_ground,
-)
+from processing.geometry.orientation import BODY_FROM_CAMERA, grid_from_camera, on_level_ground
+from processing.geometry.rotation import level_from_body
 from processing.rig import Rig
 
 GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC)
@@ -54,14 +50,8 @@ def footprint(
     ground = on_level_ground(centre, eo.enu_from_camera, image_mm, f_mm, ground_m)
     if not np.isfinite(ground).all():
         return None
-    per_latitude, per_longitude = metres_per_degree(eo.latitude_deg, ground_m)
-    return [
-        (
-            eo.longitude_deg + float(east) / per_longitude,
-            eo.latitude_deg + float(north) / per_latitude,
-        )
-        for east, north, _ in ground
-    ]
+    corners = LocalFrame(eo.latitude_deg, eo.longitude_deg).to_geodetic(ground)
+    return [(float(longitude), float(latitude)) for latitude, longitude, _ in corners]
 
 
 def footprint_corners(

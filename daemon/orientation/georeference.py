@@ -10,18 +10,20 @@ import re
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+
+import pyproj
+from pyproj.transformer import TransformerGroup
 
 from daemon.errors import DaemonError
-from drivers.base.extras import require
+from daemon.orientation.geodesy import ELLIPSOID, GEODETIC
 
-if TYPE_CHECKING:
-    import pyproj
-
-FROM_CRS = "EPSG:4979"
 _CODE = re.compile(r"[A-Za-z]{2,10}:\w{1,10}(\+([A-Za-z]{2,10}:)?\w{1,10})?", re.ASCII)
 STEP_DEG = 1e-3
-"""Half the length, about 110 m, of the piece of meridian whose direction is taken."""
+"""Half the length, about 110 m, of the piece of meridian whose direction is taken.
+
+The factors of PROJ (`get_factors`) know the projection alone: in EPSG:31287 their convergence is
+wrong by 7.5 seconds of arc, for the datum, in EPSG:2053 by 180 degrees, for the axes.
+"""
 
 
 class GeoreferenceError(DaemonError):
@@ -53,12 +55,6 @@ class Georeference:
     """
 
     def __init__(self, crs: str) -> None:
-        import_proj()
-        import pyproj
-        from pyproj.network import set_network_enabled  # type: ignore[attr-defined]
-        from pyproj.transformer import TransformerGroup
-
-        set_network_enabled(active=False)
         try:
             # Other texts that PROJ takes name files and addresses, and a mission may say them.
             if _CODE.fullmatch(crs) is None:
@@ -73,7 +69,7 @@ class Georeference:
         _refuse_unfit(self.crs, crs)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # what it warns of is the error below
-            group = TransformerGroup(FROM_CRS, self.crs, always_xy=True, allow_ballpark=False)
+            group = TransformerGroup(GEODETIC, self.crs, always_xy=True, allow_ballpark=False)
         if not group.transformers or not group.best_available:
             raise GeoreferenceError(_missing_grids(crs, group.unavailable_operations))
         self._transformer: pyproj.Transformer = group.transformers[0]
@@ -102,7 +98,7 @@ class Georeference:
             north_m=north,
             height_m=height,
             azimuth_of_north_rad=math.atan2(along[0], along[1]),
-            scale=math.hypot(*along) / _meridian_m(latitude_deg),
+            scale=math.hypot(*along) / float(ELLIPSOID.inv(0.0, south_of, 0.0, north_of)[2]),
         )
 
     def position(self, east_m: float, north_m: float, height_m: float) -> tuple[float, float]:
@@ -121,21 +117,6 @@ class Georeference:
                 f"{latitude_deg:.6f} N {longitude_deg:.6f} E is outside the area of {self.name}"
             )
         return float(x), float(y), float(z)
-
-
-def utm_of(latitude_deg: float, longitude_deg: float) -> str:
-    """The UTM zone of a place on WGS 84, as EPSG code."""
-    zone = min(int((longitude_deg + 180.0) % 360.0 // 6.0) + 1, 60)
-    return f"EPSG:{32600 + zone if latitude_deg >= 0 else 32700 + zone}"
-
-
-def import_proj() -> None:
-    """Whether PROJ is here.
-
-    Raises:
-        MissingExtraError: pyproj is not installed.
-    """
-    require("geodesy")
 
 
 def _refuse_unfit(crs: pyproj.CRS, name: str) -> None:
@@ -162,12 +143,3 @@ def _missing_grids(name: str, unavailable: Sequence[object]) -> str:
                 "system out for ellipsoidal heights"
             )
     return f"{name}: PROJ knows no accurate way there from WGS 84 with ellipsoidal heights"
-
-
-def _meridian_m(latitude_deg: float) -> float:
-    """Length of the piece of meridian of `place` on the ellipsoid."""
-    import pyproj
-
-    ellipsoid = pyproj.Geod(ellps="WGS84")
-    _, _, length = ellipsoid.inv(0.0, latitude_deg - STEP_DEG, 0.0, latitude_deg + STEP_DEG)
-    return float(length)

@@ -1,7 +1,7 @@
 """Height of an exposure above the ground: over a height model, where one is configured.
 
 The mean over the image's footprint is what converging heads are projected onto
-(docs/mathematics/virtual-camera.md#ground-plane).
+(docs/explanation/mathematics/virtual-camera.md#ground-plane).
 """
 
 from __future__ import annotations

@@ -15,8 +15,8 @@ from daemon.configuration.model import MountSection
 from daemon.mission.exposure import Exposure, NavigationRecord
 from daemon.orientation.exterior_orientation import ExteriorOrientation, MissingOrientation, orient
 from daemon.orientation.footprints import footprint
+from daemon.orientation.geodesy import metres_per_degree
 from daemon.orientation.georeference import ProjectedPoint
-from daemon.orientation.navigation import metres_per_degree
 from processing.rig import Rig
 
 FORMAT: Final = 1

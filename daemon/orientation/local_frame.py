@@ -7,15 +7,12 @@ projection has to be corrected. Extent of a block: tens of kilometres.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.orientation.georeference import import_proj
-
-if TYPE_CHECKING:
-    import pyproj
+from daemon.orientation.geodesy import ECEF_FROM_GEODETIC
+from processing.geometry.rotation import rotation_from_angles
 
 Array = NDArray[np.float64]
 
@@ -27,15 +24,9 @@ class LocalFrame:
     """East, north, up at a place of WGS 84 on the ellipsoid, metres."""
 
     def __init__(self, latitude_deg: float, longitude_deg: float) -> None:
-        import_proj()
-        import pyproj
-
         self.latitude_deg, self.longitude_deg = latitude_deg, longitude_deg
-        self._ecef: pyproj.Transformer = pyproj.Transformer.from_crs(
-            "EPSG:4979", "EPSG:4978", always_xy=True
-        )
         self._axes = enu_axes(latitude_deg, longitude_deg)
-        self._origin = np.array(self._ecef.transform(longitude_deg, latitude_deg, 0.0))
+        self._origin = np.array(ECEF_FROM_GEODETIC.transform(longitude_deg, latitude_deg, 0.0))
 
     @property
     def name(self) -> str:
@@ -46,13 +37,13 @@ class LocalFrame:
 
     def from_geodetic(self, latitude_deg: Array, longitude_deg: Array, height_m: Array) -> Array:
         """Local coordinates (n, 3) of places, heights above the ellipsoid."""
-        x, y, z = self._ecef.transform(longitude_deg, latitude_deg, height_m)
+        x, y, z = ECEF_FROM_GEODETIC.transform(longitude_deg, latitude_deg, height_m)
         return np.asarray((np.stack([x, y, z], axis=-1) - self._origin) @ self._axes)
 
     def to_geodetic(self, local_m: Array) -> Array:
         """Latitude deg, longitude deg, ellipsoidal height m, (n, 3), of local coordinates."""
         x, y, z = (local_m @ self._axes.T + self._origin).T
-        longitude, latitude, height = self._ecef.transform(x, y, z, direction="INVERSE")
+        longitude, latitude, height = ECEF_FROM_GEODETIC.transform(x, y, z, direction="INVERSE")
         return np.stack([latitude, longitude, height], axis=-1)
 
     def local_from_enu(self, latitude_deg: float, longitude_deg: float) -> Array:
@@ -62,11 +53,5 @@ class LocalFrame:
 
 def enu_axes(latitude_deg: float, longitude_deg: float) -> Array:
     """East, north and up as columns (3, 3), earth-centred axes."""
-    la, lo = math.radians(latitude_deg), math.radians(longitude_deg)
-    return np.array(
-        [
-            [-math.sin(lo), -math.sin(la) * math.cos(lo), math.cos(la) * math.cos(lo)],
-            [math.cos(lo), -math.sin(la) * math.sin(lo), math.cos(la) * math.sin(lo)],
-            [0.0, math.cos(la), math.sin(la)],
-        ]
-    )
+    longitude, latitude = math.radians(longitude_deg), math.radians(latitude_deg)
+    return rotation_from_angles("ZX", [math.pi / 2 + longitude, math.pi / 2 - latitude])

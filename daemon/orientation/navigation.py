@@ -2,7 +2,7 @@
 
 Position along a cubic through both positions and velocities, attitude by quaternion.
 
-Source: docs/mathematics/navigation.md#position-between-two-samples; Shoemake (1985).
+Source: docs/explanation/mathematics/navigation.md#position-between-two-samples; Shoemake (1985).
 """
 
 from __future__ import annotations
@@ -12,15 +12,17 @@ from collections import deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-from numpy.typing import NDArray
-
 from daemon.mission.exposure import NavigationRecord
+from daemon.orientation.geodesy import metres_per_degree
 from drivers.contract import NavSample, Velocity
+from drivers.receivers.attitude import (
+    Quaternion,
+    angles_of,
+    interpolated_quaternion,
+    quaternion_of,
+)
 
 NANOSECONDS = 1e9
-WGS84_A_M = 6_378_137.0
-WGS84_E2 = 6.694379990141e-3
 EXTRAPOLATION_LIMIT_NS = 2_000_000_000
 HISTORY_NS = 120_000_000_000
 SAMPLES_TO_STEP_BACK = 3
@@ -162,16 +164,6 @@ def _nearest(samples: Sequence[NavSample], gps_ns: int) -> NavSample | None:
     found = min(samples, key=lambda sample: abs(sample.gps_ns - gps_ns), default=None)
     is_far = found is None or abs(found.gps_ns - gps_ns) > EXTRAPOLATION_LIMIT_NS
     return None if is_far else found
-
-
-def metres_per_degree(latitude_deg: float, height_m: float) -> tuple[float, float]:
-    """Length of one degree of latitude and of longitude at a place, metres (WGS 84)."""
-    sine = math.sin(math.radians(latitude_deg))
-    w2 = 1.0 - WGS84_E2 * sine * sine
-    meridian = WGS84_A_M * (1.0 - WGS84_E2) / w2**1.5 + height_m
-    normal = WGS84_A_M / math.sqrt(w2) + height_m
-    parallel = normal * math.cos(math.radians(latitude_deg))
-    return math.radians(meridian), math.radians(parallel)
 
 
 def _matches_host_time(sample: NavSample, gps_ns: int, mono_ns: int | None) -> bool:
@@ -428,18 +420,7 @@ def _attitude_between(a: NavSample, b: NavSample, u: float) -> Attitude:
             _angle_between(a.pitch_rad, b.pitch_rad, u),
             _angle_between(a.heading_rad, b.heading_rad, u),
         )
-    dot = float(qa @ qb)
-    qb = qb if dot >= 0 else -qb
-    angle = math.acos(min(1.0, abs(dot)))
-    if angle < 1e-9:
-        q = qa
-    else:
-        q = (math.sin((1 - u) * angle) * qa + math.sin(u * angle) * qb) / math.sin(angle)
-    w, x, y, z = (float(v) for v in q)
-    roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    pitch = math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x))))
-    heading = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)) % (2 * math.pi)
-    return (roll, pitch, heading)
+    return angles_of(interpolated_quaternion(qa, qb, u))
 
 
 def _angle_between(a: float | None, b: float | None, u: float) -> float | None:
@@ -449,18 +430,7 @@ def _angle_between(a: float | None, b: float | None, u: float) -> float | None:
     return (a + u * math.remainder(b - a, math.tau)) % math.tau
 
 
-def _quaternion(sample: NavSample) -> NDArray[np.float64] | None:
-    """Local level from body, from roll, pitch, heading (yaw-pitch-roll order)."""
+def _quaternion(sample: NavSample) -> Quaternion | None:
     if sample.roll_rad is None or sample.pitch_rad is None or sample.heading_rad is None:
         return None
-    cr, sr = math.cos(sample.roll_rad / 2), math.sin(sample.roll_rad / 2)
-    cp, sp = math.cos(sample.pitch_rad / 2), math.sin(sample.pitch_rad / 2)
-    ch, sh = math.cos(sample.heading_rad / 2), math.sin(sample.heading_rad / 2)
-    return np.array(
-        [
-            cr * cp * ch + sr * sp * sh,
-            sr * cp * ch - cr * sp * sh,
-            cr * sp * ch + sr * cp * sh,
-            cr * cp * sh - sr * sp * ch,
-        ]
-    )
+    return quaternion_of(sample.roll_rad, sample.pitch_rad, sample.heading_rad)

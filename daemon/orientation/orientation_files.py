@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from daemon.configuration.model import MountSection
 from daemon.orientation.exterior_orientation import ExteriorOrientation, MissingOrientation
 from daemon.orientation.georeference import Georeference
-from processing.geometry.orientation import phi_omega_kappa
+from processing.geometry.rotation import phi_omega_kappa
 from processing.rig import VIRTUAL_CAMERA, Cone, Rig
 
 GON_PER_RAD = 200.0 / math.pi

@@ -21,9 +21,9 @@ from daemon.orientation.exterior_orientation import (
     orient,
     read_mount,
 )
-from daemon.orientation.georeference import Georeference, utm_of
+from daemon.orientation.geodesy import utm_of
+from daemon.orientation.georeference import Georeference
 from daemon.orientation.trajectory import Trajectory, flown_trajectory, read_trajectory
-from drivers.base.extras import require
 from processing.rig import Rig, load_rig
 
 
@@ -84,6 +84,8 @@ def read_orientation_inputs(
                 f"{trajectory.name}: no position in its first sample; give --crs"
             )
         crs = utm_of(*first)
+        if crs is None:
+            raise OrientationError(f"no UTM zone at {first[0]:.4f} deg latitude; give --crs")
     rig = load_rig(mission.rig_path)
     return OrientationInputs(rig, mount, plan.ground_height_m, trajectory, crs, Georeference(crs))
 
@@ -99,7 +101,6 @@ def trajectory_of(
     Raises:
         OrientationError: none of the exposures has a GPS time.
     """
-    require("geodesy")
     stamped = next((e.mark_gps_ns for e in exposures if e.mark_gps_ns is not None), None)
     if stamped is None:
         raise OrientationError(

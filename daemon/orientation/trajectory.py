@@ -22,7 +22,8 @@ from daemon.mission.foreign_files import ForeignFileError, read_regular_file
 from daemon.mission.layout import Mission
 from daemon.mission.log.flight_log import logs_of, read
 from daemon.mission.log.log_records import record_of
-from daemon.orientation.navigation import EXTRAPOLATION_LIMIT_NS, metres_per_degree, navigation_at
+from daemon.orientation.geodesy import metres_per_degree
+from daemon.orientation.navigation import EXTRAPOLATION_LIMIT_NS, navigation_at
 from drivers.contract import NavSample
 
 WEEK_NS = 604_800_000_000_000
@@ -101,7 +102,9 @@ def flown_trajectory(mission: Mission, receiver: str | None = None) -> Trajector
 
 
 def read_trajectory(path: Path, *, around_gps_ns: int) -> Trajectory:
-    """A post-processed trajectory: SBET, or CSV with a line of headings (docs/formats.md).
+    """A post-processed trajectory: SBET, or CSV with a line of headings.
+
+    Both are in docs/reference/formats.md.
 
     Args:
         around_gps_ns: any instant of the flight; it gives the week, which an SBET leaves out.

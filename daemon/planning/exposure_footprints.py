@@ -15,6 +15,8 @@ from daemon.orientation.footprints import footprint_corners
 from daemon.planning.image_counts import ExposureFootprint
 from daemon.planning.model import Point, Specification
 from processing.quality import valid_area
+from processing.quality.figures import QualityFigures
+from processing.quality.figures.circumstances import GeometryFigures
 from processing.quality.nominal_area import nominal_area
 from processing.quality.valid_area import ValidArea
 from processing.rig import Rig, load_rig
@@ -101,14 +103,14 @@ def _exclusion_reasons(
         why = dict.fromkeys(flag for flag in grave if flag != "OVERLAP")
         if why or not grave:
             yield f"refly ({', '.join(why) or 'quality'})"
-    figures = quality.get("figures", {})
+    figures = QualityFigures.from_json(quality.get("figures", {})).of(GeometryFigures)
     navigation = exposure.navigation
-    tilt_deg = figures.get("tilt_deg")
+    tilt_deg = figures.tilt_deg
     if tilt_deg is None and navigation is not None and navigation.roll_rad is not None:
         tilt_deg = math.degrees(math.hypot(navigation.roll_rad, navigation.pitch_rad or 0.0))
     if tilt_deg is not None and tilt_deg > specification.tilt_deg:
         yield f"tilted by {tilt_deg:.1f} deg"
-    crab_deg = figures.get("crab_deg")
+    crab_deg = figures.crab_deg
     if crab_deg is not None and abs(crab_deg) > specification.crab_deg:
         yield f"turned by {crab_deg:.1f} deg"
     sigma_ns = exposure.mark_sigma_ns

@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from daemon.orientation.navigation import metres_per_degree
+from daemon.orientation.geodesy import east_north_m, place_at
 
 
 class Point(NamedTuple):
@@ -85,20 +85,14 @@ class Plan:
 
 
 class LocalPlane:
-    """Metres east and north of an origin."""
+    """Metres east and north of an origin on the ellipsoid (`daemon.orientation.geodesy`)."""
 
     def __init__(self, origin: Point) -> None:
         self.origin = origin
-        self._north_m, self._east_m = metres_per_degree(origin.latitude_deg, 0.0)
+        self._origin = (origin.latitude_deg, origin.longitude_deg)
 
     def flat(self, point: Point) -> tuple[float, float]:
-        return (
-            (point.longitude_deg - self.origin.longitude_deg) * self._east_m,
-            (point.latitude_deg - self.origin.latitude_deg) * self._north_m,
-        )
+        return east_north_m(self._origin, (point.latitude_deg, point.longitude_deg))
 
     def place(self, east_m: float, north_m: float) -> Point:
-        return Point(
-            self.origin.latitude_deg + north_m / self._north_m,
-            self.origin.longitude_deg + east_m / self._east_m,
-        )
+        return Point(*place_at(self._origin, east_m, north_m))

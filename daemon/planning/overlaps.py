@@ -8,7 +8,7 @@ numbers only, so that the figures are the same whenever it is processed.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 
 from daemon.configuration.model import MountSection
 from daemon.mission.exposure import Exposure
+from daemon.mission.layout import Mission
+from daemon.orientation.exterior_orientation import mount_of, sealed_exposures
 from daemon.orientation.footprints import footprint_corners
 from daemon.planning.image_counts import Flags, gaps_of, image_shares, is_inside
 from daemon.planning.model import LocalPlane, Point
@@ -137,6 +139,24 @@ class Overlaps:
         rows = samples.mean(axis=1) @ this.ahead
         flown = (rows >= reaches.min()) & (rows <= reaches.max())
         return _share(this, samples[flown], images) if flown.mean() >= MIN_ROW_SHARE else None
+
+
+def overlaps_of(
+    mission: Mission, rig: Rig, exposures: Iterable[Exposure] | None = None
+) -> Overlaps:
+    """The footprints of what has been flown of a mission.
+
+    Args:
+        exposures: None takes all sealed records that can be read.
+    """
+    mount, plan = mount_of(mission)
+    overlaps = Overlaps(rig, mount, plan.ground_height_m)
+    if exposures is None:
+        # Verification names what cannot be read; no flight is given up for an overlap.
+        exposures = sealed_exposures(mission).results.values()
+    for exposure in exposures:
+        overlaps.add(exposure)
+    return overlaps
 
 
 def _samples(corners: Array) -> Array:

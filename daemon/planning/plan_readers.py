@@ -1,7 +1,7 @@
 """Plans of others: GeoJSON, KML, QGroundControl's .plan. Hostile input: limited in every way.
 
 GeoJSON is ours as well: every LineString is a line, its `id` and `strip` are properties, and a
-member `specification` of the collection contains the requirements (docs/plan.md).
+member `specification` of the collection contains the requirements (docs/how-to/flight/plan.md).
 """
 
 from __future__ import annotations

@@ -6,14 +6,13 @@ It draws what the records and quality reports say; nothing is computed here that
 from __future__ import annotations
 
 import base64
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
 import jinja2
 
-from daemon.configuration.model import ConfigurationError
 from daemon.errors import DaemonError
 from daemon.mission.exposure import Exposure, to_json
 from daemon.mission.exposure_batch import ExposureFailure, cause_of, for_each_exposure
@@ -24,13 +23,23 @@ from daemon.mission.store.level2 import read_report
 from daemon.planning.mission_coverage import coverage_of
 from daemon.postflight.displacements import flight_displacements, write_displacements
 from daemon.terminal.console import visible_value
-from processing.geometry.conditions import TIME_PARTS
-from processing.quality.band_levels import level_steps, levels_of
+from processing.quality.band_levels import level_steps
+from processing.quality.figures import QualityFigures
+from processing.quality.figures.circumstances import DcFigures
+from processing.quality.figures.image import BandLevelFigures
+from processing.quality.figures.stitching import (
+    AdjustmentFigures,
+    DisplacedSensorFigures,
+    DisplacementFigures,
+    DisplacementTestFigures,
+    MisreadProbeFigures,
+)
 from processing.rig import RigError
 
 REPORT_FILE = "report.html"
 T = TypeVar("T")
 
+_TIME_PARTS = ("receiver", "clock", "trigger", "delay", "head")
 _GLYPHS = {"good": "●", "usable": "▲", "refly": "■", "lost": "✕"}
 
 
@@ -77,18 +86,18 @@ def write_report(
         exposures=exposures,
         simulated=any(exposure["record"].get("simulated") for exposure in exposures),
         displaced=_displaced(exposures),
-        tested=len(_figure(exposures, "displacement_test")),
+        tested=len(_series(exposures, _displacement_test)),
         flight_sentences=[*displacements["sentences"], *_level_steps(exposures)],
         unreadable=failures,
         ledger=ledger,
         geometry=geometry,
         plots=[
             _plot("dC by cone, K", _temperature_series(exposures)),
-            _plot("sigma0, px", {"sigma0": _figure(exposures, "sigma0_px")}),
+            _plot("sigma0, px", {"sigma0": _series(exposures, _sigma0_px)}),
             _plot("Sigma of the exposure's time, ns", {"sigma": _time_sigma(exposures)}),
         ],
         glyphs=_GLYPHS,
-        time_parts=TIME_PARTS,
+        time_parts=_TIME_PARTS,
     )
     path = (out or mission / "export") / REPORT_FILE
     make_directories(path.parent)
@@ -100,7 +109,7 @@ def _coverage(mission: Path) -> dict[str, Any] | None:
     """Coverage of the plan; None without a plan, or one that cannot be used."""
     try:
         return coverage_of(Mission.open(mission))
-    except (OSError, DaemonError, ConfigurationError, RigError):
+    except (OSError, DaemonError, RigError):
         return None
 
 
@@ -120,12 +129,14 @@ def _exposure(mission: Mission, number: int) -> tuple[dict[str, Any], list[Expos
     record = to_json(Exposure(number) if sealed is None else sealed.exposure)
     state = "unknown" if sealed is None else sealed.exposure.state
     report = readable(lambda: read_report(level2), None) or {}
+    figures = QualityFigures.from_json(report.get("figures", {}))
     entry = {
         "number": number,
         "record": record,
         "report": report,
         "verdict": report.get("verdict", state),
-        "figures": report.get("figures", {}),
+        "figures": figures,
+        "shown": figures.as_json(),
         "findings": report.get("findings", []),
         "gps": _gps_text(record.get("mark_gps_ns")),
         "worst_time_sigma_ns": _worst_time_sigma(record),
@@ -156,28 +167,28 @@ def _worst_time_sigma(record: Mapping[str, Any]) -> int | None:
 
 def _displaced(exposures: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """The displaced sensor, its number of exposures, and its mean displacement."""
-    found: dict[str, list[Mapping[str, Any]]] = {}
-    for exposure in exposures:
-        name = exposure["figures"].get("displaced_sensor")
-        probe = exposure["figures"].get("misread_probe")
+    found: dict[str, list[DisplacementFigures]] = {}
+    for figures in (exposure["figures"] for exposure in exposures):
+        name = figures.of(DisplacedSensorFigures).displaced_sensor
+        probe = figures.of(MisreadProbeFigures).misread_probe
         if name and probe:
             name = f"{name}, or probe {probe} misreads"
         if name:
-            found.setdefault(name, []).append(exposure["figures"])
+            found.setdefault(name, []).append(figures.of(DisplacementFigures))
     return [
         {
             "sensor": name,
-            "count": len(figures),
-            "x_px": _mean(figures, "displacement_x_px"),
-            "y_px": _mean(figures, "displacement_y_px"),
+            "count": len(moved),
+            "x_px": _mean(one.displacement_x_px for one in moved),
+            "y_px": _mean(one.displacement_y_px for one in moved),
         }
-        for name, figures in found.items()
+        for name, moved in found.items()
     ]
 
 
-def _mean(figures: Sequence[Mapping[str, Any]], key: str) -> float | None:
-    values = [f[key] for f in figures if f.get(key) is not None]
-    return sum(values) / len(values) if values else None
+def _mean(values: Iterable[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return sum(known) / len(known) if known else None
 
 
 def _temperature_series(
@@ -185,24 +196,39 @@ def _temperature_series(
 ) -> dict[str, list[tuple[int, float]]]:
     series: dict[str, list[tuple[int, float]]] = {}
     for exposure in exposures:
-        for key, value in exposure["figures"].items():
-            if key.startswith("dc_k_") and value is not None:
-                series.setdefault(key.removeprefix("dc_k_"), []).append((exposure["number"], value))
-    return series or {"mean": _figure(exposures, "dc_k")}
+        for cone, dc_k in exposure["figures"].of(DcFigures).dc_k_by_cone.items():
+            if dc_k is not None:
+                series.setdefault(cone, []).append((exposure["number"], dc_k))
+    return series or {"mean": _series(exposures, lambda figures: figures.of(DcFigures).dc_k)}
 
 
 def _level_steps(exposures: Sequence[Mapping[str, Any]]) -> list[str]:
     """Bands whose level changed alone from one exposure to the next, one message each."""
-    levels = {exposure["number"]: levels_of(exposure["figures"]) for exposure in exposures}
+    levels = {
+        exposure["number"]: {
+            band: level
+            for band, level in exposure["figures"].of(BandLevelFigures).level_by_band.items()
+            if level is not None
+        }
+        for exposure in exposures
+    }
     return [step.sentence for step in level_steps(levels)]
 
 
-def _figure(exposures: Sequence[Mapping[str, Any]], key: str) -> list[tuple[int, float]]:
-    return [
-        (exposure["number"], exposure["figures"][key])
-        for exposure in exposures
-        if exposure["figures"].get(key) is not None
-    ]
+def _displacement_test(figures: QualityFigures) -> float | None:
+    return figures.of(DisplacementTestFigures).displacement_test
+
+
+def _sigma0_px(figures: QualityFigures) -> float | None:
+    return figures.of(AdjustmentFigures).sigma0_px
+
+
+def _series(
+    exposures: Sequence[Mapping[str, Any]], figure: Callable[[QualityFigures], float | None]
+) -> list[tuple[int, float]]:
+    """A figure by exposure number, where it is determined."""
+    values = ((exposure["number"], figure(exposure["figures"])) for exposure in exposures)
+    return [(number, value) for number, value in values if value is not None]
 
 
 def _time_sigma(exposures: Sequence[Mapping[str, Any]]) -> list[tuple[int, float]]:

@@ -20,7 +20,7 @@ from daemon.mission.store.level2 import pictures, simulated_mark
 from daemon.products.product_files import Contents, FramesRead, ProductFiles, report_json
 from processing.geometry.conditions import Conditions
 from processing.image.band_registration import RegisteredBand
-from processing.pipelines.bands import BandPipeline, FrameSettings
+from processing.pipelines.bands import BandPipeline
 from processing.radiometry.calibration import CalibrationError
 from processing.radiometry.radiance import RadianceCalibration, load_radiance
 from processing.rig import Rig
@@ -65,8 +65,7 @@ def build_bands(
     Args:
         radiance: by sensor name, those the pipeline has: wavelengths go into the files.
     """
-    settings = {frame.sensor: _frame_settings(frame.settings) for frame in exposure.frames}
-    product = pipeline.process(frames, conditions, settings, frames_read=frames_read)
+    product = pipeline.process(frames, conditions, frames_read=frames_read)
     report = report_json(product.report, exposure.number, product.timings_s, product.valid_area)
     report["reference"] = product.reference
     report["units"] = dict(product.units)
@@ -110,14 +109,6 @@ def _registration(band: RegisteredBand) -> dict[str, Any]:
         "shift_px": list(band.shift_px),
         "band_from_reference": band.band_from_reference.tolist(),
     }
-
-
-def _frame_settings(settings: Mapping[str, float | int | str]) -> FrameSettings:
-    gain, black = settings.get("Gain", 1.0), settings.get("BlackLevel")
-    return FrameSettings(
-        gain=float(gain) if isinstance(gain, float | int) else 1.0,
-        black=float(black) if isinstance(black, float | int) else None,
-    )
 
 
 def _tiff(raster: NDArray[Any], about: Mapping[str, Any]) -> bytes:

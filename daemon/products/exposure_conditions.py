@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime
 import math
 import statistics
+from collections.abc import Mapping
 
 from daemon.configuration.model import PlanSection
 from daemon.mission.exposure import Exposure
@@ -12,9 +13,8 @@ from daemon.mission.store.frame_checks import tdi_shifts
 from daemon.orientation.ground_model import GroundModel
 from daemon.planning.overlaps import OverlapShares
 from drivers.timescales.leap_seconds import leap_seconds_at
-from processing.geometry.conditions import by_sensor_name
+from processing.geometry.conditions import Conditions, FrameSettings, by_sensor_name
 from processing.geometry.sun import sun_elevation_rad
-from processing.pipelines.stitched import Conditions
 from processing.quality.report import Flag
 from processing.rig import Rig
 
@@ -33,7 +33,7 @@ def conditions_of(
 ) -> Conditions:
     """The conditions of an exposure; what the record does not know comes from the plan.
 
-    `flags` are added to those the record holds; `surroundings` are its overlaps, where known, and
+    `flags` are added to those the record holds; `overlap_shares` are its overlaps, where known, and
     `ground` is the height model under it.
 
     Raises:
@@ -64,6 +64,7 @@ def conditions_of(
             if frame.exposure_time_us is not None
         },
         tdi_shifts=_tdi_shifts(exposure, rig),
+        frame_settings={f.sensor: _frame_settings(f.settings) for f in exposure.frames},
         ground_speed_mps=speed_mps,
         height_above_ground_m=height_m,
         roll_rad=navigation.roll_rad if navigation else None,
@@ -88,6 +89,14 @@ def _tdi_shifts(exposure: Exposure, rig: Rig) -> dict[str, int]:
             usual = statistics.median_low(of_cone.values())
             found |= {sensor.name: usual for sensor in cone.sensors if sensor.name not in of_cone}
     return found
+
+
+def _frame_settings(settings: Mapping[str, float | int | str]) -> FrameSettings:
+    gain, black = settings.get("Gain", 1.0), settings.get("BlackLevel")
+    return FrameSettings(
+        gain=float(gain) if isinstance(gain, float | int) else 1.0,
+        black=float(black) if isinstance(black, float | int) else None,
+    )
 
 
 def capture_flags(exposure: Exposure, rig: Rig) -> Flag:

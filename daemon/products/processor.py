@@ -9,56 +9,40 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.configuration.model import MountSection, PlanSection, ProcessingSection
-from daemon.mission.canonical_json import canonical_bytes
+from daemon.configuration.model import ProcessingSection
 from daemon.mission.exposure import Exposure
 from daemon.mission.layout import Mission
 from daemon.mission.store.radiometry_folder import RadiometryFolder
-from daemon.orientation.in_flight_orientation import orientation_json
 from daemon.planning.plan_readers import read_plan
 from daemon.products.band_images import build_bands, radiance_folder, radiance_of
 from daemon.products.head_images import build_heads
 from daemon.products.product_files import FramesRead, ProductFiles
 from daemon.products.stitched_image import build_stitched
-from processing.pipelines.bands import BandPipeline
-from processing.pipelines.perspective import HeadPipeline, has_diverging_axes
+from processing.pipelines.bands import BAND_THRESHOLDS, BandPipeline, BandPipelineSettings
+from processing.pipelines.exposure_pipeline import ExposurePipeline
+from processing.pipelines.perspective import HeadPipeline, HeadSettings, has_diverging_axes
 from processing.pipelines.stitched import Conditions, Pipeline, PipelineSettings
 from processing.quality.report import Thresholds
 from processing.quality.requirements import QualityRequirements
-from processing.radiometry.histogram import sampled_histogram
-from processing.rig import Rig, Sensor
+from processing.rig import Rig
 
 Frames: TypeAlias = Mapping[str, NDArray[np.uint16]]
-
-
-class AnyPipeline(Protocol):
-    """Interface common to the pipelines of all kinds of rig."""
-
-    @property
-    def rig(self) -> Rig:
-        """The camera."""
-
-    def warm_up(self) -> None:
-        """Compile, or load, every kernel a flight will need."""
-
-    def clone(self) -> AnyPipeline:
-        """A second one for another exposure at the same time; calibrations are shared."""
 
 
 @dataclass(frozen=True)
 class Processor:
     """Frames of one exposure in, the files of its Level-2 folder out; one exposure at a time.
 
-    `made` gets the pipeline, the exposure, frames, conditions and a callback for when the frames
+    `build` gets the pipeline, the exposure, frames, conditions and a callback for when the frames
     are read. Pixels in what comes back may be buffers that hold until the next exposure.
     """
 
-    pipeline: AnyPipeline
+    pipeline: ExposurePipeline[Any, Any, Any, Any, Any]
     build: Callable[[Any, Exposure, Frames, Conditions, FramesRead], ProductFiles]
 
     @property
@@ -117,76 +101,28 @@ def build_processor(
         CalibrationError, ValueError: a calibration that does not fit, or a rig of no known kind.
         PlanError: a plan that cannot be read.
     """
-    requirements = quality_requirements_of(plan_file)
-    threads = processing.threads
     given: dict[str, Any] = processing.thresholds
-    thresholds = replace(Thresholds(), **given)
+    common: dict[str, Any] = {
+        "threads": processing.threads,
+        "thresholds": replace(Thresholds(), **given),
+        "requirements": quality_requirements_of(plan_file),
+    }
     if rig.virtual_image is None and not has_diverging_axes(rig):
         radiance = radiance_of(rig, radiometry or own_radiance)
-        pipeline = BandPipeline(rig, radiance, threads=threads, requirements=requirements)
-        pipeline.thresholds = replace(pipeline.thresholds, **given)
+        common["thresholds"] = replace(BAND_THRESHOLDS, **given)
+        pipeline = BandPipeline(rig, radiance, BandPipelineSettings(**common))
         return Processor(pipeline, partial(build_bands, radiance))
     known = None if radiometry is None else RadiometryFolder(radiometry, rig)
+    common["interpolation"] = processing.interpolation
     if rig.virtual_image is None:
-        return Processor(
-            HeadPipeline(
-                rig,
-                known,
-                interpolation=processing.interpolation,
-                threads=threads,
-                thresholds=thresholds,
-                requirements=requirements,
-            ),
-            build_heads,
-        )
-    return Processor(
-        Pipeline(
-            rig,
-            known,
-            PipelineSettings(
-                method=processing.method,
-                interpolation=processing.interpolation,
-                baselines=processing.baselines,
-                geometry=processing.geometry,
-                threads=threads,
-                thresholds=thresholds,
-                requirements=requirements,
-            ),
-        ),
-        build_stitched,
+        return Processor(HeadPipeline(rig, known, HeadSettings(**common)), build_heads)
+    settings = PipelineSettings(
+        method=processing.method,
+        baselines=processing.baselines,
+        geometry=processing.geometry,
+        **common,
     )
-
-
-def make_products(
-    processor: Processor,
-    mount: MountSection,
-    plan: PlanSection,
-    exposure: Exposure,
-    frames: Mapping[str, NDArray[np.uint16]],
-    conditions: Conditions,
-    *,
-    frames_read: Callable[[], None] | None = None,
-) -> ProductFiles:
-    """All Level-2 files of one exposure: its images, and the files common to every rig.
-
-    Returns:
-        The content of quality.json, and the parts of every file by its name. Pixels among them
-        hold until the processor's next exposure.
-    """
-    histograms = histograms_of(processor.rig, frames)  # before the frames are let go
-    report, contents = processor.make(exposure, frames, conditions, frames_read=frames_read)
-    orientation = orientation_json(exposure, processor.rig, mount, plan.ground_height_m)
-    contents["histogram.json"] = [canonical_bytes({k: list(v) for k, v in histograms.items()})]
-    contents["orientation.json"] = [canonical_bytes(orientation)]
-    return report, contents
-
-
-def histograms_of(rig: Rig, frames: Mapping[str, NDArray[np.uint16]]) -> dict[str, tuple[int, ...]]:
-    """Counts of raw DN by sensor."""
-    return {
-        name: sampled_histogram(frame, _word_bits(rig.sensor(name)))
-        for name, frame in frames.items()
-    }
+    return Processor(Pipeline(rig, known, settings), build_stitched)
 
 
 def quality_requirements_of(plan_file: Path | None) -> QualityRequirements:
@@ -203,7 +139,3 @@ def quality_requirements_of(plan_file: Path | None) -> QualityRequirements:
         sun_deg=wanted.sun_deg,
         time_sigma_ns=wanted.time_sigma_ns,
     )
-
-
-def _word_bits(sensor: Sensor) -> int:
-    return 16 if sensor.justified == "left" else sensor.bits

@@ -31,7 +31,7 @@ EXTRAS: Final[Mapping[str, OptionalDependency]] = {
         "gir1.2-aravis-0.8 libgirepository1.0-dev",
     ),
     "geotiff": OptionalDependency("GeoTIFF files need rasterio", ("rasterio",)),
-    "geodesy": OptionalDependency("coordinate systems need pyproj", ("pyproj",)),
+    "plots": OptionalDependency("plots of reports need matplotlib", ("matplotlib",)),
     "mavlink": OptionalDependency("MAVLink needs pymavlink", ("pymavlink",)),
     "watch": OptionalDependency(
         "the page, the API and telemetry need the packages of [watch]",

@@ -34,9 +34,9 @@ class SettingsError(DeviceError):
 class Setting(Generic[T]):
     """One setting of a driver class; on an instance, the attribute is the configured value.
 
-    The type follows from the default: bool, int, float (an integer is accepted), str, or a tuple
-    of str. `required` settings must be given; their default only defines the type. `minimum` and
-    `maximum` are inclusive. For a tuple, they limit its length.
+    The type follows from the default: bool, int, float (an integer is accepted), str, a tuple of
+    str, or a dict of names and plain values. `required` settings must be given; their default only
+    defines the type. `minimum` and `maximum` are inclusive. For a tuple, they limit its length.
 
     Example:
         >>> class Lamp(Configured):
@@ -216,6 +216,18 @@ def _str(value: object) -> str:
     return value
 
 
+def _table(value: object) -> dict[str, bool | int | float | str]:
+    """A table of names and plain values, in its order."""
+    if not isinstance(value, Mapping):
+        raise TypeError
+    found: dict[str, bool | int | float | str] = {}
+    for name, item in value.items():
+        if not isinstance(name, str) or not name or not isinstance(item, bool | int | float | str):
+            raise TypeError
+        found[name] = item
+    return found
+
+
 def _names(value: object) -> tuple[str, ...]:
     if not isinstance(value, list | tuple):
         raise TypeError
@@ -230,4 +242,5 @@ _TYPES: Final[Mapping[type, tuple[str, Callable[[object], Any]]]] = {
     float: ("a finite number", _float),
     str: ("a text", _str),
     tuple: ("a list of names", _names),
+    dict: ("a table of names and values", _table),
 }

@@ -124,7 +124,7 @@ class ProtocolDetector:
             return None
         received = f"lines such as {lines.example!r}"
         if lines.pattern is None:
-            missing = "a pattern: the lines differ, see docs/drivers/ascii-line.md"
+            missing = "a pattern: the lines differ, see docs/reference/drivers/ascii-line.md"
             return DetectedDevice("thermometer", "ascii-line", "lines of text", received, missing)
         channels = [str(number) for number in range(lines.readings)]
         settings = {"pattern": lines.pattern, "channels": channels}

@@ -29,6 +29,7 @@ from drivers.contract import (
     Sink,
     TemperatureSample,
 )
+from drivers.errors import DriverError
 from drivers.timescales.clock import Clock
 from drivers.transport.port_users import (
     holders,
@@ -72,7 +73,7 @@ class SerialPort(Protocol):
     def close(self) -> None: ...
 
 
-class LineLostError(Exception):
+class LineLostError(DriverError):
     """The open port was lost; internal to the serial drivers."""
 
 

@@ -1,6 +1,6 @@
 """The client of a pulse bus: a trigger unit behind a TCP port.
 
-The protocol is in docs/pulse-bus.md.
+The protocol is in docs/reference/flight/pulse-bus.md.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class PulseBusTrigger(Configured):
     A pulse without an answer is not fired again, since the heads may have been triggered. The
     connection is closed. The next call reconnects with the delays of the last `program`.
 
-    Source: docs/pulse-bus.md.
+    Source: docs/reference/flight/pulse-bus.md.
     """
 
     kind: ClassVar = "trigger"

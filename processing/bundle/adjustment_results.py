@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from processing.bundle.adjust import Adjustment
 from processing.bundle.network import INTERIOR
-from processing.bundle.rotations import angles_by_rotation_vector, omega_phi_kappa
 from processing.bundle.terms import UNITS
+from processing.geometry.rotation import angles_by_rotation_vector, omega_phi_kappa
 
 Array = NDArray[np.float64]
 
@@ -127,7 +127,7 @@ def exposures_of(result: Adjustment) -> tuple[AdjustedOrientation, ...]:
     images, layout = result.network.images, result.layout
     found = []
     angles = omega_phi_kappa(result.state.attitude)
-    by_vector = angles_by_rotation_vector(result.state.attitude)
+    by_vector = angles_by_rotation_vector("XYZ", result.state.attitude)
     for k, name in enumerate(images.names):
         s, a = images.station[k], images.attitude[k]
         found.append(
@@ -145,7 +145,7 @@ def exposures_of(result: Adjustment) -> tuple[AdjustedOrientation, ...]:
 def heads_of(result: Adjustment) -> tuple[AdjustedOrientation, ...]:
     """Relative orientation of every head."""
     angles = omega_phi_kappa(result.state.head_rotation)
-    by_vector = angles_by_rotation_vector(result.state.head_rotation)
+    by_vector = angles_by_rotation_vector("XYZ", result.state.head_rotation)
     return tuple(
         AdjustedOrientation(
             head.name,

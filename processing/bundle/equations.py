@@ -20,14 +20,15 @@ from processing.bundle.camera_model import (
 )
 from processing.bundle.curvature_refraction import corrected_rays
 from processing.bundle.network import INTERIOR, Network
-from processing.bundle.rotations import skew, vectors_from_rotations
 from processing.bundle.unknowns import ParameterLayout, ParameterValues
+from processing.errors import ProcessingError
+from processing.geometry.rotation import skew, vectors_from_rotations
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 
-class BehindCameraError(ValueError):
+class BehindCameraError(ProcessingError, ValueError):
     """Object points are behind the camera that saw them: starting values are far off."""
 
     def __init__(self, image_points: Indices) -> None:

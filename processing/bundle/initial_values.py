@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from processing.bundle.camera_model import ideal_mm, principal_distance_mm
 from processing.bundle.network import Network, NetworkError
+from processing.geometry.rotation import rotations_from_vectors
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -42,9 +43,9 @@ def resect(xy_mm: Array, xyz_m: Array, f_mm: float) -> tuple[Array, Array]:
     )
     if not found:
         raise ValueError("no resection: are the known points in one line?")
-    camera_from_object = np.diag([1.0, -1.0, -1.0]) @ cv2.Rodrigues(rotation)[0]
-    station = centre - cv2.Rodrigues(rotation)[0].T @ shift.ravel()
-    return np.asarray(station), np.asarray(camera_from_object.T)
+    object_from_vision = rotations_from_vectors(rotation.ravel()).T
+    station = centre - object_from_vision @ shift.ravel()
+    return np.asarray(station), np.asarray(object_from_vision @ np.diag([1.0, -1.0, -1.0]))
 
 
 def intersect(

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from processing.bundle.curvature_refraction import RayModel
 from processing.bundle.terms import Term
+from processing.errors import ProcessingError
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -30,7 +31,7 @@ INTERIOR: Final = ("dx0", "dy0", "df", "k1", "k2", "k3", "p1", "p2", "b1", "b2")
 Model = Literal["australis", "centred"]
 
 
-class NetworkError(ValueError):
+class NetworkError(ProcessingError, ValueError):
     """A network that cannot be adjusted as given; `problems` has a sentence for each error."""
 
     def __init__(self, problems: Sequence[str]) -> None:

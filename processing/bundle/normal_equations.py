@@ -16,6 +16,7 @@ from scipy import linalg, sparse
 
 from processing.bundle.equations import Equations
 from processing.bundle.unknowns import ParameterLayout
+from processing.errors import ProcessingError
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -29,7 +30,7 @@ MIN_INFORMATION = 1e-11
 leaves 1e-14."""
 
 
-class SingularError(ValueError):
+class SingularError(ProcessingError, ValueError):
     """The reduced matrix has directions without information; `reduced` is for the diagnosis."""
 
     def __init__(self, reduced: ReducedEquations) -> None:

@@ -18,6 +18,7 @@ from scipy import linalg
 from processing.bundle.network import Network
 from processing.bundle.normal_equations import MIN_INFORMATION, ReducedEquations, constrained_matrix
 from processing.bundle.unknowns import ParameterLayout, ParameterValues, Unknown
+from processing.errors import ProcessingError
 
 Array = NDArray[np.float64]
 
@@ -46,7 +47,7 @@ class RankDefect:
     shares: tuple[tuple[str, float], ...]
 
 
-class RankDefectError(ValueError):
+class RankDefectError(ProcessingError, ValueError):
     """A network with undetermined unknowns."""
 
     def __init__(self, found: Sequence[RankDefect]) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.bundle.network import INTERIOR, LinearConstraint, Network, NetworkError
-from processing.bundle.rotations import rotations_from_vectors
+from processing.geometry.rotation import rotations_from_vectors
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]

@@ -3,7 +3,7 @@
 Least squares of all exposures at once, with the whole covariance of the adjusted orientations. Parameters
 that the flight cannot separate keep their given values and are named, with a remedy.
 
-Source: docs/mathematics/boresight.md#model; Jacobsen (2008), boresite calibration.
+Source: docs/explanation/mathematics/boresight.md#model; Jacobsen (2008), boresite calibration.
 """
 
 from __future__ import annotations
@@ -16,8 +16,14 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.bundle.rotations import rotations_from_vectors, skew, vectors_from_rotations
-from processing.geometry.orientation import BODY_FROM_CAMERA, level_from_body
+from processing.geometry.orientation import BODY_FROM_CAMERA
+from processing.geometry.rotation import (
+    angles_by_rotation_vector,
+    level_from_body,
+    rotations_from_vectors,
+    skew,
+    vectors_from_rotations,
+)
 
 Array = NDArray[np.float64]
 
@@ -205,36 +211,9 @@ def calibrate_boresight(
     )
 
 
-def roll_pitch_heading(imu_from_body: Array) -> Array:
-    """Angles (3,), rad, of Rz(heading) Ry(pitch) Rx(roll): the inverse of `level_from_body`."""
-    r = imu_from_body
-    return np.array(
-        [
-            math.atan2(r[2, 1], r[2, 2]),
-            -math.asin(max(-1.0, min(1.0, float(r[2, 0])))),
-            math.atan2(r[1, 0], r[0, 0]),
-        ]
-    )
-
-
 def angle_covariance(found: BoresightCalibration) -> Array:
     """Covariance (3, 3), rad squared, of roll, pitch and heading of the boresight."""
-    step = 1e-6
-    here = roll_pitch_heading(found.mounting.imu_from_body)
-    by = np.stack(
-        [
-            (
-                roll_pitch_heading(
-                    found.mounting.imu_from_body
-                    @ rotations_from_vectors(step * np.eye(3)[k : k + 1])[0]
-                )
-                - here
-            )
-            / step
-            for k in range(3)
-        ],
-        axis=1,
-    )
+    by = angles_by_rotation_vector("ZYX", found.mounting.imu_from_body)[::-1]
     return np.asarray(by @ found.covariance[:3, :3] @ by.T)
 
 
@@ -276,13 +255,13 @@ def _mean_boresight(image_orientations: ImageOrientations, inertial: InertialOri
     mean = relative[0]
     for _ in range(5):
         off = vectors_from_rotations(np.einsum("ji,njk->nik", mean, relative))
-        mean = mean @ rotations_from_vectors(off.mean(axis=0)[None])[0]
+        mean = mean @ rotations_from_vectors(off.mean(axis=0))
     return np.asarray(mean)
 
 
 def _with_step(at: ImuMounting, step: Array) -> ImuMounting:
     return ImuMounting(
-        at.imu_from_body @ rotations_from_vectors(step[None, :3])[0],
+        at.imu_from_body @ rotations_from_vectors(step[:3]),
         at.antenna_m + step[3:6],
         at.time_offset_s + float(step[6]),
         at.shift_m + step[7:],

@@ -7,8 +7,8 @@ about the axes of the virtual image.
 A cone off the flight axis has another perspective centre than the master cone. The apparent
 rotation this causes is removed with the height above ground.
 
-Source: docs/mathematics/virtual-camera.md#platform-calibration-from-a-flight; Heier et al. (2002),
-6.1; Ladstädter et al. (2010), "platform calibration".
+Source: docs/explanation/mathematics/virtual-camera.md#platform-calibration-from-a-flight; Heier et
+al. (2002), 6.1; Ladstädter et al. (2010), "platform calibration".
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from processing.bundle.rotations import angles_by_rotation_vector, omega_phi_kappa
+from processing.geometry.rotation import angles_by_rotation_vector, omega_phi_kappa
 from processing.mosaic.mounting import place_covariance, rotated_mounting
 from processing.mosaic.stitch_record import ROTATIONS, StitchRecord
 from processing.rig import Cone, Rig
@@ -38,9 +38,10 @@ COLOUR_SHIFT_PX: Final = 0.002
 COLOUR_ROTATION_PX: Final = 0.001
 """Systematic error of matching PAN to the colour master, colour pixels: of shift, and of rotation
 at the corners. Measured on rendered flights
-(docs/calibration.md)."""
+(docs/how-to/processing/calibration.md)."""
 REGISTERED_PX: Final = 0.02
-"""The same of a band registered to the colour master, shift and turn (docs/dmc.md)."""
+"""The same of a band registered to the colour master, shift and turn
+(docs/explanation/cameras/dmc.md)."""
 HEIGHT_SIGMA: Final = 0.02
 """Sigma of the mean height above ground: relief, and the error of the plan."""
 _OUTLIER_LIMIT: Final = 5.0
@@ -210,14 +211,14 @@ def _calibrated(
     of_mean = own * np.outer(scale, scale) / n
     rotation = rotated_mounting(cone, mean)
     # A turn w before the rotation is one of R'w behind it.
-    jacobian = angles_by_rotation_vector(rotation[None])[0] @ rotation.T
+    jacobian = angles_by_rotation_vector("XYZ", rotation) @ rotation.T
     total = of_mean + _common_covariance(rig, cone, [records[k] for k in used])
     return CalibratedConeMounting(
         cone=cone.name,
         correction_rad=mean,
         correction_sigma_rad=np.sqrt(np.diag(of_mean)),
         scatter_rad=np.sqrt(np.diag(seen)),
-        angles_rad=omega_phi_kappa(rotation[None])[0],
+        angles_rad=omega_phi_kappa(rotation),
         angles_sigma_rad=np.sqrt(np.diag(jacobian @ total @ jacobian.T)),
         covariance=total,
         corrections=corrections,

@@ -3,7 +3,8 @@
 Every image's rotation is taken relative to the reference image of the same exposure, and averaged
 over the block with the full covariance of the adjustment.
 
-Source: docs/mathematics/boresight.md#relative-orientation-of-heads; Jacobsen (2008), table 2.
+Source: docs/explanation/mathematics/boresight.md#relative-orientation-of-heads; Jacobsen (2008),
+table 2.
 """
 
 from __future__ import annotations
@@ -16,8 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.bundle.adjust import Adjustment
-from processing.bundle.rotations import rotations_from_vectors, vectors_from_rotations
-from processing.geometry.orientation import phi_omega_kappa
+from processing.geometry.rotation import (
+    angles_by_rotation_vector,
+    phi_omega_kappa,
+    rotations_from_vectors,
+    vectors_from_rotations,
+)
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -70,9 +75,9 @@ class RelativeOrientations:
     def angles(self, head: int) -> tuple[Array, Array]:
         """phi, omega, kappa (3,) of R = Ry Rx Rz and their standard deviations (3,), rad."""
         rotation = self.heads[head].rotation
-        by = _angles_by_vector(rotation)
+        by = angles_by_rotation_vector("YXZ", rotation)
         own = self.covariance[3 * head : 3 * head + 3, 3 * head : 3 * head + 3]
-        return np.array(phi_omega_kappa(rotation)), np.sqrt(np.diag(by @ own @ by.T))
+        return phi_omega_kappa(rotation), np.sqrt(np.diag(by @ own @ by.T))
 
 
 def relative_orientations(
@@ -235,18 +240,3 @@ def _of_parameters(result: Adjustment, reference: str) -> RelativeOrientations:
         squares=math.nan,
         redundancy=0,
     )
-
-
-def _angles_by_vector(rotation: Array) -> Array:
-    """d(phi, omega, kappa) / d(rotation vector about the head's axes), (3, 3), by differences."""
-    step = 1e-6
-    columns = []
-    for axis in range(3):
-        rotation_change = rotations_from_vectors(step * np.eye(3)[axis : axis + 1])[0]
-        ahead, behind = (
-            phi_omega_kappa(rotation @ rotation_change),
-            phi_omega_kappa(rotation @ rotation_change.T),
-        )
-        difference = np.array(ahead) - np.array(behind)
-        columns.append((difference + math.pi) % (2 * math.pi) - math.pi)
-    return np.stack(columns, axis=1) / (2 * step)

@@ -3,7 +3,7 @@
 Each exposure's stitching adds to normal equations. The result is a proposal that a person accepts;
 it never changes a product automatically.
 
-Source: docs/mathematics/drift.md#learning and #what-is-observable.
+Source: docs/explanation/mathematics/drift.md#learning and #what-is-observable.
 """
 
 from __future__ import annotations

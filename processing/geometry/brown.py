@@ -3,7 +3,8 @@
 Makers of small cameras state measured = f(ideal); a rig file holds ideal = measured + delta. The
 correction is fitted once; the fit returns its largest error.
 
-Source: docs/mathematics/lens.md#from-browns-model; Brown (1971); Heier et al. (2002), eq. 5.1.
+Source: docs/explanation/mathematics/lens.md#from-browns-model; Brown (1971); Heier et al. (2002),
+eq. 5.1.
 """
 
 from __future__ import annotations

@@ -16,8 +16,18 @@ import numpy as np
 
 from processing.geometry.drift import lagged_probe, lagged_sensors
 from processing.geometry.rotation import rotation_matrix
+from processing.quality.figures import FigureGroup
+from processing.quality.figures.circumstances import (
+    DcFigures,
+    ExposureScaleFigures,
+    GeometryFigures,
+    SmearFigures,
+    TimeFigures,
+    UnknownExposureFigures,
+    WorstHeadFigures,
+)
 from processing.quality.probe_health import bridge_by_others
-from processing.quality.report import NO_FLAGS, Figure, Flag, Thresholds
+from processing.quality.report import NO_FLAGS, Flag, Thresholds
 from processing.rig import Cone, Rig
 
 T = TypeVar("T")
@@ -26,14 +36,21 @@ EXPOSURE_TIME_TOLERANCE = 0.02
 """Exposure times of cones that differ by less are those of one setting."""
 MAX_EXPOSURE_SCALE = 2.05
 
-TIME_PARTS = ("receiver", "clock", "trigger", "delay", "head")
+
+@dataclass(frozen=True)
+class FrameSettings:
+    """Values a head reports with its frame: gain, and the black level in words where known."""
+
+    gain: float = 1.0
+    black: float | None = None
 
 
 @dataclass(frozen=True)
 class Conditions:
     """The conditions of one exposure; None or an absent key is "not known".
 
-    Temperatures are by probe; exposure times and TDI counts are those of each frame, by sensor.
+    Temperatures are by probe; exposure times, TDI counts and settings are those of each frame, by
+    sensor.
     Angles and rates are of the body (x forward, y right, z down); `crab_rad` is the angle from the
     track to the body's x axis. `time_budget_ns` are the parts of `time_sigma_ns`: receiver, clock,
     trigger, delay, head. Overlaps are with the image before it on the line and with the
@@ -44,6 +61,7 @@ class Conditions:
     temperature_age_s: Mapping[str, float] = field(default_factory=dict)
     exposure_time_s: Mapping[str, float] = field(default_factory=dict)
     tdi_shifts: Mapping[str, int] = field(default_factory=dict)
+    frame_settings: Mapping[str, FrameSettings] = field(default_factory=dict)
     ground_speed_mps: float | None = None
     height_above_ground_m: float | None = None
     roll_rad: float | None = None
@@ -164,18 +182,17 @@ def exposure_scales(rig: Rig, exposure_time_s: Mapping[str, float]) -> dict[str,
     return {name: reference / exposure_time_s[name] for name, reference in references.items()}
 
 
-def exposure_scale_figures(scales: Mapping[str, float]) -> dict[str, Figure]:
+def exposure_scale_figures(scales: Mapping[str, float]) -> ExposureScaleFigures:
     """The frame whose level was corrected most, and by what factor."""
     name = max(scales, key=lambda n: abs(math.log(scales[n])), default=None)
-    return {
-        "exposure_scaled_sensor": None if name is None or scales[name] == 1.0 else name,
-        "exposure_scale": None if name is None else scales[name],
-    }
+    if name is None:
+        return ExposureScaleFigures()
+    return ExposureScaleFigures(None if scales[name] == 1.0 else name, scales[name])
 
 
 def unknown_exposure_figures(
     rig: Rig, present: Collection[str], exposure_time_s: Mapping[str, float]
-) -> dict[str, Figure]:
+) -> UnknownExposureFigures:
     """Colour frames whose exposure time is not known while that of other frames is.
 
     Overlaps show the level of a PAN head; nothing in one exposure shows that of a colour head.
@@ -185,43 +202,48 @@ def unknown_exposure_figures(
         exposure_time_s: by sensor name, what the record states.
     """
     if not any(name in exposure_time_s for name in present):
-        return {"exposure_unknown_sensors": None}
+        return UnknownExposureFigures()
     colour = [s.name for cone in rig.colour_cones for s in cone.sensors if s.name in present]
-    unknown = [name for name in colour if name not in exposure_time_s]
-    return {"exposure_unknown_sensors": ", ".join(unknown) or None}
+    return UnknownExposureFigures(tuple(n for n in colour if n not in exposure_time_s))
 
 
 def condition_figures(
     rig: Rig, conditions: Conditions, temperatures: UsableTemperatures
-) -> dict[str, Figure]:
-    """Figures that need no pixels, by the names of `processing.quality.report.FIGURES`."""
-    figures: dict[str, Figure] = {"gsd_m": ground_sampling_distance_m(rig, conditions)}
-    figures |= _dc(rig, temperatures)
-    figures |= _smears(rig, conditions)
+) -> tuple[FigureGroup, ...]:
+    """Figures that need no pixels."""
+    gsd_m = ground_sampling_distance_m(rig, conditions)
     ages = [conditions.temperature_age_s.get(probe) for probe in temperatures.usable_c]
-    figures["temperature_age_s"] = max((age for age in ages if age is not None), default=None)
-    figures |= _time(conditions, figures["gsd_m"])
     tilts = [abs(a) for a in (conditions.roll_rad, conditions.pitch_rad) if a is not None]
-    figures["tilt_deg"] = math.degrees(max(tilts)) if tilts else None
-    crab = conditions.crab_rad
-    figures["crab_deg"] = None if crab is None else abs(math.degrees(crab))
-    figures["forward_overlap"] = conditions.forward_overlap
-    figures["sidelap"] = conditions.sidelap
-    sun = conditions.sun_elevation_rad
-    figures["sun_deg"] = None if sun is None else math.degrees(sun)
+    crab, sun = conditions.crab_rad, conditions.sun_elevation_rad
     shifts = by_sensor_name(rig.cone(rig.reference_cone), conditions.tdi_shifts)
-    figures["tdi_shifts"] = max(shifts.values(), default=None)
-    return figures
+    geometry = GeometryFigures(
+        gsd_m=gsd_m,
+        tilt_deg=math.degrees(max(tilts)) if tilts else None,
+        crab_deg=None if crab is None else abs(math.degrees(crab)),
+        forward_overlap=conditions.forward_overlap,
+        sidelap=conditions.sidelap,
+        sun_deg=None if sun is None else math.degrees(sun),
+        tdi_shifts=max(shifts.values(), default=None),
+        temperature_age_s=max((age for age in ages if age is not None), default=None),
+    )
+    return geometry, _dc(rig, temperatures), _time(conditions, gsd_m), *_smears(rig, conditions)
 
 
-def _time(conditions: Conditions, gsd_m: Figure) -> dict[str, Figure]:
+def _time(conditions: Conditions, gsd_m: float | None) -> TimeFigures:
     sigma_ns, speed_mps = conditions.time_sigma_ns, conditions.ground_speed_mps
-    figures: dict[str, Figure] = {"time_sigma_ns": sigma_ns, "time_error_px": None}
-    if sigma_ns is not None and speed_mps is not None and isinstance(gsd_m, float):
-        figures["time_error_px"] = speed_mps * sigma_ns * 1e-9 / gsd_m
-    for part in TIME_PARTS:
-        figures[f"time_sigma_{part}_ns"] = conditions.time_budget_ns.get(part)
-    return figures
+    error_px = None
+    if sigma_ns is not None and speed_mps is not None and gsd_m is not None:
+        error_px = speed_mps * sigma_ns * 1e-9 / gsd_m
+    budget_ns = conditions.time_budget_ns
+    return TimeFigures(
+        time_sigma_ns=sigma_ns,
+        time_error_px=error_px,
+        time_sigma_receiver_ns=budget_ns.get("receiver"),
+        time_sigma_clock_ns=budget_ns.get("clock"),
+        time_sigma_trigger_ns=budget_ns.get("trigger"),
+        time_sigma_delay_ns=budget_ns.get("delay"),
+        time_sigma_head_ns=budget_ns.get("head"),
+    )
 
 
 def ground_sampling_distance_m(rig: Rig, conditions: Conditions) -> float | None:
@@ -254,35 +276,33 @@ def parallax_px(rig: Rig, conditions: Conditions, relief_fraction: float) -> flo
     return base_mm * image.f_mm * relief_fraction / (height * 1e3) / image.pitch_mm
 
 
-def _dc(rig: Rig, temperatures: UsableTemperatures) -> dict[str, Figure]:
-    figures: dict[str, Figure] = {}
+def _dc(rig: Rig, temperatures: UsableTemperatures) -> DcFigures:
+    by_cone: dict[str, float | None] = {}
     pan = []
     for cone in rig.cones:
         known = temperatures.usable_c.get(cone.probe)
         dc = None if known is None else known - cone.calibration_c
-        figures[f"dc_k_{cone.name}"] = dc
+        by_cone[cone.name] = dc
         if dc is not None and cone.role == "pan":
             pan.append(dc)
-    figures["dc_k"] = sum(pan) / len(pan) if pan else None
-    return figures
+    return DcFigures(sum(pan) / len(pan) if pan else None, by_cone)
 
 
-def _smears(rig: Rig, conditions: Conditions) -> dict[str, Figure]:
+def _smears(rig: Rig, conditions: Conditions) -> tuple[FigureGroup, ...]:
     if rig.virtual_image is None:
         heads = {cone.name: head_smear_px(cone, conditions) for cone in rig.cones}
         known = {name: px for name, px in heads.items() if px is not None}
         worst = max(known, key=lambda name: known[name], default=None)
-        return {
-            "smear_along_px": None if worst is None else known[worst],
-            "smear_across_px": None,
-            "smear_worst_head": worst,
-        }
+        along_px = None if worst is None else known[worst]
+        return SmearFigures(along_px), WorstHeadFigures(worst)
     sensors = [sensor.name for cone in rig.pan_cones for sensor in cone.sensors]
-    smears = [_smear(rig, sensor, conditions) for sensor in sensors]
-    return {
-        name: max((s[k] for s in smears if s is not None), default=None)
-        for k, name in enumerate(("smear_along_px", "smear_across_px"))
-    }
+    smears = [smear for name in sensors if (smear := _smear(rig, name, conditions)) is not None]
+    return (
+        SmearFigures(
+            smear_along_px=max((along for along, _ in smears), default=None),
+            smear_across_px=max((across for _, across in smears), default=None),
+        ),
+    )
 
 
 def tdi_misfit_px(rig: Rig, conditions: Conditions, largest_px: float) -> dict[str, float]:
@@ -330,7 +350,7 @@ def _smear(rig: Rig, sensor: str, conditions: Conditions) -> tuple[float, float]
 
     Rotation adds to translation by absolute value: the worst place of the image counts.
 
-    Source: docs/mathematics/quality.md#smear.
+    Source: docs/explanation/mathematics/quality.md#smear.
     """
     time_s = conditions.exposure_time_s.get(sensor)
     gsd_m = ground_sampling_distance_m(rig, conditions)

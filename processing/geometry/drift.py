@@ -4,8 +4,8 @@ dC is the temperature at exposure minus the temperature at calibration, measured
 the cone's own probe. A sensor that follows its probe with a lag has a temperature of its own under
 the name `lagged_probe` gives it; `lag_step` is the filter it is made with.
 
-Source: docs/mathematics/drift.md#linear-model and #lag; Ladstädter et al. (2010), "temperature
-dependant model".
+Source: docs/explanation/mathematics/drift.md#linear-model and #lag; Ladstädter et al. (2010),
+"temperature dependant model".
 """
 
 from __future__ import annotations

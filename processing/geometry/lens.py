@@ -4,7 +4,7 @@ where the rig file holds one.
 Points are mm in the layer, origin at the calibrated principal point; the direction is part of
 each function's name.
 
-Source: docs/mathematics/lens.md#ten-parameters; Heier et al. (2002), eq. 5.1.
+Source: docs/explanation/mathematics/lens.md#ten-parameters; Heier et al. (2002), eq. 5.1.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
 A placement composes TDI, TDM, skew, lens, principal distance, similarity S and layer
 transformation P; adjusting S and P is the work of `processing.mosaic.free_mosaic`.
 
-Source: docs/mathematics/coordinates.md#from-sensor-to-virtual-image; Ladstädter et al. (2010), eq.
-1.
+Source: docs/explanation/mathematics/coordinates.md#from-sensor-to-virtual-image; Ladstädter et al.
+(2010), eq. 1.
 """
 
 from __future__ import annotations

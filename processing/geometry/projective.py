@@ -52,7 +52,7 @@ def rotation_homography(master_from_cone: Array, f_cone_mm: float, f_master_mm: 
         target_from_source (3, 3), mm, with element [2, 2] equal to one.
 
     Source: Ladstädter et al. (2010), "epipolar transformation" of the platform calibration;
-    docs/mathematics/coordinates.md#similarity-and-projective-transformation.
+    docs/explanation/mathematics/coordinates.md#similarity-and-projective-transformation.
     """
     master = np.diag([f_master_mm, f_master_mm, -1.0])
     cone = np.diag([1.0, 1.0, -f_cone_mm])

@@ -3,7 +3,7 @@
 Direction: *ideal from measured*, as the ten parameters. The grid is taken at the measured place and
 added to what they made of it.
 
-Source: docs/mathematics/lens.md#residual-grid.
+Source: docs/explanation/mathematics/lens.md#residual-grid.
 """
 
 from __future__ import annotations

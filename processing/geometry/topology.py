@@ -3,8 +3,8 @@
 Everything is derived from nominal placements at calibration temperature; no image is
 used. Rectangles are in the virtual image plane, mm, y up.
 
-Source: docs/mathematics/mosaicking.md#parameters-and-degrees-of-freedom; Ladstädter et al. (2010),
-tables 1 and 2, fig. 2.
+Source: docs/explanation/mathematics/mosaicking.md#parameters-and-degrees-of-freedom; Ladstädter et
+al. (2010), tables 1 and 2, fig. 2.
 """
 
 from __future__ import annotations

@@ -4,21 +4,22 @@ A head's image is carried onto a horizontal plane of the ground and from there i
 image; that is a projective transformation of its layer. Which heads are turned how is adjusted in
 `processing.mosaic.free_mosaic`.
 
-Source: docs/mathematics/virtual-camera.md#ground-plane; Heier et al. (2002), 6.1 and fig. 8.
+Source: docs/explanation/mathematics/virtual-camera.md#ground-plane; Heier et al. (2002), 6.1 and
+fig. 8.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from processing.geometry.conditions import Conditions
+from processing.geometry.orientation import BODY_FROM_CAMERA
 from processing.geometry.projective import rotation_homography
-from processing.geometry.rotation import rotation_matrix
-from processing.quality.report import Figure
+from processing.geometry.rotation import level_from_body, rotation_matrix
+from processing.quality.figures.circumstances import ProjectionFigures
 from processing.rig import Cone, Rig
 
 Array = NDArray[np.float64]
@@ -46,12 +47,8 @@ def ground_plane(rig: Rig, conditions: Conditions) -> GroundPlane | None:
     if not rig.has_virtual_camera or height_m is None or height_m <= 0:
         return None
     roll, pitch = conditions.roll_rad or 0.0, conditions.pitch_rad or 0.0
-    up = (
-        -math.cos(pitch) * math.sin(roll),
-        math.sin(pitch),
-        math.cos(pitch) * math.cos(roll),
-    )
-    return GroundPlane(height_m, up)
+    x, y, z = -BODY_FROM_CAMERA.T @ level_from_body(roll, pitch, 0.0)[2]
+    return GroundPlane(height_m, (float(x), float(y), float(z)))
 
 
 def offset_mm(rig: Rig, cone: Cone) -> Array:
@@ -83,15 +80,12 @@ def vip_from_layer(rig: Rig, cone: Cone, ground: GroundPlane | None) -> Array:
 
 def projection_figures(
     rig: Rig, conditions: Conditions, relief_fraction: float
-) -> dict[str, Figure]:
+) -> ProjectionFigures | None:
     """The height a virtual camera projected onto, and what relief leaves, in figures."""
     plane = ground_plane(rig, conditions)
     if plane is None:
-        return {}
-    return {
-        "projection_height_m": plane.height_m,
-        "head_parallax_px": head_parallax_px(rig, conditions, relief_fraction),
-    }
+        return None
+    return ProjectionFigures(plane.height_m, head_parallax_px(rig, conditions, relief_fraction))
 
 
 def head_parallax_px(rig: Rig, conditions: Conditions, relief_fraction: float) -> float | None:

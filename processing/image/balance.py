@@ -3,7 +3,7 @@
 A gain for each sensor, and an offset where the contrast of an overlap determines it. Also
 samples the heads at common nodes of the virtual image, which the seams use too.
 
-Source: docs/mathematics/radiometry.md#balance-between-heads; Heier et al. (2002), 6.2.
+Source: docs/explanation/mathematics/radiometry.md#balance-between-heads; Heier et al. (2002), 6.2.
 """
 
 from __future__ import annotations

@@ -2,10 +2,11 @@
 
 The default one is corrected in phase: whatever its sub-pixel offset, a wave of up to 0.35 cycles
 per pixel comes out less than 0.005 px from where it belongs. How it was found, and what other
-kernels leave, is in docs/accuracy.md and docs/decisions/0008-phase-corrected-interpolation.md;
-`python -m benchmarks.interpolation` repeats both.
+kernels leave, is in docs/reference/results/accuracy.md and
+docs/explanation/decisions/0008-phase-corrected-interpolation.md; `python -m
+benchmarks.interpolation` repeats both.
 
-Source: docs/mathematics/resampling.md#phase-error; Keys (1981).
+Source: docs/explanation/mathematics/resampling.md#phase-error; Keys (1981).
 """
 
 from __future__ import annotations

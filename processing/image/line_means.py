@@ -1,7 +1,12 @@
-"""Means of bundles of pixels along every row and every column of a frame."""
+"""Means of bundles of pixels along every row and every column of a frame.
+
+The radiometric pass takes the sums while it holds the pixels (`processing.radiometry.level1`); here
+they are taken of a frame that is in memory.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -15,45 +20,102 @@ BUNDLES: Final = 39
 """So many bundles of pixels of a line are averaged, or as many as fit in it."""
 
 
-def line_means(frame: Array) -> tuple[Array, Array]:
+@dataclass(frozen=True)
+class LineMeans:
+    """Means of bundles of pixels along every line of a frame, float32.
+
+    `by_row` (bundles, rows) begins with row `first_row`, `by_column` is (bundles, columns); no
+    bundles where the frame is smaller than one.
+    """
+
+    by_row: Array
+    by_column: Array
+    first_row: int
+
+
+def line_means(frame: Array, rows: tuple[int, int]) -> LineMeans:
     """Average bundles of pixels along every row and along every column.
 
     Args:
         frame: (h, w) uint16.
-
-    Returns:
-        Means (bundles, h) along rows and (bundles, w) along columns, float32; no bundles where the
-        frame is smaller than one.
+        rows: first and last row looked at.
     """
-    height, width = frame.shape
+    first, last = rows
+    by_row, by_column = line_sums(last + 1 - first, frame.shape[1])
+    if by_row.size and by_column.size:
+        _sum_lines(frame[first : last + 1], by_row, by_column)
+    return means_of_sums(by_row, by_column, first)
+
+
+def line_sums(height: int, width: int) -> tuple[Array, Array]:
+    """Zeros for the sums of bundles along rows (bundles, h) and columns (bundles, w), uint32."""
     by_row = np.zeros((min(BUNDLES, width // BUNDLE_PX), height), np.uint32)
     by_column = np.zeros((min(BUNDLES, height // BUNDLE_PX), width), np.uint32)
-    if by_row.size and by_column.size:
-        _sum_lines(frame, by_row, by_column)
+    return by_row, by_column
+
+
+def means_of_sums(by_row: Array, by_column: Array, first_row: int) -> LineMeans:
+    """Means of bundles from their sums."""
     share = np.float32(1.0 / BUNDLE_PX)  # a power of two: exact
-    return by_row.astype(np.float32) * share, by_column.astype(np.float32) * share
+    return LineMeans(
+        by_row.astype(np.float32) * share, by_column.astype(np.float32) * share, first_row
+    )
 
 
 @njit(cache=True, parallel=True, nogil=True)
 def _sum_lines(frame, by_row, by_column):
-    height, width = frame.shape
-    blocks, bundles = by_column.shape[0], by_row.shape[0]
-    tall, wide = height // blocks, width // bundles
+    height = len(frame)
+    blocks = len(by_column)
+    tall = height // blocks
     for block in prange(blocks):
         first = block * tall
         last = height if block == blocks - 1 else first + tall
-        sums = by_column[block]
-        # Sums in elements of 32 bits: numba's scalars would be of 64, and half as many at a time.
-        total = np.zeros(1, np.uint32)
         for r in range(first, last):
-            line = frame[r]
-            for k in range(bundles):
-                total[0] = 0
-                part = line[k * wide : k * wide + BUNDLE_PX]
-                for c in range(BUNDLE_PX):
-                    total[0] += part[c]
-                by_row[k, r] = total[0]
-        for r in range(first, first + BUNDLE_PX, 4):
-            one, two, three, four = frame[r], frame[r + 1], frame[r + 2], frame[r + 3]
-            for c in range(width):
-                sums[c] += np.uint32(one[c]) + two[c] + three[c] + four[c]
+            add_line(frame[r], r, r - first, by_row, by_column[block])
+
+
+@njit(cache=True, nogil=True)
+def add_line(line, row, row_of_block, by_row, by_column):
+    """Add one line to the sums.
+
+    Args:
+        line: (w,) uint16.
+        row: where its sums go in `by_row`.
+        row_of_block: its place within the block of rows that a bundle of each column is of.
+        by_row: (bundles, h) uint32, written.
+        by_column: (w,) uint32, sums of this block's bundle; without columns nothing is added.
+    """
+    bundles = len(by_row)
+    wide = len(line) // max(bundles, 1)
+    for k in range(bundles):
+        # Sums stay 32 bits wide, so that vectors hold eight of them and not four.
+        total = np.uint32(0)
+        part = line[k * wide : k * wide + BUNDLE_PX]
+        for c in range(BUNDLE_PX):
+            total = np.uint32(total + part[c])
+        by_row[k, row] = total
+    if row_of_block < BUNDLE_PX:
+        for c in range(len(by_column)):
+            by_column[c] += line[c]
+
+
+@njit(cache=True, nogil=True)
+def add_pixels(frame, places, first_row, sign, by_row, by_column):
+    """Add some pixels (n, 2), row and column, to the sums, or take them off (`sign` -1)."""
+    bundles, height = by_row.shape
+    blocks = len(by_column)
+    if bundles == 0 or blocks == 0:
+        return
+    wide, tall = frame.shape[1] // bundles, height // blocks
+    for i in range(len(places)):
+        row, column = places[i, 0], places[i, 1]
+        r = row - first_row
+        if r < 0 or r >= height:
+            continue
+        # Sums of unsigned words wrap, so that taking off and adding leaves them exact.
+        value = np.uint32(sign * np.int64(frame[row, column]))
+        k, block = column // wide, r // tall
+        if k < bundles and column - k * wide < BUNDLE_PX:
+            by_row[k, r] += value
+        if block < blocks and r - block * tall < BUNDLE_PX:
+            by_column[block, column] += value

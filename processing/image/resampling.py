@@ -289,7 +289,9 @@ def _resample(frames, valid, lattices, cell, weights, gains, offsets, table, rea
     height, width = out.shape
     nodes = cell // WEIGHT_STEP_PX
     columns = (width + cell - 1) // cell
-    for band in prange((height + cell - 1) // cell):
+    for index in prange((height + cell - 1) // cell):
+        # `prange` counts in uint64: without this, each callee is compiled for uint64 as well.
+        band = np.int64(index)
         values = np.zeros((cell, cell), np.float32)
         flags = np.zeros((cell, cell), np.uint8)
         lines = np.zeros((_STRIP_ROWS + 1) * LINE_LENGTH, np.float32)

@@ -9,6 +9,7 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
+from processing.matching.prefetch import fetch_ahead
 from processing.radiometry.level1 import level1_counts_per_dn
 from processing.rig import Sensor
 
@@ -18,13 +19,18 @@ _EVERY_ROW: Final = 16
 _ROWS: Final = 1024
 """Of taller frames only every second, third .. row is looked at."""
 _BUNDLE: Final = 32
+_AHEAD: Final = 2
+"""Rows looked at between the one whose pixels are fetched and the one that is measured."""
 _MIN_LENGTH: Final = 34
 _MIN_SIGNAL: Final = 4.0
 """Detail at two pixels' distance must exceed its noise so many times before sharpness is reported."""
 
 
 def sharpness(
-    sensor: Sensor, frame: Array, rows: tuple[int, int]
+    sensor: Sensor,
+    frame: Array,
+    rows: tuple[int, int],
+    columns: tuple[int, int] | None = None,
 ) -> tuple[float | None, float | None]:
     """Share of the finest detail along track (columns of pixels) and across.
 
@@ -36,14 +42,16 @@ def sharpness(
     Args:
         frame: Level-1 words, (h, w) uint16.
         rows: first and last exposed row.
+        columns: first and last column looked at; None takes all.
     """
     first, last = rows
-    if last - first + 1 < _MIN_LENGTH or frame.shape[1] < _MIN_LENGTH:
+    left, right = columns or (0, frame.shape[1] - 1)
+    if last - first + 1 < _MIN_LENGTH or right - left + 1 < _MIN_LENGTH:
         return None, None
     height = last - first + 1
     pace = max(1, height // _ROWS)
     sums = np.zeros((-(-height // pace), 2, 4))
-    _difference_sums(frame[first : last + 1], pace, sums)
+    _difference_sums(frame[first : last + 1], left, right + 1, pace, sums)
     along, across = sums.sum(axis=0)
     counts = level1_counts_per_dn(sensor.bits)
     return _share(sensor, along, counts), _share(sensor, across, counts)
@@ -78,20 +86,22 @@ def _share(sensor: Sensor, sums: Array, counts: float) -> float | None:
 
 
 @njit(cache=True, parallel=True, nogil=True, fastmath={"reassoc", "contract"})
-def _difference_sums(frame, pace, sums):
+def _difference_sums(frame, left, end, pace, sums):
     """Sums of squared differences to the next pixel and to the one after it, of signal, of pixels.
 
-    `sums` is (rows, 2, 4): by every `pace`-th row, along track from bundles of neighbouring columns
-    (single ones would each cost a line of cache), across track from every `_EVERY_ROW`-th of these
-    rows.
+    Columns from `left` to before `end` are looked at. `sums` is (rows, 2, 4): by every `pace`-th
+    row, along track from bundles of neighbouring columns (single ones would each cost a line of
+    cache), across track from every `_EVERY_ROW`-th of these rows.
     """
-    height, width = frame.shape
+    height, width = frame.shape[0], end - left
     for r in prange(len(sums)):
         top = r * pace
         if top + 2 < height:
-            here, next_row, after = frame[top], frame[top + 1], frame[top + 2]
+            here, next_row = frame[top, left:end], frame[top + 1, left:end]
+            after = frame[top + 2, left:end]
             near = far = signal = 0.0
             for first in range(0, width - _BUNDLE + 1, _BUNDLE * _EVERY_ROW):
+                fetch_ahead(frame, left + first, top + _AHEAD * pace, _BUNDLE, 3)
                 for c in range(first, first + _BUNDLE):
                     signal_here = np.int32(here[c])
                     one = np.float64(np.int32(next_row[c]) - signal_here)
@@ -102,7 +112,7 @@ def _difference_sums(frame, pace, sums):
                 sums[r, 0, 3] += _BUNDLE
             sums[r, 0, 0], sums[r, 0, 1], sums[r, 0, 2] = near, far, signal
         if r % _EVERY_ROW == 0:
-            line = frame[top]
+            line = frame[top, left:end]
             near = far = signal = 0.0
             for c in range(width - 2):
                 signal_here = np.int32(line[c])

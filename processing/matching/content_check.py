@@ -28,7 +28,7 @@ from processing.matching.tie_point_search import (
     usable_pixels,
 )
 from processing.matching.tie_points import TiePoints
-from processing.quality.report import Figure
+from processing.quality.figures.image import ContentFigures
 from processing.rig import Rig
 
 Array = NDArray[np.float64]
@@ -130,16 +130,15 @@ def moved_placements(
     return moved
 
 
-def content_figures(check: ContentCheck) -> dict[str, Figure]:
+def content_figures(check: ContentCheck) -> ContentFigures:
     """The check in figures of the quality report."""
-    return {
-        "mismatched_sensors": ", ".join(check.mismatched) or None,
-        "mismatched_positions": max(check.mismatched.values(), default=None),
-        "shifted_sensors": ", ".join(check.shifted_px) or None,
-        "shifted_px": max(
-            (float(np.hypot(*shift)) for shift in check.shifted_px.values()), default=None
-        ),
-    }
+    shifts_px = [float(np.hypot(*shift)) for shift in check.shifted_px.values()]
+    return ContentFigures(
+        mismatched_sensors=tuple(check.mismatched),
+        mismatched_positions=max(check.mismatched.values(), default=None),
+        shifted_sensors=tuple(check.shifted_px),
+        shifted_px=max(shifts_px, default=None),
+    )
 
 
 def _counts(tie_points: TiePoints) -> tuple[dict[str, int], dict[str, int]]:

@@ -155,14 +155,17 @@ def _box_sums(plane, wide, n, reach, spare):
     """Each sample becomes the sum of the reach x reach ones right of it and below, in place."""
     along = n - reach + 1
     out = spare[:along]
-    out[:] = plane[:along]
+    # Loops: numba compiles the messages of array assignments, which takes seconds.
+    for p in range(along):
+        out[p] = plane[p]
     for k in range(1, reach):
         part = plane[k : k + along]
         for p in range(along):
             out[p] += part[p]
     down = along - (reach - 1) * wide
     total = plane[:down]
-    total[:] = spare[:down]
+    for p in range(down):
+        total[p] = spare[p]
     for k in range(1, reach):
         part = spare[k * wide : k * wide + down]
         for p in range(down):

@@ -11,7 +11,7 @@ Why unequal sharpness does not matter: to first order it leaves a multiple of th
 which is even where slopes are odd. A separate unknown removes it from shift and residuals, so
 that the sigma follows from noise alone.
 
-Source: docs/mathematics/matching.md#least-squares-matching; Gruen (1985).
+Source: docs/explanation/mathematics/matching.md#least-squares-matching; Gruen (1985).
 """
 
 from __future__ import annotations
@@ -97,7 +97,9 @@ def _spread(
     framed[:] = np.float32(0.0)
     for r in range(side):
         start = (r + 7) * wide + 8
-        framed[start : start + side] = jacobian[r * stride : r * stride + side]
+        # A loop: numba compiles the messages of array assignments, which takes seconds.
+        for p in range(side):
+            framed[start + p] = jacobian[r * stride + p]
     rows[: n + 8] = np.float32(0.0)
     target = rows[8 : 8 + n]
     for k in range(8):

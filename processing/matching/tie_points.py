@@ -93,7 +93,7 @@ def match_tie_points(
     Raises:
         ValueError: a frame of the wrong shape or type.
 
-    Source: docs/mathematics/matching.md#standard-deviation-of-a-match.
+    Source: docs/explanation/mathematics/matching.md#standard-deviation-of-a-match.
     """
     settings = settings or TiePointSettings()
     _check_frames(rig, frames)

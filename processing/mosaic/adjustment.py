@@ -3,8 +3,8 @@
 Blocks of observations that touch few unknowns each are accumulated into dense normal equations;
 what an observation or an unknown means is the caller's.
 
-Source: docs/mathematics/mosaicking.md#datum-by-inner-constraints; Förstner and Wrobel (2016),
-estimation with constraints.
+Source: docs/explanation/mathematics/mosaicking.md#datum-by-inner-constraints; Förstner and Wrobel
+(2016), estimation with constraints.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ The free mosaic uses tie points alone. Over water, sand, snow or under a cloud t
 and their noise would bend the image. This module detects that, and computes the prior information
 of calibration, temperature and platform. The adjustment itself is in `processing.mosaic.free_mosaic`.
 
-Source: docs/mathematics/mosaicking.md#supported-mosaic.
+Source: docs/explanation/mathematics/mosaicking.md#supported-mosaic.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ whose colours are not quite in one place: every point on it is off the same way.
 on the covariance of the unknowns is computed here from the residuals of one exposure; single points
 and their weights are evaluated in `processing.mosaic.weights`.
 
-Source: docs/mathematics/mosaicking.md#accuracy.
+Source: docs/explanation/mathematics/mosaicking.md#accuracy.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ _MIN_CLUSTERS: Final = 30
 """Fewer sums of residuals determine their variance to no better than a quarter."""
 _REACH_PX: Final = 93.0
 """Correlation length of errors of P/C points, colour pixels: sums over cells of area a show
-a / (a + reach^2) of what sums over whole sensors have. Measured on rendered exposures (docs/matching.md)."""
+a / (a + reach^2) of what sums over whole sensors have. Measured on rendered exposures
+(docs/explanation/matching.md)."""
 
 
 def clustered_cofactor(

@@ -2,8 +2,8 @@
 
 The adjustment they go into is in `processing.mosaic.free_mosaic`.
 
-Source: docs/mathematics/mosaicking.md#datum-by-inner-constraints; Ladstädter et al. (2010), eq. 6
-and 7; Heier et al. (2002), 6.1.
+Source: docs/explanation/mathematics/mosaicking.md#datum-by-inner-constraints; Ladstädter et al.
+(2010), eq. 6 and 7; Heier et al. (2002), 6.1.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
 A second way to dC in addition to the probes, for cones of two or more CCDs, always with its standard
 deviation. What drift does is in `processing.geometry.drift`; nothing found here moves a pixel.
 
-Source: docs/mathematics/drift.md#estimated-dc; Ladstädter et al. (2010), fig. 1, "estimation of dC
-from the stitching scales".
+Source: docs/explanation/mathematics/drift.md#estimated-dc; Ladstädter et al. (2010), fig. 1,
+"estimation of dC from the stitching scales".
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from processing.geometry.drift import sensor_dc
 from processing.mosaic.free_mosaic import Mosaic
+from processing.quality.figures.circumstances import EstimatedDcFigures
 from processing.rig import Rig, Sensor
 
 Array = NDArray[np.float64]
@@ -110,6 +111,16 @@ def combined_dc(estimates: Sequence[EstimatedDc]) -> tuple[float, float] | None:
         return None
     weight = sum(1.0 / sigma**2 for _, sigma in known)
     return sum(k / sigma**2 for k, sigma in known) / weight, 1.0 / math.sqrt(weight)
+
+
+def estimated_dc_figures(estimates: Sequence[EstimatedDc]) -> EstimatedDcFigures:
+    """dC by stitching over all cones with an estimate, and the cones whose probes disagree."""
+    combined = combined_dc(estimates)
+    return EstimatedDcFigures(
+        dc_estimated_k=None if combined is None else combined[0],
+        dc_estimated_sigma_k=None if combined is None else combined[1],
+        dc_disagreement=tuple(estimate.cone for estimate in estimates if estimate.disagrees),
+    )
 
 
 def expansion_rate(sensors: Sequence[Sensor]) -> tuple[float, float]:

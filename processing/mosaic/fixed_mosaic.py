@@ -3,8 +3,8 @@
 PAN layers go onto the master layer by P/P points, then green onto the PAN by P/C points, each by
 a projective transformation; the free method is in `processing.mosaic.free_mosaic`.
 
-Source: docs/mathematics/mosaicking.md#earlier-method; Ladstädter et al. (2010), "Image post
-processing", steps 1-6 of the previous versions.
+Source: docs/explanation/mathematics/mosaicking.md#earlier-method; Ladstädter et al. (2010), "Image
+post processing", steps 1-6 of the previous versions.
 """
 
 from __future__ import annotations

@@ -4,8 +4,8 @@ The adjustment and its statistics are here; the unknowns are laid out in
 `processing.mosaic.model`, what observations weigh is in `processing.mosaic.weights`, and whether
 the result agrees with the calibration is evaluated in `processing.mosaic.validity`.
 
-Source: docs/mathematics/mosaicking.md#observation-equations; Ladstädter et al. (2010), eq. 1-7,
-tables 1 and 2.
+Source: docs/explanation/mathematics/mosaicking.md#observation-equations; Ladstädter et al. (2010),
+eq. 1-7, tables 1 and 2.
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ from processing.matching.tie_points import PAN_TO_COLOUR, TiePoints
 from processing.mosaic.datum import mounting_constraints
 from processing.mosaic.free_mosaic import Mosaic
 from processing.mosaic.model import vip_and_design
-from processing.quality.report import Figure
+from processing.quality.figures.stitching import HeadScaleFigures
 from processing.rig import Cone, Rig
 
 Array = NDArray[np.float64]
@@ -178,21 +178,18 @@ def scaled_part(held: HeldQuantities, *, least: float) -> HeldPart | None:
     return HeldPart(found.unknowns + held.away, found.layers)
 
 
-def scale_figures(held: HeldQuantities | None) -> dict[str, Figure]:
+def scale_figures(held: HeldQuantities | None) -> HeadScaleFigures | None:
     """The head whose scale differs most, in figures of the quality report.
 
     Against `processing.mosaic.mounting.platform_figures`, which compare each head with its
     neighbours alone, all heads are weighed together: the one that bends the others is named.
     """
     if held is None or not _significant(held).any():
-        return {}
+        return None
     sizes = np.abs(held.scales) * _significant(held)
     i = int(np.argmax(sizes))
     # A head that is placed too large has to shrink.
-    return {
-        "platform_scale_ppm": -float(held.scales[i]) * 1e6,
-        "platform_scale_head": held.cones[i],
-    }
+    return HeadScaleFigures(-float(held.scales[i]) * 1e6, held.cones[i])
 
 
 def _significant(held: HeldQuantities) -> NDArray[np.bool_]:

@@ -6,8 +6,8 @@ A change that all other cones share is the master's own; it moves the whole imag
 corrected. A change common to all cones cannot be observed by stitching: that takes a bundle
 adjustment with ground control or GNSS.
 
-Source: docs/mathematics/validity.md#layers-against-the-platform-calibration; Ladstädter et al.
-(2010), "platform calibration".
+Source: docs/explanation/mathematics/validity.md#layers-against-the-platform-calibration; Ladstädter
+et al. (2010), "platform calibration".
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ from processing.mosaic.free_mosaic import Mosaic
 from processing.mosaic.mounting import rotation_of_layer
 from processing.mosaic.precision import BLIND_SIGMA_K, PROBE_SIGMA_K, UNKNOWN_SIGMA_K
 from processing.mosaic.stitch_record import layer_scale_design
-from processing.quality.report import Figure
+from processing.quality.figures import FigureGroup
+from processing.quality.figures.stitching import LayerFigures, PlatformFigures
 from processing.rig import Cone, Rig
 
 Array = NDArray[np.float64]
@@ -152,21 +153,25 @@ def check_layers(
     )
 
 
-def layer_figures(check: LayerCheck | None) -> dict[str, Figure]:
+def layer_figures(check: LayerCheck | None) -> tuple[FigureGroup, ...]:
     """The check in figures of the quality report."""
     if check is None:
-        return {}
+        return ()
     farthest = max(check.layers, key=lambda layer: layer.shift_px)
-    return {
-        "platform_test": check.statistic / check.limit,
-        "platform_shift_px": farthest.shift_px,
-        "platform_shift_head": farthest.cone,
-        "platform_causes": ", ".join(check.causes) or None,
-        "platform_alternatives": ", ".join(check.alternatives) or None,
-        "platform_master_changed": int(check.master_changed),
-        "common_scale_ppm": float(check.common[0]),
-        "common_scale_sigma_ppm": float(check.common_sigmas[0]),
-    }
+    return (
+        PlatformFigures(
+            platform_test=check.statistic / check.limit,
+            platform_shift_px=farthest.shift_px,
+            platform_shift_head=farthest.cone,
+            platform_alternatives=tuple(check.alternatives),
+        ),
+        LayerFigures(
+            platform_causes=tuple(check.causes),
+            platform_master_changed=int(check.master_changed),
+            common_scale_ppm=float(check.common[0]),
+            common_scale_sigma_ppm=float(check.common_sigmas[0]),
+        ),
+    )
 
 
 def _design(rig: Rig, mosaic: Mosaic, cone: Cone) -> Array:

@@ -4,7 +4,7 @@ The part of it that no shift, rotation and scale of the whole cone can make, wit
 and how well one cause or another fits it. What is concluded from that is in
 `processing.mosaic.validity`.
 
-Source: docs/mathematics/validity.md#contrasts.
+Source: docs/explanation/mathematics/validity.md#contrasts.
 """
 
 from __future__ import annotations

@@ -13,13 +13,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.bundle.rotations import rotations_from_vectors, skew
 from processing.geometry.placement import SensorPlacement, vip_mm_from_raw
 from processing.geometry.projective import (
     apply_projective,
     projective_jacobian,
     rotation_homography,
 )
+from processing.geometry.rotation import rotations_from_vectors, skew
 from processing.geometry.similarity import Similarity, apply_similarity
 from processing.matching.tie_points import TiePoints
 from processing.rig import Rig
@@ -119,8 +119,8 @@ def vip_and_design(
         Points (n, 2) in px of the virtual image, the indices (k,) of the unknowns touched, and the
         points' derivatives by these, (k, 2, n), px per unknown's own unit.
 
-    Source: docs/mathematics/mosaicking.md#observation-equations; Ladstädter et al. (2010), eq. 1
-    and 2.
+    Source: docs/explanation/mathematics/mosaicking.md#observation-equations; Ladstädter et al.
+    (2010), eq. 1 and 2.
     """
     n = len(corrected_mm)
     similarity = _similarity(model, start, values)
@@ -229,7 +229,7 @@ def small_rotation_design(vip_mm: Array, f_mm: float) -> Array:
 
 def _rotation_homography(rotation: Array, f_mm: float) -> Array:
     """The homography of the virtual image that a turn of the head makes, (3, 3), mm."""
-    return rotation_homography(rotations_from_vectors(rotation[None])[0], f_mm, f_mm)
+    return rotation_homography(rotations_from_vectors(rotation), f_mm, f_mm)
 
 
 def _left_jacobian(rotation: Array) -> Array:

@@ -4,8 +4,8 @@ Turns are small rotation vectors (rad) about the axes of the virtual image (x ri
 up), found against the platform calibration; the adjustment that finds them is in
 `processing.mosaic.free_mosaic`.
 
-Source: docs/mathematics/virtual-camera.md#mounting-angles; Heier et al. (2002), 6.1. Eq. 6 is that
-of Ladstädter et al. (2010).
+Source: docs/explanation/mathematics/virtual-camera.md#mounting-angles; Heier et al. (2002), 6.1.
+Eq. 6 is that of Ladstädter et al. (2010).
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.stats import chi2
 
-from processing.bundle.rotations import (
-    angles_by_rotation_vector,
-    omega_phi_kappa,
-    rotations_from_vectors,
-)
 from processing.geometry.drift import sensor_dc
 from processing.geometry.placement import corrected_mm_from_raw, vip_mm_from_raw
 from processing.geometry.projective import apply_projective
-from processing.geometry.rotation import rotation_matrix
+from processing.geometry.rotation import (
+    angles_by_rotation_vector,
+    omega_phi_kappa,
+    rotation_matrix,
+    rotations_from_vectors,
+)
 from processing.image.colour import BandRegistration
 from processing.matching.tie_points import PAN_TO_PAN, TiePoints
 from processing.mosaic.free_mosaic import Mosaic
@@ -39,7 +39,12 @@ from processing.mosaic.model import (
     small_rotation_design,
     vip_and_design,
 )
-from processing.quality.report import Figure
+from processing.quality.figures import FigureGroup
+from processing.quality.figures.stitching import (
+    HeadFitFigures,
+    HeadScaleFigures,
+    PlatformFigures,
+)
 from processing.rig import Cone, Rig, Sensor
 
 Array = NDArray[np.float64]
@@ -213,21 +218,21 @@ def check_platform(
     )
 
 
-def platform_figures(check: PlatformCheck | None) -> dict[str, Figure]:
+def platform_figures(check: PlatformCheck | None) -> tuple[FigureGroup, ...]:
     """The check in figures of the quality report."""
     if check is None:
-        return {}
+        return ()
     farthest, scaled = check.farthest, check.scaled
-    residuals = [math.hypot(*head.residual_px) for head in check.heads]
-    return {
-        "platform_test": check.statistic / check.limit,
-        "platform_shift_px": math.hypot(*farthest.shift_px),
-        "platform_shift_head": farthest.cone,
-        "platform_alternatives": ", ".join(check.alternatives) or None,
-        "platform_residual_px": max(residuals),
-        "platform_scale_ppm": scaled.scale_ppm,
-        "platform_scale_head": scaled.cone,
-    }
+    return (
+        PlatformFigures(
+            platform_test=check.statistic / check.limit,
+            platform_shift_px=math.hypot(*farthest.shift_px),
+            platform_shift_head=farthest.cone,
+            platform_alternatives=tuple(check.alternatives),
+        ),
+        HeadFitFigures(max(math.hypot(*head.residual_px) for head in check.heads)),
+        HeadScaleFigures(scaled.scale_ppm, scaled.cone),
+    )
 
 
 def rotation_of_layer(rig: Rig, mosaic: Mosaic, cone: Cone) -> Array | None:
@@ -287,7 +292,7 @@ def _mounting(
     rotation_vector = mosaic.values[first : first + 3]
     rotation = rotated_mounting(cone, rotation_vector)
     # A turn w before the rotation is one of R'w behind it.
-    jacobian = angles_by_rotation_vector(rotation[None])[0] @ rotation.T
+    jacobian = angles_by_rotation_vector("XYZ", rotation) @ rotation.T
     moved = (
         small_rotation_design(_middle_mm(rig, mosaic, name), mosaic.model.f_mm)[:, :, 0]
         @ rotation_vector
@@ -295,7 +300,7 @@ def _mounting(
     shift, sigma, affine, points = _affine_shift(rig, mosaic, tie_points, name)
     return EstimatedMounting(
         cone=name,
-        angles_rad=_triple(omega_phi_kappa(rotation[None])[0]),
+        angles_rad=_triple(omega_phi_kappa(rotation)),
         covariance=jacobian @ covariance @ jacobian.T,
         correction_rad=_triple(rotation_vector),
         correction_sigma_rad=_triple(np.sqrt(np.maximum(np.diag(covariance), 0.0))),
@@ -309,9 +314,7 @@ def _mounting(
 
 def rotated_mounting(cone: Cone, correction_rad: Array) -> Array:
     """virtual_from_head (3, 3) of a cone turned further about the axes of the virtual image."""
-    return np.asarray(
-        rotations_from_vectors(correction_rad[None])[0] @ rotation_matrix(*cone.rotation_rad)
-    )
+    return np.asarray(rotations_from_vectors(correction_rad) @ rotation_matrix(*cone.rotation_rad))
 
 
 def place_covariance(cone: Cone, dc_k: Mapping[str, float], *, is_datum: bool = False) -> Array:

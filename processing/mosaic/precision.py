@@ -5,8 +5,8 @@ and drift coefficients of the master sensors the datum rests on; and the tempera
 cone, which a common expansion hides in. Whether the calibration holds is tested in
 `processing.mosaic.validity`.
 
-Source: docs/mathematics/mosaicking.md#accuracy-of-the-image. Eq. 6 is that of Ladstädter et al.
-(2010).
+Source: docs/explanation/mathematics/mosaicking.md#accuracy-of-the-image. Eq. 6 is that of
+Ladstädter et al. (2010).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from processing.mosaic.datum import datum_candidates
 from processing.mosaic.free_mosaic import Mosaic, vip_precision_px
 from processing.mosaic.held import HeldPart
 from processing.mosaic.model import vip_and_design
-from processing.quality.report import Figure
+from processing.quality.figures.stitching import PrecisionFigures
 from processing.rig import Rig, Sensor
 
 Array = NDArray[np.float64]
@@ -54,7 +54,7 @@ def precision_figures(
     present: Collection[str],
     measured_c: Mapping[str, float],
     uncertainty_contribution: UncertaintyContribution | None = None,
-) -> dict[str, Figure]:
+) -> PrecisionFigures | None:
     """How well centre and corners of the PAN sensors that are there are placed, in figures.
 
     Args:
@@ -80,13 +80,10 @@ def precision_figures(
                 )
                 by_sensor[sensor.name] = float(np.sqrt(np.mean(sigma**2)))
     if not by_sensor:
-        return {}
+        return None
     worst = max(by_sensor, key=lambda name: by_sensor[name])
-    return {
-        "stitched_sigma_px": float(np.sqrt(np.mean(np.square(list(by_sensor.values()))))),
-        "stitched_sigma_worst_px": by_sensor[worst],
-        "stitched_sigma_worst_sensor": worst,
-    }
+    sigma_px = float(np.sqrt(np.mean(np.square(list(by_sensor.values())))))
+    return PrecisionFigures(sigma_px, by_sensor[worst], worst)
 
 
 def placed_sigma_px(

@@ -4,7 +4,7 @@ A head that drops or repeats lines shifts a band of its frame, or everything aft
 adjustment spreads that over sensors that are in order; the residuals of the frame's own tie
 points, rejected ones included, still step along its rows or columns. Nothing is corrected here.
 
-Source: docs/mathematics/validity.md#read-out-slips.
+Source: docs/explanation/mathematics/validity.md#read-out-slips.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.matching.tie_points import PAN_TO_COLOUR, PAN_TO_PAN, TiePoints
-from processing.quality.report import Figure
+from processing.quality.figures.stitching import SlipFigures
 from processing.rig import Rig
 
 Array = NDArray[np.float64]
@@ -42,8 +42,9 @@ class SlipSettings:
     A band holds at least two bins of `bin_points` tie points; the mean of their medians differs
     from the median of the rest of the frame by more than `limit` standard deviations of
     independent points, and by more than `min_shift_px`. The second decides on ground where errors of
-    neighbouring points are correlated: relief, trees, clouds, vehicles (docs/validity.md). All of a
-    band moves: `min_share` of its points have its shift, of vehicles on a road fewer.
+    neighbouring points are correlated: relief, trees, clouds, vehicles
+    (docs/explanation/validity.md). All of a band moves: `min_share` of its points have its shift,
+    of vehicles on a road fewer.
     """
 
     bin_points: int = 7
@@ -181,19 +182,21 @@ def slip_of(rig: Rig, tie_points: TiePoints, residuals_px: Array, sensor: str) -
     )
 
 
-def slip_figures(rig: Rig, slips: Sequence[Slip]) -> dict[str, Figure]:
+def slip_figures(rig: Rig, slips: Sequence[Slip]) -> SlipFigures:
     """The worst slip in figures of the quality report."""
-    worst = slips[0] if slips else None
-    return {
-        "slip_sensor": None if worst is None else worst.sensor,
-        "slip_cone": None if worst is None else rig.cone_of(worst.sensor).name,
-        "slip_px": None if worst is None else worst.length_px,
-        "slip_axis": None if worst is None else worst.axis,
-        "slip_first": None if worst is None else worst.first,
-        "slip_last": None if worst is None else worst.last,
-        "slip_alternatives": None if worst is None else ", ".join(worst.alternatives) or None,
-        "slip_sensors": ", ".join(slip.sensor for slip in slips) or None,
-    }
+    if not slips:
+        return SlipFigures()
+    worst = slips[0]
+    return SlipFigures(
+        slip_sensor=worst.sensor,
+        slip_cone=rig.cone_of(worst.sensor).name,
+        slip_px=worst.length_px,
+        slip_axis=worst.axis,
+        slip_first=worst.first,
+        slip_last=worst.last,
+        slip_alternatives=tuple(worst.alternatives),
+        slip_sensors=tuple(slip.sensor for slip in slips),
+    )
 
 
 def _alternatives(

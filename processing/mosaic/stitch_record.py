@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
+from processing.errors import ProcessingError
 from processing.geometry.drift import sensor_dc
 from processing.geometry.topology import mosaic_cones
 from processing.image.colour import BandRegistration
@@ -32,7 +33,7 @@ ROTATIONS = ("rotation_x_urad", "rotation_y_urad", "rotation_z_urad")
 """Rotation of a cone against its calibration, about the axes of the virtual image."""
 
 
-class StitchRecordError(ValueError):
+class StitchRecordError(ProcessingError, ValueError):
     """A record that cannot be read; the sentence names the key."""
 
 

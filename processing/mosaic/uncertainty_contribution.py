@@ -4,7 +4,8 @@ The covariance of `processing.mosaic.precision` holds for a camera that is as ca
 report itself finds a displaced sensor, a wrong temperature, a changed master cone or a read-out
 slip, the stated accuracy of the image includes that finding.
 
-Source: docs/mathematics/validity.md#what-findings-add. Eq. 6 is that of Ladstädter et al. (2010).
+Source: docs/explanation/mathematics/validity.md#what-findings-add. Eq. 6 is that of Ladstädter et
+al. (2010).
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
 This module holds the test and the datum that follows from it; the adjustment is in
 `processing.mosaic.free_mosaic`. Displacements are (x right, y up), found minus expected, in PAN px.
 
-Source: docs/mathematics/validity.md#one-displaced-sensor; Ladstädter et al. (2010), "Optimal IO
-reconstruction", fig. 5 and 6.
+Source: docs/explanation/mathematics/validity.md#one-displaced-sensor; Ladstädter et al. (2010),
+"Optimal IO reconstruction", fig. 5 and 6.
 """
 
 from __future__ import annotations

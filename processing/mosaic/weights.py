@@ -3,7 +3,7 @@
 A-priori accuracy, variance components and data snooping; the adjustment that asks for them is in
 `processing.mosaic.free_mosaic`.
 
-Source: docs/mathematics/mosaicking.md#weights.
+Source: docs/explanation/mathematics/mosaicking.md#weights.
 """
 
 from __future__ import annotations

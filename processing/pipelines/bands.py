@@ -8,21 +8,15 @@ registered to the reference band and resampled once. Rigs that stitch are
 from __future__ import annotations
 
 import copy
-import time
-from collections.abc import Callable, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import cv2
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.geometry.conditions import (
-    Conditions,
-    condition_figures,
-    usable_temperatures,
-)
+from processing.geometry.conditions import Conditions, FrameSettings
 from processing.geometry.placement import SensorPlacement
 from processing.image.band_registration import (
     BandSettings,
@@ -32,13 +26,21 @@ from processing.image.band_registration import (
     reference_image,
     register_to_reference,
 )
+from processing.pipelines.exposure_pipeline import (
+    ExposureInput,
+    ExposurePipeline,
+    Judgement,
+    Stages,
+    StageSettings,
+)
 from processing.pipelines.synthetic_frames import synthetic_head_frames
-from processing.quality.evaluation import evaluate
-from processing.quality.figures import valid_area_figures
+from processing.quality.figures import FigureGroup
+from processing.quality.figures.image import SaturationFigures, ValidFigures
+from processing.quality.figures.stitching import BandFitFigures, BandShiftFigures
 from processing.quality.readout import blank_unread
-from processing.quality.report import Figure, QualityReport, Thresholds
-from processing.quality.requirements import QualityRequirements
-from processing.quality.valid_area import ValidArea, area_of, gap_cells, grid_of
+from processing.quality.report import QualityReport, Thresholds
+from processing.quality.valid_area import ValidArea, area_of_rasters, grid_of
+from processing.radiometry.level1 import unread_fraction
 from processing.radiometry.radiance import RadianceCalibration, radiance_from_raw, saturated_pixels
 from processing.rig import Rig, Sensor, VirtualImage
 
@@ -49,23 +51,14 @@ SIGNAL_UNIT: Final = "DN"
 VALID: Final = 1
 SATURATED: Final = 2
 
-BAND_FIGURES: Final[Mapping[str, str]] = {
-    "<band>_points": "tie points of a band with the reference band that were kept",
-    "<band>_rms_px": "root mean square length of their residuals, pixels",
-    "<band>_shift_px": "largest displacement of raw pixels against the reference band, pixels",
-}
-"""Figures of a band in addition to those of `processing.quality.report.FIGURES`."""
+BAND_THRESHOLDS: Final = replace(
+    Thresholds(), saturated_fraction=0.0005, saturated_refly_fraction=0.01
+)
+"""Ten times less saturation than for a picture: a radiance that is wrong is worse than a roof
+without detail."""
 
 _MATCHING_LEVEL: Final = 1000.0
 """Frames are matched with their median at this value: the kernels' guards are made for counts."""
-
-
-@dataclass(frozen=True)
-class FrameSettings:
-    """Values a head reports with its frame: gain, and the black level in words where known."""
-
-    gain: float = 1.0
-    black: float | None = None
 
 
 @dataclass(frozen=True)
@@ -88,16 +81,56 @@ class BandProduct:
     timings_s: Mapping[str, float] = field(default_factory=dict)
 
 
-class BandPipeline:
+@dataclass(frozen=True, kw_only=True)
+class BandPipelineSettings(StageSettings):
+    """How exposures of single-band heads are processed."""
+
+    thresholds: Thresholds = BAND_THRESHOLDS
+    registration: BandSettings = field(default_factory=BandSettings)
+
+
+@dataclass(frozen=True)
+class _CorrectedBands:
+    """By sensor name: radiance or signal, its unit, saturated pixels, pixels that were read."""
+
+    linear: Mapping[str, Array]
+    units: Mapping[str, str]
+    saturated: Mapping[str, Array]
+    read: Mapping[str, Array]
+
+
+@dataclass(frozen=True)
+class _RegisteredBands:
+    """By sensor name: the placement, and the registration of all but the reference."""
+
+    placements: Mapping[str, SensorPlacement]
+    registrations: Mapping[str, RegisteredBand]
+
+
+@dataclass(frozen=True)
+class _BandRasters:
+    """By band, on the raster of the reference."""
+
+    bands: Mapping[str, Array]
+    masks: Mapping[str, Array]
+    units: Mapping[str, str]
+
+
+_BandStages = Stages[_CorrectedBands, _RegisteredBands, _BandRasters]
+
+
+class BandPipeline(
+    ExposurePipeline[
+        BandPipelineSettings, _CorrectedBands, _RegisteredBands, _BandRasters, BandProduct
+    ]
+):
     """A rig of single-band heads without a virtual image, and its radiance calibrations.
 
     Args:
         rig: every cone has one sensor and one band, all bands differ; `colour_master_cone` is the
             reference band.
         radiance: by sensor name; a sensor without one gives DN above black.
-        thresholds: of the verdict. None asks ten times less saturation than for a picture: a
-            radiance that is wrong is worse than a roof without detail.
-        requirements: of the project, if any.
+        settings: None takes the defaults.
 
     Raises:
         ValueError: a rig of other make.
@@ -107,11 +140,7 @@ class BandPipeline:
         self,
         rig: Rig,
         radiance: Mapping[str, RadianceCalibration] | None = None,
-        *,
-        settings: BandSettings | None = None,
-        threads: int = 2,
-        thresholds: Thresholds | None = None,
-        requirements: QualityRequirements | None = None,
+        settings: BandPipelineSettings | None = None,
     ) -> None:
         single = all(len(c.sensors) == 1 and len(c.bands) == 1 for c in rig.cones)
         bands = [cone.bands[0] for cone in rig.cones if cone.bands]
@@ -120,13 +149,7 @@ class BandPipeline:
                 f"rig {rig.name}: without a virtual image each cone has one sensor and a band of "
                 f"its own; give [virtual_image] for cameras that are stitched"
             )
-        self.rig = rig
-        self.settings = settings or BandSettings()
-        self.thresholds = thresholds or replace(
-            Thresholds(), saturated_fraction=0.0005, saturated_refly_fraction=0.01
-        )
-        self._requirements = requirements or QualityRequirements()
-        self._threads = threads
+        super().__init__(rig, settings or BandPipelineSettings())
         self._radiance = dict(radiance or {})
         self._image = reference_image(rig)
         self._band_of = {cone.sensors[0].name: cone.bands[0] for cone in rig.cones}
@@ -142,102 +165,68 @@ class BandPipeline:
         exposure_time_s = {sensor.name: 0.001 for sensor in self.rig.sensors}
         self.process(synthetic_head_frames(self.rig), Conditions(exposure_time_s=exposure_time_s))
 
-    def process(
-        self,
-        frames: Mapping[str, Array],
-        conditions: Conditions,
-        heads: Mapping[str, FrameSettings] | None = None,
-        *,
-        frames_read: Callable[[], None] | None = None,
-    ) -> BandProduct:
-        """Make the bands of one exposure and evaluate it.
-
-        Args:
-            frames: Level-0 frames by sensor name, (h, w) uint16. A missing one leaves no band;
-                without the reference all bands stay as calibrated.
-            conditions: exposure times, temperatures, what capture knows.
-            heads: gain and black level by sensor name.
-            frames_read: called once the pixels of `frames` are no longer needed.
-
-        Raises:
-            ValueError: a frame of the wrong shape or type, or a radiance calibration without an
-                exposure time.
-        """
-        cv2.setNumThreads(self._threads)
-        numba.set_num_threads(max(1, min(self._threads, int(numba.config.NUMBA_NUM_THREADS))))
-        temperatures = usable_temperatures(self.rig, conditions, self.thresholds)
-        seconds: dict[str, float] = {}
-        began = time.perf_counter()
+    def _correct(self, exposure: ExposureInput) -> _CorrectedBands:
         linear, saturated, read, units = {}, {}, {}, {}
-        for name in (name for name in self._band_of if name in frames):
-            sensor = self.rig.sensor(name)
-            head_settings = (heads or {}).get(name, FrameSettings())
-            linear[name], units[name] = self._linear(
-                sensor, frames[name], conditions, head_settings
-            )
-            saturated[name] = saturated_pixels(sensor, frames[name])
-            read[name] = np.ones(frames[name].shape, np.uint8)
-            blank_unread(sensor, frames[name], read[name])
-        if frames_read is not None:
-            frames_read()
-        seconds["radiometry"] = time.perf_counter() - began
-        began = time.perf_counter()
-        placements = band_placements(self.rig, temperatures.placement_temperatures_c)
-        found = self._register(
-            placements, linear, {name: saturated[name] | (read[name] == 0) for name in linear}
+        with exposure.clock.stage("radiometry"):
+            for name in (name for name in self._band_of if name in exposure.frames):
+                sensor, frame = self.rig.sensor(name), exposure.frames[name]
+                linear[name], units[name] = self._linear(sensor, frame, exposure.conditions)
+                saturated[name] = saturated_pixels(sensor, frame)
+                read[name] = np.ones(frame.shape, np.uint8)
+                blank_unread(sensor, frame, unread_fraction(sensor, frame), read[name])
+        return _CorrectedBands(linear, units, saturated, read)
+
+    def _adjust(self, exposure: ExposureInput, corrected: _CorrectedBands) -> _RegisteredBands:
+        with exposure.clock.stage("registration"):
+            temperatures_c = exposure.temperatures.placement_temperatures_c
+            placements = band_placements(self.rig, temperatures_c)
+            return _RegisteredBands(placements, self._register(placements, corrected))
+
+    def _resample(
+        self, exposure: ExposureInput, corrected: _CorrectedBands, adjusted: _RegisteredBands
+    ) -> _BandRasters:
+        found = adjusted.registrations
+        bands, masks, units = {}, {}, {}
+        with exposure.clock.stage("resampling"):
+            for name, frame in corrected.linear.items():
+                homography = found[name].band_from_reference if name in found else np.eye(3)
+                at = raw_of_reference_pixels(self._image, adjusted.placements[name], homography)
+                band = self._band_of[name]
+                bands[band], masks[band] = _resampled(
+                    frame, corrected.saturated[name], corrected.read[name], at
+                )
+                units[band] = corrected.units[name]
+        return _BandRasters(bands, masks, units)
+
+    def _judge(self, stages: _BandStages) -> Judgement:
+        found, masks = stages.adjusted.registrations.values(), stages.image.masks
+        cells = grid_of(self._image.width_px, self._image.height_px)
+        return Judgement(
+            "bands",
+            _figures(found, stages.corrected.saturated, masks),
+            area_of_rasters(masks, self._band_of.values(), cells, saturated_bit=SATURATED),
+            nominal_bands=tuple(f.band for f in found if not f.registered),
         )
-        seconds["registration"] = time.perf_counter() - began
-        began = time.perf_counter()
-        bands, masks = {}, {}
-        for name, frame in linear.items():
-            homography = found[name].band_from_reference if name in found else np.eye(3)
-            at = raw_of_reference_pixels(self._image, placements[name], homography)
-            band = self._band_of[name]
-            bands[band], masks[band] = _resampled(frame, saturated[name], read[name], at)
-        seconds["resampling"] = time.perf_counter() - began
-        missing = [name for name in self._band_of if name not in frames]
-        figures = condition_figures(self.rig, conditions, temperatures)
-        figures |= self._figures(found, saturated, masks, missing)
-        area = self._valid_area(masks)
-        figures |= valid_area_figures(area)
-        report = evaluate(
-            figures,
-            capture_flags=conditions.flags,
-            missing_sensors=missing,
-            missing_probes=temperatures.missing,
-            probes_out_of_range=temperatures.out_of_range,
-            nominal_bands=[f.band for f in found.values() if not f.registered],
-            thresholds=self.thresholds,
-            requirements=self._requirements,
-        )
+
+    def _product(
+        self, stages: _BandStages, judgement: Judgement, report: QualityReport
+    ) -> BandProduct:
+        image = stages.image
         return BandProduct(
             image=self._image,
             reference=self._band_of[self._reference],
-            bands=bands,
-            masks=masks,
-            units={self._band_of[name]: unit for name, unit in units.items()},
-            registrations=tuple(found.values()),
-            valid_area=area,
+            bands=image.bands,
+            masks=image.masks,
+            units=image.units,
+            registrations=tuple(stages.adjusted.registrations.values()),
+            valid_area=judgement.valid_area,
             report=report,
-            timings_s=seconds,
+            timings_s=stages.exposure.clock.seconds,
         )
 
-    def _valid_area(self, masks: Mapping[str, Array]) -> ValidArea:
-        columns, rows = grid_of(self._image.width_px, self._image.height_px)
-        nothing = np.ones((rows, columns), np.bool_)
-        return area_of(
-            {
-                band: gap_cells(masks[band], columns, rows, saturated_bit=SATURATED)
-                if band in masks
-                else nothing
-                for band in self._band_of.values()
-            }
-        )
-
-    def _linear(
-        self, sensor: Sensor, raw: Array, conditions: Conditions, head_settings: FrameSettings
-    ) -> tuple[Array, str]:
+    def _linear(self, sensor: Sensor, raw: Array, conditions: Conditions) -> tuple[Array, str]:
         """Radiance, or DN above black where the head has no absolute calibration."""
+        head_settings = conditions.frame_settings.get(sensor.name, FrameSettings())
         calibration = self._radiance.get(sensor.name)
         if calibration is None:
             black = (
@@ -258,13 +247,14 @@ class BandPipeline:
         return radiance, RADIANCE_UNIT
 
     def _register(
-        self,
-        placements: Mapping[str, SensorPlacement],
-        linear: Mapping[str, Array],
-        unusable: Mapping[str, Array],
+        self, placements: Mapping[str, SensorPlacement], corrected: _CorrectedBands
     ) -> dict[str, RegisteredBand]:
         """All bands but the reference, by sensor name."""
-        matching = {name: _for_matching(f, unusable[name]) for name, f in linear.items()}
+        linear, saturated, read = corrected.linear, corrected.saturated, corrected.read
+        matching = {
+            name: _for_matching(frame, saturated[name] | (read[name] == 0))
+            for name, frame in linear.items()
+        }
         found = {}
         for name in (name for name in linear if name != self._reference):
             if self._reference in matching:
@@ -274,7 +264,7 @@ class BandPipeline:
                     placements[name],
                     matching[self._reference],
                     matching[name],
-                    settings=self.settings,
+                    settings=self.settings.registration,
                 )
             else:
                 found[name] = RegisteredBand(
@@ -283,29 +273,27 @@ class BandPipeline:
                 )  # fmt: skip
         return found
 
-    def _figures(
-        self,
-        found: Mapping[str, RegisteredBand],
-        saturated: Mapping[str, Array],
-        masks: Mapping[str, Array],
-        missing: list[str],
-    ) -> dict[str, Figure]:
-        figures: dict[str, Figure] = {"method": "bands", "missing_sensors": ", ".join(missing)}
-        figures["missing_sensors"] = figures["missing_sensors"] or None
-        for band in found.values():
-            figures[f"{band.band}_points"] = band.points
-            figures[f"{band.band}_rms_px"] = band.rms_px
-            figures[f"{band.band}_shift_px"] = band.largest_shift_px if band.registered else None
-        shares = {name: float(np.mean(full)) for name, full in saturated.items()}
-        if shares:
-            worst = max(shares, key=lambda name: shares[name])
-            # Each band is a measurement of its own: the worst decides.
-            figures["saturated_fraction"] = shares[worst]
-            figures["saturated_worst_fraction"] = shares[worst]
-            figures["saturated_worst_sensor"] = worst
-            everywhere = np.logical_and.reduce([mask & VALID != 0 for mask in masks.values()])
-            figures["valid_fraction"] = float(np.mean(everywhere))
-        return figures
+
+def _figures(
+    found: Collection[RegisteredBand],
+    saturated: Mapping[str, Array],
+    masks: Mapping[str, Array],
+) -> Iterator[FigureGroup]:
+    """Registration by band, saturation by sensor name, and valid pixels of the masks by band."""
+    yield BandFitFigures(
+        points_by_band={band.band: band.points for band in found},
+        rms_px_by_band={band.band: band.rms_px for band in found},
+    )
+    yield BandShiftFigures(
+        {band.band: band.largest_shift_px if band.registered else None for band in found}
+    )
+    shares = {name: float(np.mean(full)) for name, full in saturated.items()}
+    if shares:
+        worst = max(shares, key=lambda name: shares[name])
+        # Each band is a measurement of its own: the worst decides.
+        yield SaturationFigures(shares[worst], shares[worst], worst)
+        everywhere = np.logical_and.reduce([mask & VALID != 0 for mask in masks.values()])
+        yield ValidFigures(float(np.mean(everywhere)))
 
 
 def _for_matching(frame: Array, unusable: Array) -> Array:

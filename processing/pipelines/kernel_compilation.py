@@ -16,6 +16,7 @@ import numpy as np
 from numba.core.dispatcher import Dispatcher
 
 from processing.pipelines.bands import BandPipeline
+from processing.pipelines.parallel_compilation import Progress, compile_recorded
 from processing.pipelines.perspective import HeadPipeline, has_diverging_axes
 from processing.pipelines.stitched import Pipeline, PipelineSettings
 from processing.pipelines.synthetic_frames import synthetic_radiometry
@@ -32,8 +33,10 @@ _KERNEL_MODULES: Final = (
     "processing.image.line_means",
     "processing.quality.common_windows",
     "processing.quality.frame_blocks",
+    "processing.quality.local_sharpness",
     "processing.quality.signal_steps",
     "processing.matching.least_squares",
+    "processing.radiometry.defects",
     "processing.radiometry.level1",
     "processing.matching.patches",
     "processing.matching.prefetch",
@@ -61,7 +64,7 @@ def kernels() -> dict[str, Any]:
     for module_name in _KERNEL_MODULES:
         for name, value in vars(importlib.import_module(module_name)).items():
             if isinstance(value, Dispatcher) and value.py_func.__module__ == module_name:
-                found[f"{module_name}.{name.lstrip('_')}"] = value
+                found[f"{module_name}.{name}"] = value
     return dict(sorted(found.items()))
 
 
@@ -74,16 +77,32 @@ def compile_for(
     rig: Rig,
     radiometry: Mapping[str, RadiometricCalibration] | None = None,
     settings: PipelineSettings | None = None,
+    *,
+    progress: Progress | None = None,
+    processes: int | None = None,
 ) -> Compilation:
     """Compile, or load from the cache, what this rig's pipeline will call.
 
-    Without radiometry, as at installation, what a calibrated sensor needs is compiled as well; so
-    is what a Bayer head needs, whether this rig has one or not.
+    Recorded variants are compiled in several processes. The pipeline then runs once, which
+    compiles whatever else it calls. Without radiometry, as at installation, what a calibrated
+    sensor needs is compiled as well; so is what a Bayer head needs, whether this rig has one or
+    not.
+
+    Args:
+        rig: the camera.
+        radiometry: calibrations by sensor name.
+        settings: of the pipeline.
+        progress: called after each kernel that another process compiled.
+        processes: None takes one for each core, 0 compiles in this process as the pipeline runs.
 
     Raises:
+        KernelCompilationError: a recorded variant cannot be compiled.
         ValueError, CalibrationError: as `Pipeline`, `HeadPipeline` or `BandPipeline`.
     """
     began = time.perf_counter()
+    compiled = 0
+    if processes != 0:
+        compiled = compile_recorded(kernels(), progress=progress, processes=processes)
     before = _cache_misses()
     if radiometry is None:
         first = (rig.pan_cones or rig.cones)[0].sensors[0]
@@ -95,7 +114,8 @@ def compile_for(
         HeadPipeline(rig, radiometry).warm_up()
     else:
         BandPipeline(rig).warm_up()
-    return Compilation(variants(), _cache_misses() - before, time.perf_counter() - began)
+    compiled += _cache_misses() - before
+    return Compilation(variants(), compiled, time.perf_counter() - began)
 
 
 def _cache_misses() -> int:

@@ -10,41 +10,39 @@ from __future__ import annotations
 
 import copy
 import math
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
-import cv2
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.geometry.conditions import (
-    Conditions,
-    UsableTemperatures,
-    condition_figures,
-    usable_temperatures,
-)
+from processing.geometry.conditions import Conditions
 from processing.geometry.placement import nominal_placements, raw_from_vip_mm, vip_mm_from_px
 from processing.geometry.rotation import rotation_matrix
 from processing.image.kernels import DEFAULT_INTERPOLATION, Interpolation
 from processing.image.lattice import OUTSIDE
+from processing.image.line_means import line_means
 from processing.image.resampling import (
     SATURATED_SOURCE,
     SUPPORT_MARGIN_PX,
     WEIGHT_UNIT,
     resample,
 )
-from processing.image.sharpness import bright_level
+from processing.pipelines.exposure_pipeline import (
+    ExposureInput,
+    ExposurePipeline,
+    Judgement,
+    Stages,
+    StageSettings,
+)
 from processing.pipelines.synthetic_frames import synthetic_head_frames
-from processing.quality.evaluation import evaluate
-from processing.quality.figures import valid_area_figures
+from processing.quality.figures import FigureGroup
+from processing.quality.frame_signal import signal_figures
 from processing.quality.readout import blank_unread, unread_figures
-from processing.quality.report import Figure, QualityReport, Thresholds
-from processing.quality.requirements import QualityRequirements
-from processing.quality.signal_steps import line_means_of, signal_steps, step_figures
-from processing.quality.valid_area import ValidArea, area_of, gap_cells, grid_of
+from processing.quality.report import QualityReport
+from processing.quality.signal_steps import signal_steps, step_figures
+from processing.quality.valid_area import ValidArea, area_of_rasters, grid_of
 from processing.quality.word_format import word_format_figures
 from processing.radiometry.calibration import RadiometricCalibration
 from processing.radiometry.demosaic import BAYER_BANDS, demosaic, is_bayer
@@ -53,7 +51,6 @@ from processing.radiometry.level1 import (
     LEVEL1_FLOOR,
     FrameStatistics,
     corrector_for,
-    level1_from_level0,
 )
 from processing.rig import Cone, Rig, VirtualImage
 
@@ -112,14 +109,37 @@ def raw_of_perspective(
     return raw_from_vip_mm(_placement(cone, temperatures_c), vip_mm_from_px(image, colrow))
 
 
-class HeadPipeline:
+@dataclass(frozen=True, kw_only=True)
+class HeadSettings(StageSettings):
+    """How exposures of separate heads are processed."""
+
+    interpolation: Interpolation = DEFAULT_INTERPOLATION
+
+
+@dataclass(frozen=True)
+class _CorrectedHeads:
+    """Level-1 and statistics by sensor name, the planes of each head by cone name."""
+
+    level1: Mapping[str, Array]
+    statistics: Mapping[str, FrameStatistics]
+    planes: Mapping[str, Mapping[str, Array]]
+    figures: tuple[FigureGroup | None, ...]
+
+
+_Lattices = Mapping[str, Array]
+_Heads = Mapping[str, HeadImage]
+_HeadStages = Stages[_CorrectedHeads, _Lattices, _Heads]
+
+
+class HeadPipeline(
+    ExposurePipeline[HeadSettings, _CorrectedHeads, _Lattices, _Heads, HeadsProduct]
+):
     """A rig with diverging axes, and its radiometric calibrations.
 
     Args:
         rig: every cone has one sensor.
         radiometry: by sensor name; a sensor without one is taken as flat.
-        interpolation: as in `processing.image.kernels`.
-        requirements: of the project, if any.
+        settings: None takes the defaults.
 
     Raises:
         ValueError: a rig of other make.
@@ -130,26 +150,18 @@ class HeadPipeline:
         self,
         rig: Rig,
         radiometry: Mapping[str, RadiometricCalibration] | None = None,
-        *,
-        interpolation: Interpolation = DEFAULT_INTERPOLATION,
-        threads: int = 2,
-        thresholds: Thresholds | None = None,
-        requirements: QualityRequirements | None = None,
+        settings: HeadSettings | None = None,
     ) -> None:
         if rig.virtual_image is not None or any(len(c.sensors) != 1 for c in rig.cones):
             raise ValueError(
                 f"rig {rig.name}: heads are images of their own where each has one sensor and "
                 "there is no [virtual_image]"
             )
-        self.rig = rig
+        super().__init__(rig, settings or HeadSettings())
         self._correctors = {
             sensor.name: corrector_for(sensor, (radiometry or {}).get(sensor.name))
             for sensor in rig.sensors
         }
-        self._interpolation = interpolation
-        self._threads = threads
-        self._thresholds = thresholds or Thresholds()
-        self._requirements = requirements or QualityRequirements()
         self._lattices: dict[str, tuple[tuple[float | None, float | None], Array]] = {}
 
     def clone(self) -> HeadPipeline:
@@ -161,135 +173,86 @@ class HeadPipeline:
         frames = synthetic_head_frames(self.rig)
         self.process(frames, Conditions())
         # Frames in memory may be read-only to the kernels: that is another variant of one of them.
+        exposure = self._read(frames, Conditions())
         for sensor in self.rig.sensors:
             frames[sensor.name].flags.writeable = False
-            level1_from_level0(
-                self._correctors[sensor.name],
-                frames[sensor.name],
-                temperature_c=None,
-                exposure_time_s=0.0,
-                tdi_shifts=0,
-                out=np.empty((sensor.height_px, sensor.width_px), np.uint16),
-            )
+            out = np.empty((sensor.height_px, sensor.width_px), np.uint16)
+            exposure.correct(self._correctors[sensor.name], out=out)
 
-    def process(
-        self,
-        frames: Mapping[str, Array],
-        conditions: Conditions,
-        *,
-        frames_read: Callable[[], None] | None = None,
-    ) -> HeadsProduct:
-        """Make the images of one exposure.
-
-        Args:
-            frames: Level-0 by sensor name, (h, w) uint16; a missing one leaves no image.
-            conditions: temperatures, exposure times, what capture knows.
-            frames_read: called once the pixels of `frames` are no longer needed.
-
-        Raises:
-            ValueError: a frame of the wrong shape or type.
-        """
-        cv2.setNumThreads(self._threads)
-        numba.set_num_threads(max(1, min(self._threads, int(numba.config.NUMBA_NUM_THREADS))))
-        seconds = {"radiometry": 0.0, "resampling": 0.0}
-        temperatures = usable_temperatures(self.rig, conditions, self._thresholds)
-        known = temperatures.placement_temperatures_c
-        heads: dict[str, HeadImage] = {}
+    def _correct(self, exposure: ExposureInput) -> _CorrectedHeads:
+        frames = exposure.frames
         level1: dict[str, Array] = {}
         planes: dict[str, dict[str, Array]] = {}
         statistics: dict[str, FrameStatistics] = {}
-        present = [cone for cone in self.rig.cones if cone.sensors[0].name in frames]
-        for cone in present:
-            sensor = cone.sensors[0]
-            began = time.perf_counter()
-            level1[sensor.name] = np.empty((sensor.height_px, sensor.width_px), np.uint16)
-            statistics[sensor.name] = level1_from_level0(
-                self._correctors[sensor.name],
-                np.ascontiguousarray(frames[sensor.name]),
-                temperature_c=known.get(sensor.probe),
-                exposure_time_s=conditions.exposure_time_s.get(sensor.name, 0.0),
-                tdi_shifts=0,
-                out=level1[sensor.name],
-            )
-            planes[cone.name] = _planes(cone, level1[sensor.name])
-            blank_unread(sensor, frames[sensor.name], *planes[cone.name].values())
-            seconds["radiometry"] += time.perf_counter() - began
-        seen = {**unread_figures(self.rig, frames), **word_format_figures(self.rig, frames)}
-        if frames_read is not None:
-            frames_read()
-        for cone in present:
-            began = time.perf_counter()
-            lattice = self._lattice(cone, known)
-            bands = {
-                name: self._resampled(plane, lattice) for name, plane in planes[cone.name].items()
-            }
-            heads[cone.name] = HeadImage(cone.name, perspective_of(cone), bands)
-            seconds["resampling"] += time.perf_counter() - began
-        area = self._valid_area(heads)
-        seen |= self._step_figures(planes)
-        report = self._quality_report(conditions, temperatures, level1, statistics, area, seen)
-        return HeadsProduct(heads, area, report, seconds)
+        with exposure.clock.stage("radiometry"):
+            for cone in self._present(exposure):
+                sensor = cone.sensors[0]
+                out = np.empty((sensor.height_px, sensor.width_px), np.uint16)
+                statistics[sensor.name] = exposure.correct(self._correctors[sensor.name], out=out)
+                level1[sensor.name] = out
+                planes[cone.name] = _planes(cone, out)
+                unread = statistics[sensor.name].unread_fraction
+                blank_unread(sensor, frames[sensor.name], unread, *planes[cone.name].values())
+        unread_fraction = {name: seen.unread_fraction for name, seen in statistics.items()}
+        figures = unread_figures(unread_fraction), word_format_figures(self.rig, frames)
+        return _CorrectedHeads(level1, statistics, planes, figures)
 
-    def _valid_area(self, heads: Mapping[str, HeadImage]) -> ValidArea:
+    def _adjust(self, exposure: ExposureInput, corrected: _CorrectedHeads) -> _Lattices:
+        """By calibration and drift alone: separate heads have no tie points."""
+        known = exposure.temperatures.placement_temperatures_c
+        with exposure.clock.stage("resampling"):
+            return {cone.name: self._lattice(cone, known) for cone in self._present(exposure)}
+
+    def _resample(
+        self, exposure: ExposureInput, corrected: _CorrectedHeads, adjusted: _Lattices
+    ) -> _Heads:
+        with exposure.clock.stage("resampling"):
+            return {
+                cone.name: HeadImage(
+                    cone.name,
+                    perspective_of(cone),
+                    {
+                        band: self._resampled(plane, adjusted[cone.name])
+                        for band, plane in corrected.planes[cone.name].items()
+                    },
+                )
+                for cone in self._present(exposure)
+            }
+
+    def _judge(self, stages: _HeadStages) -> Judgement:
+        corrected = stages.corrected
+        present = [cone.sensors[0] for cone in self._present(stages.exposure)]
+        figures = (
+            *corrected.figures,
+            *signal_figures(present, corrected.level1, corrected.statistics),
+            self._step_figures(corrected.planes),
+        )
+        return Judgement("heads", figures, self._valid_area(stages.image))
+
+    def _product(
+        self, stages: _HeadStages, judgement: Judgement, report: QualityReport
+    ) -> HeadsProduct:
+        seconds = stages.exposure.clock.seconds
+        return HeadsProduct(stages.image, judgement.valid_area, report, seconds)
+
+    def _present(self, exposure: ExposureInput) -> list[Cone]:
+        return [cone for cone in self.rig.cones if cone.sensors[0].name in exposure.frames]
+
+    def _valid_area(self, heads: _Heads) -> ValidArea:
         cone = self.rig.cone(self.rig.image_cone_name)
         image = perspective_of(cone)
-        columns, rows = grid_of(image.width_px, image.height_px)
-        nothing = np.ones((rows, columns), np.bool_)
-        product = heads[cone.name].bands if cone.name in heads else {}
-        return area_of(
-            {
-                band: gap_cells(product[band], columns, rows, saturated_bit=1)
-                if band in product
-                else nothing
-                for band in _bands(cone)
-            }
-        )
+        cells = grid_of(image.width_px, image.height_px)
+        rasters = heads[cone.name].bands if cone.name in heads else {}
+        return area_of_rasters(rasters, _bands(cone), cells, saturated_bit=1)
 
-    def _quality_report(
-        self,
-        conditions: Conditions,
-        temperatures: UsableTemperatures,
-        level1: Mapping[str, Array],
-        statistics: Mapping[str, FrameStatistics],
-        area: ValidArea,
-        seen: Mapping[str, Figure],
-    ) -> QualityReport:
-        missing = [s.name for s in self.rig.sensors if s.name not in level1]
-        figures = condition_figures(self.rig, conditions, temperatures)
-        figures |= {**valid_area_figures(area), **seen}
-        figures |= {"method": "heads", "missing_sensors": ", ".join(missing) or None}
-        if statistics:
-            saturated = {name: seen.saturated_fraction for name, seen in statistics.items()}
-            worst = max(saturated, key=lambda name: saturated[name])
-            figures |= {
-                "mean_dn": float(np.mean([seen.mean_dn for seen in statistics.values()])),
-                "saturated_fraction": float(np.mean(list(saturated.values()))),
-                "saturated_worst_fraction": saturated[worst],
-                "saturated_worst_sensor": worst,
-                "bright_fraction": bright_level(
-                    [self.rig.sensor(name) for name in level1], list(level1.values())
-                ),
-            }
-        return evaluate(
-            figures,
-            capture_flags=conditions.flags,
-            missing_sensors=missing,
-            missing_probes=temperatures.missing,
-            probes_out_of_range=temperatures.out_of_range,
-            thresholds=self._thresholds,
-            requirements=self._requirements,
-        )
-
-    def _step_figures(self, planes: Mapping[str, Mapping[str, Array]]) -> dict[str, Figure]:
+    def _step_figures(self, planes: Mapping[str, Mapping[str, Array]]) -> FigureGroup:
         """Steps of the signal in green, or in the one band of a head."""
-        leading, rows = {}, {}
+        means = {}
         for name, bands in planes.items():
             sensor = self.rig.cone(name).sensors[0]
-            leading[sensor.name] = bands.get("green", next(iter(bands.values())))
-            rows[sensor.name] = (0, sensor.height_px - 1)
-        return step_figures(
-            signal_steps(self.rig.sensors, line_means_of(self.rig.sensors, leading, rows))
-        )
+            leading = bands.get("green", next(iter(bands.values())))
+            means[sensor.name] = line_means(leading, (0, sensor.height_px - 1))
+        return step_figures(signal_steps(self.rig.sensors, means))
 
     def _lattice(self, cone: Cone, known: Mapping[str, float]) -> Array:
         """Raw (column, row) at every `_CELL_PX`-th pixel; kept while temperatures stay."""
@@ -312,7 +275,7 @@ class HeadPipeline:
             _CELL_PX,
             np.full((1, *(2 * (n - 1) + 1 for n in lattice.shape[:2])), WEIGHT_UNIT, np.uint8),
             np.ones(1, np.float32),
-            interpolation=self._interpolation,
+            interpolation=self.settings.interpolation,
             out=value,
             source=source,
         )

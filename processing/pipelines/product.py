@@ -20,15 +20,15 @@ from processing.mosaic.mounting import PlatformCheck
 from processing.mosaic.precision import UncertaintyContribution
 from processing.mosaic.stitching import Method
 from processing.mosaic.validity import Validity
-from processing.quality.report import QualityReport, Thresholds
-from processing.quality.requirements import QualityRequirements
+from processing.pipelines.exposure_pipeline import StageSettings
+from processing.quality.report import QualityReport
 from processing.quality.valid_area import ValidArea
 
 Array = NDArray[Any]
 
 
-@dataclass(frozen=True)
-class PipelineSettings:
+@dataclass(frozen=True, kw_only=True)
+class PipelineSettings(StageSettings):
     """How exposures are processed.
 
     `method` "fixed" is the earlier method, "pan-only" the experiment without the colour master:
@@ -47,9 +47,6 @@ class PipelineSettings:
     baselines: bool = False
     geometry: bool = True
     relief_fraction: float = 0.01
-    threads: int = 2
-    thresholds: Thresholds = field(default_factory=Thresholds)
-    requirements: QualityRequirements = field(default_factory=QualityRequirements)
     tie_points: TiePointSettings = field(default_factory=TiePointSettings)
     mosaic: MosaicSettings = field(default_factory=MosaicSettings)
     colour: ColourSettings = field(default_factory=ColourSettings)

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 
 class Stopwatch:
-    """`seconds` by the name of each stage that has ended, in order."""
+    """`seconds` by the name of each stage that has ended, in order; a stage may be in parts."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
@@ -20,4 +20,5 @@ class Stopwatch:
         try:
             yield
         finally:
-            self.seconds[name] = time.perf_counter() - began
+            seconds = time.perf_counter() - began
+            self.seconds[name] = self.seconds.get(name, 0.0) + seconds

@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 
 from processing.quality.common_windows import CommonWindows
-from processing.quality.report import Figure
+from processing.quality.figures.image import BandLevelFigures
 from processing.rig import Rig
 
 MIN_WINDOWS: Final = 200
@@ -25,7 +25,6 @@ MIN_CHANGE: Final = 0.5
 MAX_OTHERS: Final = 0.06
 """Of every other ratio meanwhile."""
 MIN_OTHERS: Final = 2
-FIGURE_SUFFIX: Final = "_over_pan"
 
 
 @dataclass(frozen=True)
@@ -48,29 +47,20 @@ class LevelStep:
         )
 
 
-def level_figures(rig: Rig, ground: CommonWindows | None) -> dict[str, Figure]:
+def level_figures(rig: Rig, ground: CommonWindows | None) -> BandLevelFigures | None:
     """The median signal of each band over that of PAN on the same ground."""
     if ground is None or not ground.pan.any():
-        return {}
+        return None
     seen = np.isfinite(ground.mean[ground.pan])
     total = np.where(seen, ground.mean[ground.pan], 0.0).sum(axis=0)
     pan = total / np.where(seen.any(axis=0), seen.sum(axis=0), np.nan)
-    figures: dict[str, Figure] = {}
+    level_by_band: dict[str, float | None] = {}
     for name, mean, of_pan in zip(ground.names, ground.mean, ground.pan, strict=True):
         both = np.isfinite(mean) & np.isfinite(pan) & (pan > 0.0)
         bands = rig.cone_of(name).bands
         if not of_pan and len(bands) == 1 and np.count_nonzero(both) >= MIN_WINDOWS:
-            figures[f"{bands[0]}{FIGURE_SUFFIX}"] = float(np.median(mean[both] / pan[both]))
-    return figures
-
-
-def levels_of(figures: Mapping[str, Figure]) -> dict[str, float]:
-    """Signal over that of PAN by band, from the figures of a quality report."""
-    return {
-        name.removesuffix(FIGURE_SUFFIX): float(value)
-        for name, value in figures.items()
-        if name.endswith(FIGURE_SUFFIX) and isinstance(value, int | float)
-    }
+            level_by_band[bands[0]] = float(np.median(mean[both] / pan[both]))
+    return BandLevelFigures(level_by_band)
 
 
 def level_steps(levels: Mapping[int, Mapping[str, float]]) -> tuple[LevelStep, ...]:

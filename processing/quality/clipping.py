@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.quality.report import Figure
+from processing.quality.figures.image import ClippingFigures
 from processing.rig import Rig, Sensor
 
 Array = NDArray[Any]
@@ -30,7 +30,7 @@ MAX_SHARE_ABOVE: Final = 0.001
 """Of the pixels: defects may lie beyond the level."""
 
 
-def clipping_figures(rig: Rig, frames: Mapping[str, Array]) -> dict[str, Figure]:
+def clipping_figures(rig: Rig, frames: Mapping[str, Array]) -> ClippingFigures | None:
     """Name the frame that is cut off below full scale, the one with most pixels there.
 
     Args:
@@ -43,14 +43,10 @@ def clipping_figures(rig: Rig, frames: Mapping[str, Array]) -> dict[str, Figure]
         if s.name in frames and (cut := clipped_at(s, frames[s.name])) is not None
     }
     if not found:
-        return {}
+        return None
     worst = max(found, key=lambda name: found[name][1])
-    return {
-        "clipped_sensor": worst,
-        "clipped_sensors": ", ".join(found),
-        "clipped_dn": found[worst][0],
-        "clipped_fraction": found[worst][1],
-    }
+    level_dn, share = found[worst]
+    return ClippingFigures(worst, tuple(found), level_dn, share)
 
 
 def clipped_at(sensor: Sensor, frame: Array) -> tuple[int, float] | None:
@@ -61,7 +57,9 @@ def clipped_at(sensor: Sensor, frame: Array) -> tuple[int, float] | None:
         frame: Level-0, (h, w) uint16.
     """
     step = max(STEP[0], len(frame) // ROWS)
-    sample = frame[::step, :: STEP[1]].ravel() // sensor.raw_units_per_dn
+    sample = frame[::step, :: STEP[1]].ravel()
+    if sensor.raw_units_per_dn != 1:
+        sample = sample // sensor.raw_units_per_dn
     counts = np.bincount(sample, minlength=sensor.full_scale_dn + 1)
     above = np.cumsum(counts[::-1])[::-1]
     # The highest value that more than a few defects reach.

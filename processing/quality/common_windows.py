@@ -15,8 +15,14 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from processing.geometry.placement import SensorPlacement, raw_from_vip_mm, vip_mm_from_px
+from processing.geometry.placement import (
+    SensorPlacement,
+    raw_from_vip_mm,
+    vip_mm_from_px,
+    vip_mm_from_raw,
+)
 from processing.geometry.topology import exact_colour_ratio
+from processing.matching.prefetch import fetch_ahead
 from processing.radiometry.level1 import exposed_rows, level1_counts_per_dn
 from processing.rig import Rig, Sensor
 
@@ -27,6 +33,11 @@ WINDOWS: Final = (56, 36)
 WINDOW_PX: Final = 16
 """Side of a window, colour pixels."""
 _COLUMNS: Final = 10
+_BORDER_POINTS: Final = 9
+_BORDER_SHARE: Final = 0.02
+_NO_DATA_LESS_ONE: Final = np.uint32(1 << 31)
+_PART: Final = 64
+"""Windows that one thread measures in a row; the next one is fetched meanwhile."""
 
 
 @dataclass(frozen=True)
@@ -109,11 +120,31 @@ def _inside(placement: SensorPlacement, vip_mm: Array, half_px: int) -> tuple[Ar
     """Raw places (m, 2) of the windows that lie whole in a frame, and which (n,) those are."""
     sensor = placement.sensor
     first, last = exposed_rows(sensor, placement.tdi_shifts)
+    inside = _near(placement, vip_mm)
     with np.errstate(invalid="ignore"):
-        at = raw_from_vip_mm(placement, vip_mm)
-        inside = (at[:, 0] > half_px) & (at[:, 0] < sensor.width_px - half_px - 1)
-        inside &= (at[:, 1] > first + half_px) & (at[:, 1] < last - half_px)
-    return at[inside], inside
+        at = raw_from_vip_mm(placement, vip_mm[inside])
+        whole = (at[:, 0] > half_px) & (at[:, 0] < sensor.width_px - half_px - 1)
+        whole &= (at[:, 1] > first + half_px) & (at[:, 1] < last - half_px)
+    inside[inside] = whole
+    return at[whole], inside
+
+
+def _near(placement: SensorPlacement, vip_mm: Array) -> Array:
+    """Which points (n,) lie in the rectangle around a frame's border in the virtual image.
+
+    The border is bent by the lens: the rectangle of some of its points is widened by
+    `_BORDER_SHARE` of its sides.
+    """
+    sensor = placement.sensor
+    along = np.linspace(0.0, 1.0, _BORDER_POINTS)
+    ends = np.repeat([0.0, 1.0], _BORDER_POINTS)
+    share = np.stack([np.tile(along, 4), np.tile(ends, 2)], axis=1)
+    share[2 * _BORDER_POINTS :] = share[2 * _BORDER_POINTS :, ::-1]
+    border = vip_mm_from_raw(placement, share * (sensor.width_px - 1.0, sensor.height_px - 1.0))
+    low, high = border.min(axis=0), border.max(axis=0)
+    margin = _BORDER_SHARE * (high - low)
+    near: Array = np.all((vip_mm > low - margin) & (vip_mm < high + margin), axis=1)
+    return near
 
 
 def _variance(sensor: Sensor, signal: Array) -> Array:
@@ -128,50 +159,65 @@ def _variance(sensor: Sensor, signal: Array) -> Array:
 def _window_sums(frame, corners, step, size, out):
     """Rows of `out`: near, far, curved, fine (each along columns and along rows), the mean, and 1
     where all pixels are good."""
-    for i in prange(len(corners)):
-        left, top = corners[i, 0], corners[i, 1]
+    side = step * size
+    for part in prange((len(corners) + _PART - 1) // _PART):
         window = np.zeros((size, size), np.float32)
-        bad = np.uint16(0)
-        fine_y = fine_x = np.float32(0.0)
-        for y in range(size):
-            into = window[y]
-            for k in range(step):
-                line = frame[top + y * step + k, left : left + size * step + 1]
-                after = frame[top + y * step + k + 1, left : left + size * step]
+        # Elements of arrays stay 32 bits wide; numba's scalars would be of 64.
+        column = np.zeros(side, np.uint32)
+        union = np.zeros(side, np.uint32)
+        last = min((part + 1) * _PART, len(corners))
+        for i in range(part * _PART, last):
+            left, top = corners[i, 0], corners[i, 1]
+            if i + 1 < last:
+                fetch_ahead(frame, corners[i + 1, 0], corners[i + 1, 1], side + 1, side + 1)
+            union[:] = 0
+            fine_y = fine_x = np.float32(0.0)
+            for y in range(size):
+                column[:] = 0
+                for r in range(top + y * step, top + (y + 1) * step):
+                    line = frame[r, left : left + side + 1]
+                    after = frame[r + 1, left : left + side]
+                    for j in range(side):
+                        word = np.uint32(line[j])
+                        column[j] += word
+                        # The lowest bit of a saturated word, the highest one of no data less one.
+                        union[j] |= word | ((word - np.uint32(1)) & _NO_DATA_LESS_ONE)
+                    for j in range(side):
+                        here = np.float32(line[j])
+                        down = np.float32(after[j]) - here
+                        right = np.float32(line[j + 1]) - here
+                        fine_y += down * down
+                        fine_x += right * right
+                into = window[y]
                 for x in range(size):
-                    total = np.float32(0.0)
+                    total = np.uint32(0)
                     for j in range(x * step, (x + 1) * step):
-                        pixel_value = line[j]
-                        bad |= (pixel_value & np.uint16(1)) | np.uint16(pixel_value == 0)
-                        total += np.float32(pixel_value)
-                    into[x] += total
-                for j in range(size * step):
-                    here = np.float32(line[j])
-                    down = np.float32(after[j]) - here
-                    right = np.float32(line[j + 1]) - here
-                    fine_y += down * down
-                    fine_x += right * right
-        near_y = near_x = far_y = far_x = curved_y = curved_x = mean = np.float32(0.0)
-        for y in range(size - 2):
-            here, below, under = window[y], window[y + 1], window[y + 2]
-            for x in range(size - 2):
-                value = here[x]
-                mean += value
-                one, two = below[x] - value, under[x] - value
-                near_y += one * one
-                far_y += two * two
-                curved_y += (two - one - one) * (two - one - one)
-                one, two = here[x + 1] - value, here[x + 2] - value
-                near_x += one * one
-                far_x += two * two
-                curved_x += (two - one - one) * (two - one - one)
-        inner = np.float64((size - 2) * (size - 2))
-        pixel = np.float64(step * step)
-        square = 1.0 / (inner * pixel * pixel)
-        out[i, 0], out[i, 1] = near_y * square, near_x * square
-        out[i, 2], out[i, 3] = far_y * square, far_x * square
-        out[i, 4], out[i, 5] = curved_y * square, curved_x * square
-        pixels = np.float64(size * size) * pixel
-        out[i, 6], out[i, 7] = fine_y / pixels, fine_x / pixels
-        out[i, 8] = mean / (inner * pixel)
-        out[i, 9] = 1.0 if bad == 0 else 0.0
+                        total += column[j]
+                    into[x] = np.float32(total)
+            near_y = near_x = far_y = far_x = curved_y = curved_x = mean = np.float32(0.0)
+            for y in range(size - 2):
+                here, below, under = window[y], window[y + 1], window[y + 2]
+                for x in range(size - 2):
+                    value = here[x]
+                    mean += value
+                    one, two = below[x] - value, under[x] - value
+                    near_y += one * one
+                    far_y += two * two
+                    curved_y += (two - one - one) * (two - one - one)
+                    one, two = here[x + 1] - value, here[x + 2] - value
+                    near_x += one * one
+                    far_x += two * two
+                    curved_x += (two - one - one) * (two - one - one)
+            good = True
+            for j in range(side):
+                good &= (union[j] & (_NO_DATA_LESS_ONE | np.uint32(1))) == 0
+            inner = np.float64((size - 2) * (size - 2))
+            pixel = np.float64(step * step)
+            square = 1.0 / (inner * pixel * pixel)
+            out[i, 0], out[i, 1] = near_y * square, near_x * square
+            out[i, 2], out[i, 3] = far_y * square, far_x * square
+            out[i, 4], out[i, 5] = curved_y * square, curved_x * square
+            pixels = np.float64(size * size) * pixel
+            out[i, 6], out[i, 7] = fine_y / pixels, fine_x / pixels
+            out[i, 8] = mean / (inner * pixel)
+            out[i, 9] = 1.0 if good else 0.0

@@ -12,6 +12,19 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Final
 
+from processing.quality.figures import QualityFigures
+from processing.quality.figures.circumstances import (
+    EstimatedDcFigures,
+    GeometryFigures,
+    TimeFigures,
+)
+from processing.quality.figures.image import (
+    ContentFigures,
+    UnreadFigures,
+    ValidAreaFigures,
+    ValidFigures,
+)
+from processing.quality.figures.stitching import DisplacedSensorFigures, MisreadProbeFigures
 from processing.quality.image_findings import (
     content_findings,
     exposure_findings,
@@ -21,16 +34,14 @@ from processing.quality.image_findings import (
 )
 from processing.quality.report import (
     NO_FLAGS,
-    Figure,
     Finding,
     Flag,
     QualityReport,
     Thresholds,
     Verdict,
-    finite,
 )
 from processing.quality.requirements import QualityRequirements, requirement_findings
-from processing.quality.rules import above, number, probe_bias_phrase
+from processing.quality.rules import above, probe_bias_phrase
 from processing.quality.stitching_findings import stitching_findings
 
 _CAPTURE: Final[Mapping[Flag, tuple[Verdict, str]]] = {
@@ -108,7 +119,7 @@ _CAPTURE: Final[Mapping[Flag, tuple[Verdict, str]]] = {
 
 
 def evaluate(
-    figures: Mapping[str, Figure],
+    figures: QualityFigures,
     *,
     capture_flags: Flag = NO_FLAGS,
     missing_sensors: Sequence[str] = (),
@@ -121,10 +132,10 @@ def evaluate(
 ) -> QualityReport:
     """Findings and verdict of one exposure from its figures.
 
-    A figure that is missing or None raises nothing: what is not known is not evaluated.
+    A figure that is not determined raises nothing: what is not known is not evaluated.
 
     Args:
-        figures: by documented name.
+        figures: of all steps that looked for any.
         capture_flags: what capture already knows (late frame, event mark missing, ...).
         missing_sensors: sensors whose frame is not there.
         missing_probes: probes that gave no temperature.
@@ -133,7 +144,7 @@ def evaluate(
         mismatched_bands: those of them that have texture that does not match that of green.
         requirements: of the project, if any.
     """
-    t = thresholds or Thresholds()
+    t, figures = thresholds or Thresholds(), figures.finite()
     findings = [
         Finding(flag, *_CAPTURE[flag]) for flag in Flag if flag & capture_flags and flag in _CAPTURE
     ]
@@ -144,9 +155,9 @@ def evaluate(
         figures, [b for b in nominal_bands if b not in mismatched_bands], t
     )
     findings += word_format_findings(figures) + identity_findings(figures)
-    findings += [] if figures.get("mismatched_sensors") else signal_findings(figures, t)
+    findings += [] if figures.of(ContentFigures).mismatched_sensors else signal_findings(figures, t)
     findings += exposure_findings(figures, t)
-    findings += _attitude(figures, t)
+    findings += _attitude(figures.of(GeometryFigures), t)
     broken = list(requirement_findings(figures, requirements or QualityRequirements()))
     findings = [f for f in findings if f.flag not in {b.flag for b in broken}] + broken
     order = list(Verdict)
@@ -154,41 +165,42 @@ def evaluate(
     flags = capture_flags
     for finding in findings:
         flags |= finding.flag
-    return QualityReport(order[worst], flags, tuple(findings), finite(figures))
+    return QualityReport(order[worst], flags, tuple(findings), figures)
 
 
 def _frames(
-    figures: Mapping[str, Figure],
+    figures: QualityFigures,
     capture_flags: Flag,
     missing_sensors: Sequence[str],
     t: Thresholds,
 ) -> list[Finding]:
-    findings = []
+    findings, gap = [], _gap(figures.of(ValidAreaFigures))
     if missing_sensors or capture_flags & Flag.FRAME_MISSING:
         heads = f"Head{'s' * (len(missing_sensors) > 1)} {', '.join(missing_sensors)}"
         findings.append(
             Finding(
                 Flag.FRAME_MISSING,
                 Verdict.USABLE,
-                f"{heads if missing_sensors else 'A head'} sent no image{_gap(figures)}. Check "
+                f"{heads if missing_sensors else 'A head'} sent no image{gap}. Check "
                 "power and cable.",
                 float(len(missing_sensors)) or None,
                 0.0,
             )
         )
-    unread = number(figures, "unread_worst_fraction")
+    worst = figures.of(UnreadFigures)
+    unread = worst.unread_worst_fraction
     if unread is not None and unread > t.unread_fraction:
         findings.append(
             Finding(
                 Flag.FRAME_CORRUPT,
                 Verdict.USABLE,
-                f"{unread:.0%} of {figures.get('unread_worst_sensor')} was not read out: it is "
-                f"below black{_gap(figures)}. Check head and cable.",
+                f"{unread:.0%} of {worst.unread_worst_sensor} was not read out: it is "
+                f"below black{gap}. Check head and cable.",
                 unread,
                 t.unread_fraction,
             )
         )
-    valid = number(figures, "valid_fraction")
+    valid = figures.of(ValidFigures).valid_fraction
     if valid is not None and valid < t.valid_refly_fraction:
         findings.append(
             Finding(
@@ -202,30 +214,29 @@ def _frames(
     return findings
 
 
-def _gap(figures: Mapping[str, Figure]) -> str:
+def _gap(area: ValidAreaFigures) -> str:
     """What of the image is missing, as the end of a sentence; coverage counts it."""
-    valid, band = number(figures, "valid_worst_fraction"), figures.get("valid_worst_band")
+    valid, band = area.valid_worst_fraction, area.valid_worst_band
     if valid is None or not band:
         return ""
     return f"; {1.0 - valid:.0%} of {band} has no valid pixels, which coverage counts as a gap"
 
 
 def _time_and_temperature(
-    figures: Mapping[str, Figure],
+    figures: QualityFigures,
     missing_probes: Sequence[str],
     probes_out_of_range: Sequence[str],
     t: Thresholds,
 ) -> list[Finding]:
+    time = figures.of(TimeFigures)
     findings = above(
-        figures,
-        "time_sigma_ns",
+        time.time_sigma_ns,
         Flag.TIME_SIGMA,
         (t.time_sigma_ns, t.time_sigma_refly_ns),
         "The exposure's time is uncertain; check strobe cable and receiver.",
     )
     findings += above(
-        figures,
-        "time_error_px",
+        time.time_error_px,
         Flag.TIME_SIGMA,
         (t.time_error_px, t.time_error_refly_px),
         "The exposure's time is too uncertain for this speed and GSD; see the time budget: "
@@ -243,8 +254,7 @@ def _time_and_temperature(
             )
         )
     findings += above(
-        figures,
-        "temperature_age_s",
+        figures.of(GeometryFigures).temperature_age_s,
         Flag.TEMPERATURE_STALE,
         (t.temperature_age_s, math.inf),
         "Temperatures are old; check the probe module and its line.",
@@ -264,12 +274,14 @@ def _time_and_temperature(
     return findings
 
 
-def _temperature_by_stitching(figures: Mapping[str, Figure]) -> list[Finding]:
-    disagreeing = figures.get("dc_disagreement")
-    misread, displaced = probe_bias_phrase(figures), figures.get("displaced_sensor")
+def _temperature_by_stitching(figures: QualityFigures) -> list[Finding]:
+    estimated = figures.of(EstimatedDcFigures)
+    disagreeing = estimated.dc_disagreement
+    misread = probe_bias_phrase(figures.of(MisreadProbeFigures))
+    displaced = figures.of(DisplacedSensorFigures).displaced_sensor
     if not (disagreeing or misread):
         return []
-    where = f" of cone {disagreeing}" if disagreeing else ""
+    where = f" of cone {', '.join(disagreeing)}" if disagreeing else ""
     why = "a stuck probe, a moved sensor or an old calibration"
     if misread and displaced:
         why = f"{misread}, or sensor {displaced} has moved"
@@ -279,20 +291,18 @@ def _temperature_by_stitching(figures: Mapping[str, Figure]) -> list[Finding]:
         f"Probe and stitching disagree on the temperature{where}: {why}; check the probe after "
         "landing."
     )
-    value = number(figures, "dc_estimated_k")
+    value = estimated.dc_estimated_k
     return [Finding(Flag.DC_DISAGREEMENT, Verdict.USABLE, sentence, value)]
 
 
-def _attitude(figures: Mapping[str, Figure], t: Thresholds) -> list[Finding]:
+def _attitude(figures: GeometryFigures, t: Thresholds) -> list[Finding]:
     return above(
-        figures,
-        "tilt_deg",
+        figures.tilt_deg,
         Flag.TILT,
         (math.degrees(t.tilt_rad), math.inf),
         "The camera was tilted; check the mount and fly the line level.",
     ) + above(
-        figures,
-        "crab_deg",
+        figures.crab_deg,
         Flag.DRIFT,
         (math.degrees(t.crab_rad), math.inf),
         "The camera does not point along the track; set the drift angle of the mount.",

@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 
 from processing.geometry.placement import SensorPlacement, raw_from_vip_mm, vip_mm_from_raw
 from processing.geometry.topology import exact_colour_ratio
-from processing.image.line_means import BUNDLE_PX
-from processing.quality.report import Figure
-from processing.quality.signal_steps import LineMeans
+from processing.image.line_means import BUNDLE_PX, LineMeans
+from processing.quality.figures.image import BlockFigures
 from processing.radiometry.level1 import exposed_rows, level1_counts_per_dn
 from processing.rig import Rig, Sensor
 
@@ -96,18 +95,20 @@ def block_edges(
     return tuple(sorted(found, key=lambda block: -abs(block.relative)))
 
 
-def block_figures(blocks: tuple[BlockEdge, ...]) -> dict[str, Figure]:
+def block_figures(blocks: tuple[BlockEdge, ...]) -> BlockFigures:
     """The largest edge in figures of the quality report."""
-    worst = blocks[0] if blocks else None
-    return {
-        "block_sensor": None if worst is None else worst.sensor,
-        "block_step_dn": None if worst is None else worst.step_dn,
-        "block_step": None if worst is None else worst.relative,
-        "block_axis": None if worst is None else worst.axis,
-        "block_at": None if worst is None else worst.at,
-        "block_first": None if worst is None else worst.first,
-        "block_last": None if worst is None else worst.last,
-    }
+    if not blocks:
+        return BlockFigures()
+    worst = blocks[0]
+    return BlockFigures(
+        block_sensor=worst.sensor,
+        block_step_dn=worst.step_dn,
+        block_step=worst.relative,
+        block_axis=worst.axis,
+        block_at=worst.at,
+        block_first=worst.first,
+        block_last=worst.last,
+    )
 
 
 @dataclass(frozen=True)
@@ -133,21 +134,12 @@ def _candidates(sensor: Sensor, lines: LineMeans) -> list[_Edge]:
         limit = max(least, OVER_TEXTURE * _texture(by_line))
         pace = length // len(by_line)
         for sign in (1.0, -1.0):
-            for at in np.flatnonzero(_has_run(by_line, sign, limit, RUN)):
-                # Of the lines before and after, too.
-                change = np.diff(by_line[:, max(at - 1, 0) : at + 3], axis=1)
-                here = min(int(at), 1)
-                steps = sign * change[:, here] > limit
-                runs = np.lib.stride_tricks.sliding_window_view(steps, RUN).all(axis=1)
-                start = int(np.argmax(runs))
-                stop = start
-                while stop < len(steps) and steps[stop]:
-                    stop += 1
-                step = float(np.median(change[start:stop, here]))
-                if _blur(change[start:stop], here) > MAX_BLUR * abs(step):
-                    continue
-                first, last = start * pace, min((stop - 1) * pace + BUNDLE_PX, length) - 1
-                edges.append(_Edge(axis, int(at) + offset, first, last, step))
+            places = np.flatnonzero(_has_run(by_line, sign, limit, RUN))
+            starts, stops, steps, blurs = _runs(by_line, places, sign, limit, RUN)
+            for k in np.flatnonzero(blurs <= MAX_BLUR * np.abs(steps)):
+                first = int(starts[k]) * pace
+                last = min((int(stops[k]) - 1) * pace + BUNDLE_PX, length) - 1
+                edges.append(_Edge(axis, int(places[k]) + offset, first, last, float(steps[k])))
     return sorted(edges, key=lambda e: -abs(e.step) * (e.last - e.first))
 
 
@@ -180,6 +172,41 @@ def _has_run(means: Array, sign: float, limit: float, length: int) -> Array:
     return np.asarray(longest >= length)
 
 
+@njit(cache=True, nogil=True)
+def _runs(
+    means: Array, places: Array, sign: float, limit: float, length: int
+) -> tuple[Array, Array, Array, Array]:
+    """The first run of changed bundles at each place that has one.
+
+    Returns:
+        First bundle and the one after the last, the median change, and the larger median change in
+        the lines before and after: a lens spreads edges on the ground over lines.
+    """
+    bundles, lines = means.shape
+    starts = np.zeros(len(places), np.int64)
+    stops = np.zeros(len(places), np.int64)
+    steps = np.zeros(len(places), np.float32)
+    blurs = np.zeros(len(places), np.float32)
+    for j in range(len(places)):
+        at = places[j]
+        start = stop = 0
+        for k in range(bundles):
+            if sign * (means[k, at + 1] - means[k, at]) > limit:
+                stop = k + 1
+            elif stop - start >= length:
+                break
+            else:
+                start = stop = k + 1
+        starts[j], stops[j] = start, stop
+        for line in range(max(at - 1, 0), min(at + 2, lines - 1)):
+            change = np.median(means[start:stop, line + 1] - means[start:stop, line])
+            if line == at:
+                steps[j] = change
+            else:
+                blurs[j] = max(blurs[j], abs(change))
+    return starts, stops, steps, blurs
+
+
 def _cornered(edges: list[_Edge]) -> list[_Edge]:
     """The edges that meet another one in a corner, or have one of the other sign opposite."""
 
@@ -195,12 +222,6 @@ def _cornered(edges: list[_Edge]) -> list[_Edge]:
         )
 
     return [a for a in edges if any(joined(a, b) for b in edges if b is not a)]
-
-
-def _blur(change: Array, at: int) -> float:
-    """The larger change to either side of a step: a lens spreads edges on the ground over lines."""
-    adjacent = [k for k in (at - 1, at + 1) if 0 <= k < change.shape[1]]
-    return max(abs(float(np.median(change[:, k]))) for k in adjacent)
 
 
 def _unshared(

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from processing.geometry.placement import SensorPlacement, vip_mm_from_raw
 from processing.image.colour import BandRegistration
 from processing.matching.tie_points import PAN_TO_COLOUR, TiePoints
-from processing.quality.report import Figure
+from processing.quality.figures.image import IdentityFigures
 from processing.radiometry.level1 import Corrector, exposed_rows
 from processing.rig import Rig, Sensor
 
@@ -25,6 +25,8 @@ Array = NDArray[Any]
 PIXELS: Final = 30_000
 MIN_ROWS: Final = 8
 """Of a frame, evenly over its height, that are looked at."""
+SCREEN: Final = 4
+"""Every so many of these rows are looked at first: they suffice where the pattern is clear."""
 OWN_PATTERN_LIMIT: Final = 6.0
 OTHER_PATTERN_LIMIT: Final = 8.0
 """Correlation with a pattern over its standard deviation: below `OWN` it is not the frame's, above
@@ -93,8 +95,11 @@ def heads_by_pattern(
         own = patterns.of(name, shifts)
         if own is None:
             continue
-        signal = frames[name][_rows(sensor, shifts)].astype(np.float32)
-        change = _relative_change(signal / sensor.raw_units_per_dn - sensor.black_dn)
+        rows = _rows(sensor, shifts)
+        few = _change_of(sensor, frames[name][rows[::SCREEN]])
+        if _correlation_significance(few, own[::SCREEN]) >= OWN_PATTERN_LIMIT:
+            continue
+        change = _change_of(sensor, frames[name][rows])
         if _correlation_significance(change, own) >= OWN_PATTERN_LIMIT:
             continue
         others = {
@@ -116,7 +121,7 @@ def identity_figures(
     placements: Mapping[str, SensorPlacement],
     tie_points: TiePoints,
     bands: Sequence[BandRegistration],
-) -> dict[str, Figure]:
+) -> IdentityFigures:
     """Name frames that came from another head than the one they are stored for.
 
     Args:
@@ -127,11 +132,8 @@ def identity_figures(
         bands: how the others lie against it.
     """
     found = by_pattern or _by_place(rig, placements, tie_points, bands)
-    return {
-        "exchanged_frames": ", ".join(found) or None,
-        "exchanged_from": ", ".join(found.values()) or None,
-        "exchanged_by": None if not found else "fixed pattern" if by_pattern else "geometry",
-    }
+    shown_by = "fixed pattern" if by_pattern else "geometry"
+    return IdentityFigures(tuple(found), tuple(found.values()), shown_by if found else None)
 
 
 def _rows(sensor: Sensor, shifts: int) -> Array:
@@ -139,6 +141,12 @@ def _rows(sensor: Sensor, shifts: int) -> Array:
     count = max(MIN_ROWS, PIXELS // sensor.width_px)
     rows: Array = np.linspace(first, last, count).astype(np.int64)
     return rows
+
+
+def _change_of(sensor: Sensor, lines: Array) -> Array:
+    """Relative change along lines of a Level-0 frame."""
+    signal = lines.astype(np.float32) / sensor.raw_units_per_dn - sensor.black_dn
+    return _relative_change(signal)
 
 
 def _relative_change(lines: Array) -> Array:

@@ -2,19 +2,41 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
-from processing.quality.report import Figure, Finding, Flag, Thresholds, Verdict
-from processing.quality.rules import above, number
+from processing.quality.figures import QualityFigures
+from processing.quality.figures.circumstances import (
+    ExposureScaleFigures,
+    SmearFigures,
+    UnknownExposureFigures,
+)
+from processing.quality.figures.image import (
+    BalanceFigures,
+    BlockFigures,
+    ClippingFigures,
+    ContentFigures,
+    IdentityFigures,
+    LocalBlurFigures,
+    RelativeSharpnessFigures,
+    SaturationFigures,
+    SharpnessFigures,
+    SignalFigures,
+    SignalStepFigures,
+    UnreadFigures,
+    WordFormatFigures,
+)
+from processing.quality.report import Finding, Flag, Thresholds, Verdict
+from processing.quality.rules import above
 
 
-def content_findings(figures: Mapping[str, Figure], bands: Sequence[str]) -> list[Finding]:
+def content_findings(figures: QualityFigures, bands: Sequence[str]) -> list[Finding]:
     """Frames with texture that show other ground than their neighbours."""
-    misread = str(figures.get("word_format_sensors") or "").split(", ")
-    frames = str(figures.get("mismatched_sensors") or "").split(", ")
-    named = ", ".join([*(f for f in frames if f and f not in misread), *bands])
+    content, misread = figures.of(ContentFigures), figures.of(WordFormatFigures)
+    frames = [f for f in content.mismatched_sensors if f not in misread.word_format_sensors]
+    named = ", ".join([*frames, *bands])
     if not named:
         return []
+    positions = content.mismatched_positions
     return [
         Finding(
             Flag.FRAME_CORRUPT,
@@ -22,20 +44,20 @@ def content_findings(figures: Mapping[str, Figure], bands: Sequence[str]) -> lis
             f"The frame of {named} shows other ground than its neighbours although it has texture: "
             "frames swapped, of another exposure, turned or mirrored, or the head has moved. "
             "Check cables and serial numbers of the heads. Fly this exposure again.",
-            number(figures, "mismatched_positions"),
+            None if positions is None else float(positions),
         )
     ]
 
 
-def identity_findings(figures: Mapping[str, Figure]) -> list[Finding]:
+def identity_findings(figures: QualityFigures) -> list[Finding]:
     """Frames that are stored for another head than the one that took them."""
-    frames, heads = figures.get("exchanged_frames"), figures.get("exchanged_from")
-    if not frames or not heads:
+    identity = figures.of(IdentityFigures)
+    if not identity.exchanged_frames:
         return []
-    pairs = zip(str(frames).split(", "), str(heads).split(", "), strict=True)
+    pairs = zip(identity.exchanged_frames, identity.exchanged_from, strict=True)
     named = ", ".join(f"the frame of {frame} comes from head {head}" for frame, head in pairs)
     shown = "by the fixed pattern of their pixels"
-    if figures.get("exchanged_by") == "geometry":
+    if identity.exchanged_by == "geometry":
         shown = "by their places, or both heads have turned alike"
     return [
         Finding(
@@ -48,44 +70,47 @@ def identity_findings(figures: Mapping[str, Figure]) -> list[Finding]:
     ]
 
 
-def word_format_findings(figures: Mapping[str, Figure]) -> list[Finding]:
+def word_format_findings(figures: QualityFigures) -> list[Finding]:
     """Words in another format than the rig file states."""
-    word_format = figures.get("word_format")
-    if not word_format:
+    words = figures.of(WordFormatFigures)
+    if not words.word_format:
         return []
+    sensors, word_format = ", ".join(words.word_format_sensors), ", ".join(words.word_format)
     return [
         Finding(
             Flag.FRAME_CORRUPT,
             Verdict.REFLY,
-            f"The words of {figures.get('word_format_sensors')} are {word_format}, not as in the rig "
-            "file: set the pixel format of the head, or `bits` and `justified` in the rig "
-            "file. The pixels stored are good; process them again with the right rig file.",
+            f"The words of {sensors} are {word_format}, not as in the rig file: set the pixel format "
+            "of the head, or `bits` and `justified` in the rig file. The pixels stored are good; "
+            "process them again with the right rig file.",
         )
     ]
 
 
-def signal_findings(figures: Mapping[str, Figure], t: Thresholds) -> list[Finding]:
+def signal_findings(figures: QualityFigures, t: Thresholds) -> list[Finding]:
     """Signal that a head or its read-out has changed."""
     findings = []
-    step = number(figures, "signal_step")
+    steps, unread = figures.of(SignalStepFigures), figures.of(UnreadFigures)
+    step = steps.signal_step
     # Lines that were not read out are a step, too.
-    unread = number(figures, "unread_worst_fraction") or 0.0
-    unread_sensor = figures.get("unread_worst_sensor") if unread > t.unread_fraction else None
-    if step is not None and figures.get("signal_step_sensor") != unread_sensor:
-        lines = number(figures, "signal_step_lines") or 1.0
-        where = f"{figures.get('signal_step_axis')} of {figures.get('signal_step_sensor')}"
+    is_unread = (unread.unread_worst_fraction or 0.0) > t.unread_fraction
+    unread_sensor = unread.unread_worst_sensor if is_unread else None
+    if step is not None and steps.signal_step_sensor != unread_sensor:
+        lines = steps.signal_step_lines or 1
+        where = f"{steps.signal_step_axis} of {steps.signal_step_sensor}"
         sentence = (
-            f"The signal changes by {step:+.0%} after line {figures.get('signal_step_at')} of the "
+            f"The signal changes by {step:+.0%} after line {steps.signal_step_at} of the "
             f"{where}: gain or offset changed during read-out. Radiometry of this frame is wrong. "
             "Check the head."
         )
-        if lines > 2.0:
+        if lines > 2:
             sentence = (
-                f"The {where} show banding of {abs(step):.0%} in {lines:.0f} lines: check power "
+                f"The {where} show banding of {abs(step):.0%} in {lines} lines: check power "
                 "supply and cable of the head. Radiometry of this frame is wrong."
             )
         findings.append(Finding(Flag.FRAME_CORRUPT, Verdict.USABLE, sentence, step))
-    outlier, signal = figures.get("gain_outlier"), number(figures, "gain_outlier_signal")
+    balance = figures.of(BalanceFigures)
+    outlier, signal = balance.gain_outlier, balance.gain_outlier_signal
     if outlier and signal is not None:
         findings.append(
             Finding(
@@ -99,22 +124,24 @@ def signal_findings(figures: Mapping[str, Figure], t: Thresholds) -> list[Findin
                 1.0,
             )
         )
-    return findings + _block(figures, t) + _clipping(figures, t) + _local_blur(figures, t)
+    findings += _block(figures.of(BlockFigures), t)
+    findings += _clipping(figures.of(ClippingFigures), t)
+    return findings + _blur(figures.of(RelativeSharpnessFigures), figures.of(LocalBlurFigures), t)
 
 
-def _block(figures: Mapping[str, Figure], t: Thresholds) -> list[Finding]:
+def _block(block: BlockFigures, t: Thresholds) -> list[Finding]:
     """A rectangle of a frame with another offset or gain."""
-    step, step_dn = number(figures, "block_step"), number(figures, "block_step_dn")
+    step, step_dn = block.block_step, block.block_step_dn
     if step is None or step_dn is None or abs(step) <= t.block_step:
         return []
-    other = "columns" if figures.get("block_axis") == "rows" else "rows"
+    other = "columns" if block.block_axis == "rows" else "rows"
     return [
         Finding(
             Flag.FRAME_CORRUPT,
             Verdict.USABLE,
-            f"A block of {figures.get('block_sensor')} differs by {step_dn:+.0f} DN ({step:+.0%}): "
-            f"an edge after {str(figures.get('block_axis'))[:-1]} {figures.get('block_at')}, "
-            f"{other} {figures.get('block_first')} to {figures.get('block_last')}, follows a line "
+            f"A block of {block.block_sensor} differs by {step_dn:+.0f} DN ({step:+.0%}): "
+            f"an edge after {str(block.block_axis)[:-1]} {block.block_at}, "
+            f"{other} {block.block_first} to {block.block_last}, follows a line "
             "of pixels and no other head shows it. Radiometry of this frame is wrong. Check the "
             "head and its cable.",
             step,
@@ -123,17 +150,17 @@ def _block(figures: Mapping[str, Figure], t: Thresholds) -> list[Finding]:
     ]
 
 
-def _clipping(figures: Mapping[str, Figure], t: Thresholds) -> list[Finding]:
+def _clipping(clipping: ClippingFigures, t: Thresholds) -> list[Finding]:
     """A frame that ends below full scale."""
-    share, level_dn = number(figures, "clipped_fraction"), number(figures, "clipped_dn")
+    share, level_dn = clipping.clipped_fraction, clipping.clipped_dn
     if share is None or level_dn is None or share <= t.clipped_fraction:
         return []
     return [
         Finding(
             Flag.OVEREXPOSED,
             Verdict.USABLE,
-            f"Head {figures.get('clipped_sensors')} gives no signal above {level_dn:.0f} DN, below "
-            f"full scale: {share:.1%} of the pixels of {figures.get('clipped_sensor')} lie at "
+            f"Head {', '.join(clipping.clipped_sensors)} gives no signal above {level_dn} DN, below "
+            f"full scale: {share:.1%} of the pixels of {clipping.clipped_sensor} lie at "
             "that value, and what is brighter is lost. Check gain, bits and lookup table of the "
             "head.",
             share,
@@ -142,10 +169,12 @@ def _clipping(figures: Mapping[str, Figure], t: Thresholds) -> list[Finding]:
     ]
 
 
-def _local_blur(figures: Mapping[str, Figure], t: Thresholds) -> list[Finding]:
+def _blur(
+    relative: RelativeSharpnessFigures, local: LocalBlurFigures, t: Thresholds
+) -> list[Finding]:
     """A PAN head, or a region of any frame, that is less sharp than others of the same ground."""
     findings = []
-    blurred, ratio = figures.get("blurred_sensor"), number(figures, "blurred_ratio")
+    blurred, ratio = relative.blurred_sensor, relative.blurred_ratio
     if blurred and ratio is not None:
         findings.append(
             Finding(
@@ -156,9 +185,16 @@ def _local_blur(figures: Mapping[str, Figure], t: Thresholds) -> list[Finding]:
                 ratio,
             )
         )
-    for kind, least in (("colour", t.colour_blur_deficit), ("pan", t.pan_blur_deficit)):
-        deficit = number(figures, f"{kind}_blur_deficit")
-        name, region = figures.get(f"{kind}_blur_sensor"), figures.get(f"{kind}_blur_region")
+    for name, deficit, region, least in (
+        (
+            *(local.colour_blur_sensor, local.colour_blur_deficit, local.colour_blur_region),
+            t.colour_blur_deficit,
+        ),
+        (
+            *(local.pan_blur_sensor, local.pan_blur_deficit, local.pan_blur_region),
+            t.pan_blur_deficit,
+        ),
+    ):
         if deficit is None or deficit <= least or name == blurred:
             continue
         findings.append(
@@ -174,9 +210,9 @@ def _local_blur(figures: Mapping[str, Figure], t: Thresholds) -> list[Finding]:
     return findings
 
 
-def exposure_findings(figures: Mapping[str, Figure], t: Thresholds) -> list[Finding]:
+def exposure_findings(figures: QualityFigures, t: Thresholds) -> list[Finding]:
     findings = []
-    bright = number(figures, "bright_fraction")
+    bright = figures.of(SignalFigures).bright_fraction
     if bright is not None and bright < t.bright_fraction:
         black = bright < t.bright_refly_fraction
         findings.append(
@@ -190,7 +226,7 @@ def exposure_findings(figures: Mapping[str, Figure], t: Thresholds) -> list[Find
                 t.bright_refly_fraction if black else t.bright_fraction,
             )
         )
-    unknown = figures.get("exposure_unknown_sensors")
+    unknown = ", ".join(figures.of(UnknownExposureFigures).exposure_unknown_sensors)
     if unknown:
         findings.append(
             Finding(
@@ -201,7 +237,8 @@ def exposure_findings(figures: Mapping[str, Figure], t: Thresholds) -> list[Find
                 "and process it again, or compare colours on the ground.",
             )
         )
-    scale, scaled = number(figures, "exposure_scale"), figures.get("exposure_scaled_sensor")
+    corrected = figures.of(ExposureScaleFigures)
+    scale, scaled = corrected.exposure_scale, corrected.exposure_scaled_sensor
     if scale is not None and scale > t.exposure_scale:
         findings.append(
             Finding(
@@ -215,21 +252,20 @@ def exposure_findings(figures: Mapping[str, Figure], t: Thresholds) -> list[Find
             )
         )
     findings += above(
-        figures,
-        "saturated_fraction",
+        figures.of(SaturationFigures).saturated_fraction,
         Flag.OVEREXPOSED,
         (t.saturated_fraction, t.saturated_refly_fraction),
         "Parts of the image are saturated; shorten the exposure.",
     )
-    for name, way in (("smear_along_px", "along"), ("smear_across_px", "across")):
+    smear = figures.of(SmearFigures)
+    for smear_px, way in ((smear.smear_along_px, "along"), (smear.smear_across_px, "across")):
         findings += above(
-            figures,
-            name,
+            smear_px,
             Flag.BLUR,
             (t.smear_px, t.smear_refly_px),
             f"Motion blur {way} track; shorten the exposure, check TDI, speed, mount and crab.",
         )
-    sharpness = number(figures, "sharpness")
+    sharpness = figures.of(SharpnessFigures).sharpness
     if sharpness is not None and sharpness < t.sharpness:
         findings.append(
             Finding(

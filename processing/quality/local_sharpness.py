@@ -7,14 +7,17 @@ head resolves as finely, but blur takes detail that the rest of the image has.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from processing.quality.common_windows import CommonWindows
-from processing.quality.report import Figure
+from processing.quality.figures.image import LocalBlurFigures
 from processing.rig import Rig
 
 Array = NDArray[Any]
@@ -59,27 +62,30 @@ def local_blurs(ground: CommonWindows) -> tuple[LocalBlur, ...]:
     return tuple(found)
 
 
-def local_blur_figures(rig: Rig, ground: CommonWindows | None) -> dict[str, Figure]:
+def local_blur_figures(rig: Rig, ground: CommonWindows | None) -> LocalBlurFigures:
     """The colour head and the PAN head with the least sharp region, in figures of the report.
 
     Of PAN only what the next frame does not have counts: grounds differ in how their detail goes on
     below the pixels of colour, and then in several frames.
     """
     blurs = () if ground is None else local_blurs(ground)
-    figures: dict[str, Figure] = {}
-    for kind, of_kind in (
-        ("colour", [b for b in blurs if not b.pan]),
-        ("pan", [b for b in blurs if b.pan]),
-    ):
-        ordered = sorted(of_kind, key=lambda b: -b.deficit)
-        worst = ordered[0] if ordered else None
-        usual = max(0.0, ordered[1].deficit) if kind == "pan" and len(ordered) > 1 else 0.0
-        figures |= {
-            f"{kind}_blur_sensor": None if worst is None else worst.sensor,
-            f"{kind}_blur_deficit": None if worst is None else worst.deficit - usual,
-            f"{kind}_blur_region": None if worst is None else _pixels(rig, worst),
-        }
-    return figures
+    colour, _ = _least_sharp([b for b in blurs if not b.pan])
+    pan, next_pan = _least_sharp([b for b in blurs if b.pan])
+    usual = 0.0 if next_pan is None else max(0.0, next_pan.deficit)
+    return LocalBlurFigures(
+        colour_blur_sensor=None if colour is None else colour.sensor,
+        colour_blur_deficit=None if colour is None else colour.deficit,
+        colour_blur_region=None if colour is None else _pixels(rig, colour),
+        pan_blur_sensor=None if pan is None else pan.sensor,
+        pan_blur_deficit=None if pan is None else pan.deficit - usual,
+        pan_blur_region=None if pan is None else _pixels(rig, pan),
+    )
+
+
+def _least_sharp(blurs: Sequence[LocalBlur]) -> tuple[LocalBlur | None, LocalBlur | None]:
+    """The least sharp region, and the next."""
+    worst, following, *_ = [*sorted(blurs, key=lambda blur: -blur.deficit), None, None]
+    return worst, following
 
 
 def _pixels(rig: Rig, blur: LocalBlur) -> str:
@@ -122,29 +128,55 @@ def _worst_region(
     place: Array, deficits: Array
 ) -> tuple[float, tuple[float, float, float, float], Literal["columns", "rows"]] | None:
     """The largest median deficit of any region of a frame, in either direction."""
-    worst = None
-    inside = np.isfinite(place[:, 0])
-    cell = np.floor(np.where(np.isfinite(place), place, 0.0) * CELLS)
+    medians = _region_medians(place, deficits)
+    if not np.isfinite(medians).any():
+        return None
+    left, top, axis = (int(k) for k in np.unravel_index(np.nanargmax(medians), medians.shape))
+    region = (left / CELLS, top / CELLS, (left + 2) / CELLS, (top + 2) / CELLS)
+    return float(medians[left, top, axis]), region, _AXES[axis]
+
+
+@njit(cache=True, nogil=True)
+def _region_medians(place: Array, deficits: Array) -> Array:
+    """Medians (left, top, axis) of finite deficits (n, 2); NaN of fewer than `MIN_WINDOWS`."""
+    medians = np.full((CELLS - 1, CELLS - 1, 2), np.nan)
+    values = np.empty(len(place))
     for left in range(CELLS - 1):
         for top in range(CELLS - 1):
-            here = inside & (cell[:, 0] >= left) & (cell[:, 0] <= left + 1)
-            here &= (cell[:, 1] >= top) & (cell[:, 1] <= top + 1)
-            for k, along in enumerate(_AXES):
-                values = deficits[here, k]
-                values = values[np.isfinite(values)]
-                if len(values) < MIN_WINDOWS:
-                    continue
-                deficit = float(np.median(values))
-                if worst is None or deficit > worst[0]:
-                    region = (left / CELLS, top / CELLS, (left + 2) / CELLS, (top + 2) / CELLS)
-                    worst = (deficit, region, along)
-    return worst
+            for axis in range(2):
+                count = 0
+                for i in range(len(place)):
+                    if not (np.isfinite(place[i, 0]) and np.isfinite(deficits[i, axis])):
+                        continue
+                    column, row = np.floor(place[i, 0] * CELLS), np.floor(place[i, 1] * CELLS)
+                    if left <= column <= left + 1 and top <= row <= top + 1:
+                        values[count] = deficits[i, axis]
+                        count += 1
+                if count >= MIN_WINDOWS:
+                    medians[left, top, axis] = np.median(values[:count])
+    return medians
 
 
 def _median(values: Array) -> Array:
     """Median along the first axis of what is there; NaN where nothing is."""
-    if not len(values):
-        return np.full(values.shape[1:], np.nan)
-    empty = ~np.isfinite(values).any(axis=0)
-    median: Array = np.nanmedian(np.where(empty, 0.0, values), axis=0)
-    return np.where(empty, np.nan, median)
+    flat = np.ascontiguousarray(values.reshape(len(values), math.prod(values.shape[1:])))
+    return np.asarray(_column_medians(flat).reshape(values.shape[1:]))
+
+
+@njit(cache=True, nogil=True)
+def _column_medians(values: Array) -> Array:
+    """Medians of the columns (k, n) without NaN; NaN where no value of a column is finite."""
+    medians = np.full(values.shape[1], np.nan)
+    column = np.empty(len(values))
+    for i in range(values.shape[1]):
+        count = finite = 0
+        for k in range(len(values)):
+            if not np.isnan(values[k, i]):
+                column[count] = values[k, i]
+                count += 1
+                finite += np.isfinite(values[k, i])
+        if finite:
+            found = column[:count]
+            found.sort()
+            medians[i] = 0.5 * (found[(count - 1) // 2] + found[count // 2])
+    return medians

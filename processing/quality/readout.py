@@ -12,70 +12,56 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.quality.report import Figure
-from processing.rig import Rig, Sensor
+from processing.quality.figures.image import UnreadFigures
+from processing.radiometry.level1 import min_raw_value
+from processing.rig import Sensor
 
 Array = NDArray[Any]
 
-_NOISES: Final = 10.0
-_STEP: Final = (1, 256)
-"""Of rows and columns looked at: every line, by a few of its pixels; a lost packet is longer."""
 _SHARE: Final = 1e-3
 """Of the pixels looked at; fewer below black are defects, which calibration interpolates."""
 _RUN_PX: Final = 16
 """Along a row: what a lost packet takes is longer, a cluster of defects is shorter."""
 
 
-def unread_figures(rig: Rig, frames: Mapping[str, Array]) -> dict[str, Figure]:
+def unread_figures(unread_fraction: Mapping[str, float | None]) -> UnreadFigures | None:
     """The sensor with the largest share of words far below black, and that share.
 
-    Lines that were lost on the way, and a head without pixels, are zeros. Sensors whose black level
-    is not above the noise are skipped.
+    Lines that were lost on the way, and a head without pixels, are zeros.
 
     Args:
-        rig: the camera.
-        frames: Level-0 frames by sensor name, (h, w) uint16, DN.
+        unread_fraction: `processing.radiometry.level1.FrameStatistics.unread_fraction` by sensor
+            name; sensors without one are skipped.
     """
-    shares = {
-        sensor.name: share
-        for sensor in rig.sensors
-        if sensor.name in frames
-        and (share := _unread_share(sensor, frames[sensor.name])) is not None
-    }
+    shares = {name: share for name, share in unread_fraction.items() if share is not None}
     if not shares:
-        return {}
+        return None
     worst = max(shares, key=lambda name: shares[name])
-    return {"unread_worst_fraction": shares[worst], "unread_worst_sensor": worst}
+    return UnreadFigures(shares[worst], worst)
 
 
-def blank_unread(sensor: Sensor, frame: Array, *level1: Array) -> None:
+def blank_unread(
+    sensor: Sensor, frame: Array, unread_fraction: float | None, *level1: Array
+) -> bool:
     """Write no data (0) into corrected frames where the raw frame was not read out.
 
     Looks at every pixel only where a sample of them shows that lines are missing.
 
     Args:
+        sensor: of the frame.
         frame: Level-0, (h, w) uint16, DN.
+        unread_fraction: share of its words far below black among those compared, None for unknown.
         level1: corrected frames of the same shape, changed in place.
+
+    Returns:
+        Whether they were changed.
     """
-    if (_unread_share(sensor, frame) or 0.0) < _SHARE:
-        return
-    low = (frame < _min_raw_value(sensor)).astype(np.uint8)
+    if (unread_fraction or 0.0) < _SHARE:
+        return False
+    low = (frame < min_raw_value(sensor)).astype(np.uint8)
     run = np.ones((1, _RUN_PX), np.uint8)
     # OpenCV's own opening with an even length moves the result by one pixel.
     lost = cv2.dilate(cv2.erode(low, run), run, anchor=((_RUN_PX - 1) // 2, 0)) != 0
     for corrected in level1:
         corrected[lost] = 0
-
-
-def _unread_share(sensor: Sensor, frame: Array) -> float | None:
-    least = _min_raw_value(sensor)
-    if least <= 0:
-        return None
-    seen = frame[:: _STEP[0], :: _STEP[1]]
-    return float(np.count_nonzero(seen < least)) / seen.size
-
-
-def _min_raw_value(sensor: Sensor) -> int:
-    noise_dn = sensor.read_noise_e / sensor.electrons_per_dn
-    least_dn = int(sensor.black_dn - _NOISES * max(noise_dn, 1.0))
-    return least_dn * sensor.raw_units_per_dn
+    return bool(lost.any())

@@ -17,7 +17,7 @@ from processing.geometry.placement import SensorPlacement
 from processing.geometry.topology import overlaps
 from processing.image.sharpness import sharpness
 from processing.matching.tie_point_search import overlap_pixels
-from processing.quality.report import Figure
+from processing.quality.figures.image import RelativeSharpnessFigures
 from processing.rig import Rig
 
 Array = NDArray[Any]
@@ -32,7 +32,7 @@ MIN_DETAIL: Final = 0.05
 
 def relative_sharpness_figures(
     rig: Rig, placements: Mapping[str, SensorPlacement], frames: Mapping[str, Array]
-) -> dict[str, Figure]:
+) -> RelativeSharpnessFigures | None:
     """The PAN head that shows least of its neighbours' fine detail, if it is clearly less.
 
     Args:
@@ -48,8 +48,7 @@ def relative_sharpness_figures(
         shares = []
         for name in (a, b):
             left, right, top, low = overlap_pixels(placements[name], overlap)
-            part = np.ascontiguousarray(frames[name][top : low + 1, left : right + 1])
-            shares.append(sharpness(rig.sensor(name), part, (0, len(part) - 1)))
+            shares.append(sharpness(rig.sensor(name), frames[name], (top, low), (left, right)))
         for of_a, of_b in zip(*shares, strict=True):
             if of_a is None or of_b is None:
                 continue
@@ -60,11 +59,11 @@ def relative_sharpness_figures(
     # Blurred is who is so against most neighbours; along one direction is enough.
     worst = {name: _typical(found) for name, found in ratios.items()}
     if not worst:
-        return {}
+        return None
     name = min(worst, key=lambda n: worst[n])
     if worst[name] >= MIN_RATIO:
-        return {"blurred_sensor": None, "blurred_ratio": None}
-    return {"blurred_sensor": name, "blurred_ratio": worst[name]}
+        return RelativeSharpnessFigures()
+    return RelativeSharpnessFigures(name, worst[name])
 
 
 def _typical(found: list[float]) -> float:

@@ -1,6 +1,6 @@
 """The quality report of one exposure: flags, the figures behind them, and the verdict.
 
-Every figure has one documented name (`FIGURES`). How figures become findings is in
+The figures are in `processing.quality.figures`. How figures become findings is in
 `processing.quality.evaluation`.
 """
 
@@ -8,15 +8,14 @@ from __future__ import annotations
 
 import enum
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-Figure = float | int | str | None
+from processing.quality.figures import QualityFigures
 
 
 class Flag(enum.IntFlag):
-    """The documented bit set (docs/formats.md). A bit keeps its place in all versions."""
+    """The documented bit set (docs/reference/formats.md). A bit keeps its place in all versions."""
 
     FRAME_MISSING = 1 << 0
     FRAME_LATE = 1 << 1
@@ -73,12 +72,12 @@ class Finding:
 
 @dataclass(frozen=True)
 class QualityReport:
-    """What is known about one exposure. `figures` are numbers by documented name."""
+    """What is known about one exposure; `figures` hold no NaN and no infinity."""
 
     verdict: Verdict
     flags: Flag
     findings: tuple[Finding, ...]
-    figures: Mapping[str, float | int | str | None] = field(default_factory=dict)
+    figures: QualityFigures = field(default_factory=QualityFigures)
 
 
 @dataclass(frozen=True)
@@ -133,159 +132,6 @@ class Thresholds:
     valid_refly_fraction: float = 0.75
 
 
-FIGURES: Final[Mapping[str, str]] = {
-    "method": "how the image was stitched: free, fixed",
-    "sigma0": "a posteriori standard deviation of unit weight",
-    "sigma0_px": "sigma0 as one P/P coordinate difference, PAN pixels",
-    "sigma0_um": "the same in um in the image plane",
-    "redundancy": "redundancy of the adjustment",
-    "outliers": "tie points rejected by data snooping",
-    "tie_points_pp": "tie points between PAN sensors",
-    "tie_points_pc": "tie points between PAN and the colour master",
-    "tie_points_min_overlap": "tie points in the poorest overlap",
-    "tie_points_min_overlap_name": "which overlap that is",
-    "tie_points_min_overlap_burnt": "share of matching windows there that hold saturated pixels, "
-    "where points are too few",
-    "dc_k": "temperature at exposure less that at calibration, mean of the PAN cones, K",
-    "dc_estimated_k": "the same as the stitching sees it, cones of two or more CCDs, K",
-    "dc_estimated_sigma_k": "standard deviation of that; null where it cannot be determined",
-    "dc_disagreement": "cones whose probes and stitching disagree, comma separated",
-    "stitched_sigma_px": "standard deviation of a stitched point, RMS over PAN sensors, pixels",
-    "stitched_sigma_worst_px": "the same of the worst PAN sensor",
-    "stitched_sigma_worst_sensor": "which sensor that is",
-    "displaced_sensor": "name of the one master sensor found displaced",
-    "displacement_x_px": "its displacement against calibration and TDM, PAN pixels, x right",
-    "displacement_y_px": "the same, y up",
-    "displacement_sigma_px": "standard deviation of a coordinate of it",
-    "displacement_test": "test statistic over its critical value; above one is significant",
-    "displaced_alternatives": "master sensors that explain the stitching nearly as well",
-    "displaced_several": "1 where one displaced sensor does not explain it all: several moved",
-    "misread_probe": "probe of the master cone whose error explains the stitching as well as the "
-    "displaced sensor; without one, better than any",
-    "misread_k": "how much too high it reads then, K",
-    "misread_sigma_k": "standard deviation of that",
-    "relative_displacements": "pairs of sensors of one cone found displaced against each other",
-    "platform_test": "mountings of converging heads, or scale and rotation of the layers of the "
-    "other cones, against the platform calibration: test statistic over its critical value; above "
-    "one is significant",
-    "platform_shift_px": "how far the head that moved most went by it, PAN pixels at its middle",
-    "platform_shift_head": "which head that is",
-    "platform_causes": "cones whose change explains the layers, comma separated; the master's name "
-    "where all others changed alike",
-    "platform_alternatives": "cones that explain them nearly as well",
-    "platform_master_changed": "1 where the master cone is among these: the image is not corrected",
-    "common_scale_ppm": "change of scale that all layers share against calibration and drift",
-    "common_scale_sigma_ppm": "standard deviation of that by calibration, drift and tie points",
-    "mismatched_sensors": "frames with texture that match no neighbour, comma separated",
-    "mismatched_positions": "textured positions of the worst of them that were tried",
-    "shifted_sensors": "frames found farther from their calibrated place than points are sought",
-    "shifted_px": "how far the farthest of them was, PAN pixels",
-    "slip_sensor": "frame with a band of rows or columns that lies elsewhere than the rest",
-    "slip_alternatives": "frames that explain the same tie points nearly as well",
-    "slip_cone": "the cone of that frame",
-    "slip_px": "by how much it is shifted, PAN pixels",
-    "slip_axis": "rows or columns",
-    "slip_first": "first row or column of the band, raw pixels",
-    "slip_last": "last row or column of the band",
-    "slip_sensors": "all frames with such a band, comma separated",
-    "platform_residual_px": "largest shift an affine transformation still finds between heads",
-    "platform_scale_ppm": "largest difference of scale between a converging head and its "
-    "neighbours that its rotation does not explain",
-    "platform_scale_head": "which head that is",
-    "projection_height_m": "height above ground a virtual camera projected its heads onto",
-    "head_parallax_px": "parallax relief may leave between PAN heads after that, PAN pixels",
-    "undetermined": "sensors and cones the tie points did not place, held at calibration and TDM",
-    "resting_on_calibration": "PAN sensors that tie points place too poorly, supported",
-    "smear_along_px": "motion during exposure along track that TDI left, worst PAN cone, pixels",
-    "smear_across_px": "the same across track",
-    "smear_worst_head": "without a virtual image: the head whose ground moves farthest; the way's "
-    "length, where the head sees it longest, is smear_along_px",
-    "gsd_m": "ground sampling distance of the virtual image",
-    "unread_worst_fraction": "share of the worst sensor's pixels far below black: not read out",
-    "unread_worst_sensor": "which sensor that is",
-    "saturated_fraction": "share of saturated pixels, all PAN sensors",
-    "saturated_worst_fraction": "the same of the worst sensor",
-    "saturated_worst_sensor": "which sensor that is",
-    "mean_dn": "mean signal above black of the PAN sensors, DN",
-    "bright_fraction": "95th percentile of PAN signal as a share of full scale",
-    "balance_spread": "largest over smallest gain between PAN heads, less one",
-    "gain_outlier": "PAN sensor whose signal in the overlaps is far off that of the others",
-    "gain_outlier_signal": "its signal over theirs",
-    "signal_step": "largest change of signal from one whole line of a frame to the next, relative",
-    "signal_step_sensor": "the frame it is in",
-    "signal_step_axis": "rows or columns",
-    "signal_step_at": "the last line before it, raw pixels",
-    "signal_step_lines": "lines of the frame where the signal steps; many are banding",
-    "word_format": "what is wrong with the words of a frame: left-justified, byte-swapped, beyond "
-    "the sensor's bits",
-    "word_format_sensors": "the frames it is wrong in, comma separated",
-    "blurred_sensor": "PAN sensor that is less sharp than its neighbours in their overlaps",
-    "blurred_ratio": "its fine detail over theirs",
-    "colour_blur_sensor": "colour sensor with the region that is least sharp against the other "
-    "frames of the same ground",
-    "colour_blur_deficit": "what is missing there of the share of the finest detail",
-    "colour_blur_region": "which region, raw pixels",
-    "pan_blur_sensor": "PAN sensor with the region that has least detail of its own pixels for "
-    "what colour sees there",
-    "pan_blur_deficit": "how many times less energy than usual, natural logarithm, beyond that "
-    "of the next frame's region",
-    "pan_blur_region": "which region, raw pixels",
-    "exchanged_frames": "frames that another head took than the one they are stored for, comma "
-    "separated",
-    "exchanged_from": "the heads they came from, in the same order",
-    "exchanged_by": "what shows it: fixed pattern, geometry",
-    "exposure_unknown_sensors": "colour frames whose exposure time the record does not state while "
-    "it states others, comma separated",
-    "exposure_scaled_sensor": "frame whose level was corrected most for an exposure time other "
-    "than that of the other cones",
-    "exposure_scale": "what its signal was multiplied by",
-    "red_over_pan": "signal of red over that of PAN on the same ground, median",
-    "green_over_pan": "signal of green over that of PAN on the same ground, median",
-    "blue_over_pan": "signal of blue over that of PAN on the same ground, median",
-    "nir_over_pan": "signal of near infrared over that of PAN on the same ground, median",
-    "clipped_sensor": "frame whose signal ends at one value below full scale",
-    "clipped_sensors": "all such frames, comma separated",
-    "clipped_dn": "that value, raw DN",
-    "clipped_fraction": "share of its pixels there",
-    "block_sensor": "frame with a block whose signal differs: its edges follow lines of pixels, "
-    "and no other head shows them",
-    "block_step_dn": "change of signal over its edge, DN",
-    "block_step": "the same, relative",
-    "block_axis": "the edge runs between two rows or two columns",
-    "block_at": "the last line before it, raw pixels",
-    "block_first": "first pixel of the edge in these lines",
-    "block_last": "last pixel of it",
-    "sharpness": "share of the finest detail: 0.25 smooth, 1 without any correlation",
-    "time_sigma_ns": "standard deviation of the time of the least certain frame",
-    "time_error_px": "way flown in that, speed x sigma, as a fraction of the GSD",
-    "time_sigma_receiver_ns": "part of it: the receiver's event mark",
-    "time_sigma_clock_ns": "part of it: the host's clock, where there is no mark",
-    "time_sigma_trigger_ns": "part of it: when the pulse was given, where there is no mark",
-    "time_sigma_delay_ns": "part of it: how well the trigger unit keeps its delays",
-    "time_sigma_head_ns": "part of it: from the head's trigger to its mid-exposure",
-    "temperature_age_s": "age of the oldest temperature used",
-    "valid_fraction": "share of virtual image pixels that hold data",
-    "missing_sensors": "sensors without a frame, comma separated",
-    "valid_worst_fraction": "share of the image with valid pixels, of the band that has the least",
-    "valid_worst_band": "which band that is",
-    "tilt_deg": "largest of roll and pitch",
-    "crab_deg": "angle between the image's along axis and the track",
-    "forward_overlap": "share of the ground seen that the image before it on the line saw, too",
-    "sidelap": "share of it that images of the neighbouring line saw, the poorer side",
-    "sun_deg": "elevation of the sun",
-    "tdi_shifts": "TDI shifts of the reference cone",
-    "parallax_px": "parallax relief may leave between PAN and the colour master, PAN pixels",
-    "green_rms_px": "residual of P/C tie points, colour pixels",
-    "red_points": "tie points red to green",
-    "red_rms_px": "residual of red to green, colour pixels",
-    "blue_points": "tie points blue to green",
-    "blue_rms_px": "residual of blue to green, colour pixels",
-    "nir_points": "tie points near infrared to green",
-    "nir_rms_px": "residual of near infrared to green, colour pixels",
-}
-"""Documented names of figures; `dc_k_<cone>` is one cone's own dC, K."""
-
-
 def as_json(report: QualityReport) -> dict[str, Any]:
     """The report as JSON-ready data: no NaN, no infinity, flags by name."""
     return {
@@ -302,15 +148,7 @@ def as_json(report: QualityReport) -> dict[str, Any]:
             }
             for finding in report.findings
         ],
-        "figures": finite(report.figures),
-    }
-
-
-def finite(figures: Mapping[str, Figure]) -> dict[str, Figure]:
-    """The figures with None for what is no number, as JSON wants them."""
-    return {
-        name: None if isinstance(value, float) and not math.isfinite(value) else value
-        for name, value in figures.items()
+        "figures": report.figures.as_json(),
     }
 
 

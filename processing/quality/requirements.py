@@ -6,11 +6,12 @@ that hold for any project are in `processing.quality.report.Thresholds`.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 
-from processing.quality.report import Figure, Finding, Flag, Verdict
+from processing.quality.figures import QualityFigures
+from processing.quality.figures.circumstances import GeometryFigures, TimeFigures
+from processing.quality.report import Finding, Flag, Verdict
 
 
 @dataclass(frozen=True)
@@ -31,49 +32,49 @@ class QualityRequirements:
 
 
 def requirement_findings(
-    figures: Mapping[str, Figure], requirements: QualityRequirements
+    figures: QualityFigures, requirements: QualityRequirements
 ) -> Iterator[Finding]:
     """A finding, and a re-fly, for everything asked for that an exposure does not keep.
 
     Unknown figures are not evaluated.
     """
-    for name, limit, flag, is_minimum, sentence in (
+    geometry, time = figures.of(GeometryFigures), figures.of(TimeFigures)
+    for value, limit, flag, is_minimum, sentence in (
         (
-            *("forward_overlap", requirements.forward_overlap, Flag.OVERLAP, True),
+            *(geometry.forward_overlap, requirements.forward_overlap, Flag.OVERLAP, True),
             "Only {value:.0%} forward overlap, {limit:.0%} asked for; fly this part of the line "
             "again.",
         ),
         (
-            *("sidelap", requirements.sidelap, Flag.OVERLAP, True),
+            *(geometry.sidelap, requirements.sidelap, Flag.OVERLAP, True),
             "Only {value:.0%} sidelap with the neighbouring line, {limit:.0%} asked for; fly this "
             "part of the line again, nearer to it.",
         ),
         (
-            *("gsd_m", requirements.gsd_m, Flag.GSD, False),
+            *(geometry.gsd_m, requirements.gsd_m, Flag.GSD, False),
             "The GSD is {value:.3f} m, {limit:.3f} m asked for; fly lower, and this part again.",
         ),
         (
-            *("tilt_deg", requirements.tilt_deg, Flag.TILT, False),
+            *(geometry.tilt_deg, requirements.tilt_deg, Flag.TILT, False),
             "Tilted by {value:.1f} deg, {limit:.1f} deg allowed; fly this part again, level.",
         ),
         (
-            *("crab_deg", requirements.crab_deg, Flag.DRIFT, False),
+            *(geometry.crab_deg, requirements.crab_deg, Flag.DRIFT, False),
             "Turned by {value:.1f} deg against the track, {limit:.1f} deg allowed; set the drift "
             "angle of the mount and fly this part again.",
         ),
         (
-            *("sun_deg", requirements.sun_deg, Flag.SUN, True),
+            *(geometry.sun_deg, requirements.sun_deg, Flag.SUN, True),
             "The sun is {value:.1f} deg high, {limit:.1f} deg asked for; fly this part again "
             "when it is higher.",
         ),
         (
-            *("time_sigma_ns", requirements.time_sigma_ns, Flag.TIME_SIGMA, False),
+            *(time.time_sigma_ns, requirements.time_sigma_ns, Flag.TIME_SIGMA, False),
             "The time is known to {value:.0f} ns, {limit:.0f} ns asked for; check strobe cable and "
             "receiver, and fly this part again.",
         ),
     ):
-        value = figures.get(name)
-        if limit is None or not isinstance(value, int | float) or not math.isfinite(value):
+        if limit is None or value is None:
             continue
         if value < limit if is_minimum else value > limit:
             value_text = sentence.format(value=value, limit=limit)

@@ -15,8 +15,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from processing.image.line_means import line_means
-from processing.quality.report import Figure
+from processing.image.line_means import LineMeans
+from processing.quality.figures.image import SignalStepFigures
 from processing.radiometry.level1 import level1_counts_per_dn
 from processing.rig import Sensor
 
@@ -53,38 +53,6 @@ class SignalStep:
     lines: int
 
 
-@dataclass(frozen=True)
-class LineMeans:
-    """Means of bundles of pixels along every line of a frame (`processing.image.line_means`).
-
-    `by_row` (bundles, rows) begins with row `first_row`, `by_column` is (bundles, columns).
-    """
-
-    by_row: Array
-    by_column: Array
-    first_row: int
-
-
-def line_means_of(
-    sensors: Sequence[Sensor],
-    frames: Mapping[str, Array],
-    rows: Mapping[str, tuple[int, int]],
-) -> dict[str, LineMeans]:
-    """Line means of all frames that are there, by sensor name.
-
-    Args:
-        sensors: those to look at.
-        frames: Level-1 words by sensor name, (h, w) uint16.
-        rows: first and last exposed row by sensor name.
-    """
-    return {
-        s.name: LineMeans(*line_means(frames[s.name][first : last + 1]), first)
-        for s in sensors
-        if s.name in frames
-        for first, last in (rows[s.name],)
-    }
-
-
 def signal_steps(
     sensors: Sequence[Sensor], means: Mapping[str, LineMeans]
 ) -> tuple[SignalStep, ...]:
@@ -117,16 +85,18 @@ def signal_steps(
     return tuple(sorted(found, key=lambda step: -abs(step.relative)))
 
 
-def step_figures(steps: Sequence[SignalStep]) -> dict[str, Figure]:
+def step_figures(steps: Sequence[SignalStep]) -> SignalStepFigures:
     """The largest step in figures of the quality report."""
-    worst = steps[0] if steps else None
-    return {
-        "signal_step": None if worst is None else worst.relative,
-        "signal_step_sensor": None if worst is None else worst.sensor,
-        "signal_step_axis": None if worst is None else worst.axis,
-        "signal_step_at": None if worst is None else worst.at,
-        "signal_step_lines": None if worst is None else worst.lines,
-    }
+    if not steps:
+        return SignalStepFigures()
+    worst = steps[0]
+    return SignalStepFigures(
+        signal_step=worst.relative,
+        signal_step_sensor=worst.sensor,
+        signal_step_axis=worst.axis,
+        signal_step_at=worst.at,
+        signal_step_lines=worst.lines,
+    )
 
 
 def _largest(
@@ -144,9 +114,6 @@ def _largest(
     lines = np.flatnonzero((rising >= often) | (falling >= often))
     if not len(lines):
         return None
-    count = means.shape[1]
-    usual = _medians(means, np.arange(0, count - 1, 1 if count < ALL else count // SAMPLES))
-    spread = _MAD_TO_SIGMA * float(np.median(np.abs(usual - np.median(usual))))
     signal = 0.5 * (means[:, lines + 1] + means[:, lines])
     bright = np.median(signal, axis=0)
     relative = (means[:, lines + 1] - means[:, lines]) / np.maximum(signal, 1.0)
@@ -154,8 +121,11 @@ def _largest(
     # What nearly all bundles of a line share; nothing where they differ in sign.
     common = np.where(low > 0.0, low, np.where(high < 0.0, high, 0.0))
     middle = np.median(relative, axis=0)
-    noise = np.maximum(SIGMAS * spread, min_counts / np.maximum(bright, 1.0))
+    least = min_counts / np.maximum(bright, 1.0)
     shared = np.abs(middle) * (np.abs(common) > 0.5 * np.abs(middle))
+    if not np.any(shared > np.maximum(BANDING_STEP, least)):
+        return None
+    noise = np.maximum(SIGMAS * _spread(means), least)
     steps = shared > np.maximum(BANDING_STEP, noise)
     if np.count_nonzero(steps) < BANDING_LINES:
         steps = shared > np.maximum(MIN_STEP, noise)
@@ -164,6 +134,13 @@ def _largest(
     best = int(np.argmax(np.where(steps, np.abs(middle), 0.0)))
     stepping = int(np.count_nonzero(steps))
     return SignalStep(sensor, axis, int(lines[best]) + offset, float(middle[best]), stepping)
+
+
+def _spread(means: Array) -> float:
+    """Standard deviation of the usual relative change between lines, by its median."""
+    count = means.shape[1]
+    usual = _medians(means, np.arange(0, count - 1, 1 if count < ALL else count // SAMPLES))
+    return _MAD_TO_SIGMA * float(np.median(np.abs(usual - np.median(usual))))
 
 
 @njit(cache=True, nogil=True)

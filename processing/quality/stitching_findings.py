@@ -3,26 +3,47 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
-from processing.quality.report import Figure, Finding, Flag, Thresholds, Verdict
-from processing.quality.rules import above, number, probe_bias_phrase
+from processing.quality.figures import QualityFigures
+from processing.quality.figures.circumstances import EstimatedDcFigures
+from processing.quality.figures.image import ContentFigures, IdentityFigures
+from processing.quality.figures.stitching import (
+    AdjustmentFigures,
+    BandFitFigures,
+    DisplacedSensorFigures,
+    DisplacementFigures,
+    DisplacementTestFigures,
+    HeadScaleFigures,
+    LayerFigures,
+    MisreadProbeFigures,
+    PlatformFigures,
+    PoorestOverlapFigures,
+    PrecisionFigures,
+    SaturatedOverlapFigures,
+    SlipFigures,
+    SupportFigures,
+    TiePointFigures,
+)
+from processing.quality.report import Finding, Flag, Thresholds, Verdict
+from processing.quality.rules import above, probe_bias_phrase
 
 
 def stitching_findings(
-    figures: Mapping[str, Figure], nominal_bands: Sequence[str], t: Thresholds
+    figures: QualityFigures, nominal_bands: Sequence[str], t: Thresholds
 ) -> list[Finding]:
     findings = []
-    poorest = number(figures, "tie_points_min_overlap")
-    slipped = str(figures.get("slip_sensor") or "none") in str(
-        figures.get("tie_points_min_overlap_name")
-    )
-    explained = slipped or bool(figures.get("mismatched_sensors"))
+    overlap, slip = figures.of(PoorestOverlapFigures), figures.of(SlipFigures)
+    elsewhere = figures.of(ContentFigures).mismatched_sensors
+    poorest, name = overlap.tie_points_min_overlap, overlap.tie_points_min_overlap_name
+    slipped = slip.slip_sensor is not None and slip.slip_sensor in (name or "")
+    explained = slipped or bool(elsewhere)
     if poorest is not None and poorest < t.tie_points_per_overlap and not explained:
-        where = figures.get("tie_points_min_overlap_name") or "an overlap"
-        total = number(figures, "tie_points_pp") or 0.0
+        where = name or "an overlap"
+        total = figures.of(TiePointFigures).tie_points_pp or 0
         too_few = total < t.tie_points_pp_refly
-        saturated_fraction = number(figures, "tie_points_min_overlap_burnt") or 0.0
+        saturation = figures.of(SaturatedOverlapFigures)
+        saturated_fraction = saturation.tie_points_min_overlap_burnt or 0.0
         sentence = (
             f"Few tie points in {where} (water, snow, desert or cloud?): look at the quick look; "
             "fly again if it should have had detail."
@@ -37,53 +58,63 @@ def stitching_findings(
                 Flag.TIE_POINTS,
                 Verdict.REFLY if too_few else Verdict.USABLE,
                 sentence,
-                poorest,
+                float(poorest),
                 float(t.tie_points_per_overlap),
             )
         )
-    elsewhere = str(figures.get("mismatched_sensors") or "").split(", ")
-    weak = str(figures.get("resting_on_calibration") or "").split(", ")
-    supported = ", ".join(name for name in weak if name and name not in elsewhere)
-    if supported and not figures.get("slip_sensor"):
+    weak = figures.of(SupportFigures).resting_on_calibration
+    supported = ", ".join(name for name in weak if name not in elsewhere)
+    if supported and not slip.slip_sensor:
         findings.append(
             Finding(
                 Flag.TIE_POINTS,
                 Verdict.USABLE,
                 f"Too little detail to place {supported}: calibration and temperature help to place "
                 "them. Look at the quick look; fly again if there should have been detail.",
-                number(figures, "stitched_sigma_worst_px"),
+                figures.of(PrecisionFigures).stitched_sigma_worst_px,
             )
         )
+    points = figures.of(BandFitFigures).points_by_band
     findings += [
         Finding(
             Flag.TIE_POINTS,
             Verdict.USABLE,
             f"Too few tie points for {band}: it is placed by calibration; expect colour fringes.",
-            number(figures, f"{band}_points"),
+            _as_float(points.get(band)),
         )
         for band in nominal_bands
     ]
     findings += above(
-        figures,
-        "sigma0_px",
+        figures.of(AdjustmentFigures).sigma0_px,
         Flag.SIGMA0,
         (t.sigma0_px, t.sigma0_refly_px),
         "The sensors do not fit together well; check exposure times and the mount of the heads.",
     )
-    findings += _head_scale(figures, t) or _platform(figures)
-    findings += _slip(figures, t)
-    displaced = figures.get("displaced_sensor")
-    if displaced or figures.get("displaced_several"):
+    findings += _head_scale(figures.of(HeadScaleFigures), t) or _platform(figures)
+    findings += _slip(slip, t)
+    return findings + _displaced(figures, t)
+
+
+def _as_float(value: float | None) -> float | None:
+    return None if value is None else float(value)
+
+
+def _displaced(figures: QualityFigures, t: Thresholds) -> list[Finding]:
+    """A sensor of the master cone that is not where it was calibrated."""
+    findings = []
+    displaced = figures.of(DisplacedSensorFigures).displaced_sensor
+    displacement = figures.of(DisplacementFigures)
+    if displaced or displacement.displaced_several:
         size = math.hypot(
-            number(figures, "displacement_x_px") or 0.0,
-            number(figures, "displacement_y_px") or 0.0,
+            displacement.displacement_x_px or 0.0, displacement.displacement_y_px or 0.0
         )
         sentence = (
             f"Sensor {displaced} sits {size:.2f} px off its calibrated place; the image is "
             "corrected for it. Go on, and have the camera calibrated."
         )
-        alternatives, misread = figures.get("displaced_alternatives"), probe_bias_phrase(figures)
-        if figures.get("displaced_several"):
+        alternatives = ", ".join(displacement.displaced_alternatives)
+        misread = probe_bias_phrase(figures.of(MisreadProbeFigures))
+        if displacement.displaced_several:
             sentence = (
                 "More than one sensor of the master cone sits off its calibrated place, and which "
                 "ones cannot be determined: the image fits together, but its place in the camera is "
@@ -101,35 +132,37 @@ def stitching_findings(
                 f"Sensor {displaced} sits {size:.2f} px off its calibrated place, unless it is "
                 f"{alternatives}; the image fits together. Go on, and have the camera calibrated."
             )
-        test = number(figures, "displacement_test")
+        test = figures.of(DisplacementTestFigures).displacement_test
         verdict_level = test is None or test > t.displacement_verdict
         verdict = Verdict.USABLE if verdict_level else Verdict.GOOD
         findings.append(Finding(Flag.DISPLACED_SENSOR, verdict, sentence, size))
     return findings
 
 
-def _platform(figures: Mapping[str, Figure]) -> list[Finding]:
+def _platform(figures: QualityFigures) -> list[Finding]:
     """Mountings and layers that are not as the platform calibration has them."""
-    test = number(figures, "platform_test")
+    platform, layers = figures.of(PlatformFigures), figures.of(LayerFigures)
+    test = platform.platform_test
     if test is None or test <= 1.0:
         return []
-    causes = figures.get("platform_causes")
-    of_slip = causes is not None and causes == figures.get("slip_cone")
-    if causes in str(figures.get("exchanged_frames") or "").split(", "):
+    causes = ", ".join(layers.platform_causes)
+    of_slip = bool(causes) and causes == figures.of(SlipFigures).slip_cone
+    if causes and causes in figures.of(IdentityFigures).exchanged_frames:
         return []
-    of_temperature = figures.get("platform_master_changed") and figures.get("dc_disagreement")
+    disagreement = figures.of(EstimatedDcFigures).dc_disagreement
+    of_temperature = layers.platform_master_changed and disagreement
     if of_slip or of_temperature:
         return []
-    moved = number(figures, "platform_shift_px") or 0.0
-    scale = number(figures, "common_scale_ppm") or 0.0
-    other = figures.get("platform_alternatives")
+    moved = platform.platform_shift_px or 0.0
+    scale = layers.common_scale_ppm or 0.0
+    other = ", ".join(platform.platform_alternatives)
     others = f", or {other}," if other else ""
     sentence = (
-        f"Head {figures.get('platform_shift_head')}{others} sits {moved:.2f} px off the platform "
+        f"Head {platform.platform_shift_head}{others} sits {moved:.2f} px off the platform "
         "calibration; the image is corrected for it. Go on, and calibrate the platform from this "
         "flight."
     )
-    if figures.get("platform_master_changed"):
+    if layers.platform_master_changed:
         sentence = (
             f"The layers of the other cones do not fit the master cone (common scale {scale:+.0f} "
             f"ppm; cause: cone {causes}"
@@ -147,16 +180,16 @@ def _platform(figures: Mapping[str, Figure]) -> list[Finding]:
     return [Finding(Flag.CALIBRATION_EXPIRED, Verdict.USABLE, sentence, test, 1.0)]
 
 
-def _head_scale(figures: Mapping[str, Figure], t: Thresholds) -> list[Finding]:
+def _head_scale(scale: HeadScaleFigures, t: Thresholds) -> list[Finding]:
     """A converging head whose scale does not fit: rotations cannot correct that."""
-    scale_ppm = number(figures, "platform_scale_ppm")
+    scale_ppm = scale.platform_scale_ppm
     if scale_ppm is None or abs(scale_ppm) <= t.head_scale_ppm:
         return []
     return [
         Finding(
             Flag.CALIBRATION_EXPIRED,
             Verdict.USABLE,
-            f"The scale of head {figures.get('platform_scale_head')} differs by {scale_ppm:+.0f} "
+            f"The scale of head {scale.platform_scale_head} differs by {scale_ppm:+.0f} "
             "ppm from its neighbours': its principal distance is not as calibrated. The image is "
             "not corrected for it; its stated accuracy includes it. Check the serial numbers, and "
             "calibrate the head.",
@@ -166,22 +199,22 @@ def _head_scale(figures: Mapping[str, Figure], t: Thresholds) -> list[Finding]:
     ]
 
 
-def _slip(figures: Mapping[str, Figure], t: Thresholds) -> list[Finding]:
+def _slip(slip: SlipFigures, t: Thresholds) -> list[Finding]:
     """A band of a frame that was read out shifted."""
-    shift_px = number(figures, "slip_px")
+    shift_px = slip.slip_px
     if shift_px is None:
         return []
-    others = str(figures.get("slip_sensors") or "").split(", ")[1:]
+    others = slip.slip_sensors[1:]
     also = f" Also shifted: {', '.join(dict.fromkeys(others))}." if others else ""
-    alternatives = figures.get("slip_alternatives")
+    alternatives = ", ".join(slip.slip_alternatives)
     instead = f" (or {alternatives}, which sees the same ground)" if alternatives else ""
     verdict_level = shift_px >= t.slip_refly_px
     return [
         Finding(
             Flag.FRAME_CORRUPT,
             Verdict.REFLY if verdict_level else Verdict.USABLE,
-            f"In the frame of {figures.get('slip_sensor')}{instead}, {figures.get('slip_axis')} "
-            f"{figures.get('slip_first')} to {figures.get('slip_last')} lie {shift_px:.1f} px off "
+            f"In the frame of {slip.slip_sensor}{instead}, {slip.slip_axis} "
+            f"{slip.slip_first} to {slip.slip_last} lie {shift_px:.1f} px off "
             f"the rest: lines were lost or repeated in read-out.{also} Check the head and its "
             "cable." + (" Fly this exposure again." if verdict_level else ""),
             shift_px,

@@ -6,12 +6,14 @@ the boxes lie on the ground is not asked here.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+
+from processing.quality.figures.image import ValidAreaFigures
 
 Mask: TypeAlias = NDArray[np.bool_]
 Box: TypeAlias = tuple[int, int, int, int]
@@ -91,6 +93,33 @@ def area_of(cells: Mapping[str, Mask]) -> ValidArea:
     return ValidArea(columns, rows, gaps)
 
 
+def area_of_rasters(
+    rasters: Mapping[str, NDArray[Any]],
+    bands: Iterable[str],
+    cells: tuple[int, int],
+    *,
+    saturated_bit: int,
+) -> ValidArea:
+    """The valid area of an image by its rasters; a band without one has no valid pixels.
+
+    Args:
+        rasters: by band, (h, w), 0 without data.
+        bands: all that the image is to have.
+        cells: columns and rows of the grid.
+        saturated_bit: of a raster's words.
+    """
+    columns, rows = cells
+    nothing = np.ones((rows, columns), np.bool_)
+    return area_of(
+        {
+            band: gap_cells(rasters[band], columns, rows, saturated_bit=saturated_bit)
+            if band in rasters
+            else nothing
+            for band in bands
+        }
+    )
+
+
 def boxes_of(gaps: Mask, most: int = BOXES_MAX) -> tuple[Box, ...]:
     """Boxes that cover the true cells of a grid and no others, at most so many.
 
@@ -105,6 +134,13 @@ def boxes_of(gaps: Mask, most: int = BOXES_MAX) -> tuple[Box, ...]:
         (left * scale, top * scale, min(right * scale, columns), min(bottom * scale, rows))
         for left, top, right, bottom in boxes
     )
+
+
+def valid_area_figures(area: ValidArea) -> ValidAreaFigures:
+    """The band with the smallest valid share, and that share; no band where all are whole."""
+    shares = {band: area.share(band) for band in area.gaps}
+    worst = min(shares, key=lambda band: shares[band], default=None)
+    return ValidAreaFigures(1.0 if worst is None else shares[worst], worst)
 
 
 def as_json(area: ValidArea) -> dict[str, Any]:

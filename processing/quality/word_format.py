@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.quality.report import Figure
+from processing.quality.figures.image import WordFormatFigures
 from processing.rig import Rig, Sensor
 
 Array = NDArray[Any]
@@ -21,7 +21,7 @@ MIN_SHARE: Final = 1e-3
 """Of the words looked at: fewer beyond the sensor's range are bits flipped on the way."""
 
 
-def word_format_figures(rig: Rig, frames: Mapping[str, Array]) -> dict[str, Figure]:
+def word_format_figures(rig: Rig, frames: Mapping[str, Array]) -> WordFormatFigures | None:
     """Name frames whose words have another format than the rig file states.
 
     Args:
@@ -34,11 +34,8 @@ def word_format_figures(rig: Rig, frames: Mapping[str, Array]) -> dict[str, Figu
         if s.name in frames and (format_ := wrong_format(s, frames[s.name])) is not None
     }
     if not wrong:
-        return {}
-    return {
-        "word_format": ", ".join(dict.fromkeys(wrong.values())),
-        "word_format_sensors": ", ".join(wrong),
-    }
+        return None
+    return WordFormatFigures(tuple(dict.fromkeys(wrong.values())), tuple(wrong))
 
 
 def wrong_format(sensor: Sensor, frame: Array) -> str | None:
@@ -67,4 +64,7 @@ def wrong_format(sensor: Sensor, frame: Array) -> str | None:
 def _share_beyond(sensor: Sensor, sample: Array) -> float:
     """Share of words that the sensor cannot have given."""
     unit = sensor.raw_units_per_dn
-    return float(np.mean((sample > sensor.full_scale_dn * unit) | (sample % unit != 0)))
+    beyond = sample > sensor.full_scale_dn * unit
+    if unit != 1:
+        beyond |= sample % unit != 0
+    return float(np.count_nonzero(beyond)) / sample.size

@@ -2,7 +2,7 @@
 
 The pass that applies it to pixels is in `processing.radiometry.level1`; balancing between heads,
 which needs the overlaps, is in `processing.image.balance`. Source:
-docs/mathematics/radiometry.md#offset-and-gain; Heier et al. (2002), 5.2.
+docs/explanation/mathematics/radiometry.md#offset-and-gain; Heier et al. (2002), 5.2.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from typing import IO, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.errors import ProcessingError
 from processing.rig import Sensor
 
 Array = NDArray[Any]
@@ -41,7 +42,7 @@ _OPTIONAL: Final = "response_per_k"
 RESPONSE_LIMIT_PER_K: Final = 0.01
 
 
-class CalibrationError(ValueError):
+class CalibrationError(ProcessingError, ValueError):
     """A calibration that cannot be used; the message names file, finding and remedy."""
 
 

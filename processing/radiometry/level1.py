@@ -1,7 +1,8 @@
 """Level-0 to Level-1: raw counts to linear signal in one fused pass over the pixels.
 
-Defects are interpolated here too; what the calibration is and where it comes from is in
-`processing.radiometry.calibration`.
+The pass also takes what tests of the frame need of every pixel or line, so that no step reads the
+frame for it again. What the calibration is and where it comes from is in
+`processing.radiometry.calibration`, how defects are filled in `processing.radiometry.defects`.
 
 A Level-1 word is uint16. 0 means no data: partly exposed TDI rows, and defects without a good
 neighbour in reach. Any other word is linear signal above black in units of 1 /
@@ -9,7 +10,8 @@ neighbour in reach. Any other word is linear signal above black in units of 1 /
 noise); its lowest bit marks that the pixel was saturated before it was scaled. Signal at or below
 black is held at `LEVEL1_FLOOR`.
 
-Source: docs/mathematics/radiometry.md#offset-and-gain, #tdi and #defects; Heier et al. (2002), 5.2.
+Source: docs/explanation/mathematics/radiometry.md#offset-and-gain, #tdi and #defects; Heier et al.
+(2002), 5.2.
 """
 
 from __future__ import annotations
@@ -21,11 +23,13 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
+from processing.image.line_means import LineMeans, add_line, add_pixels, line_sums, means_of_sums
 from processing.radiometry.calibration import (
     RadiometricCalibration,
     check_radiometry,
     neutral_radiometry,
 )
+from processing.radiometry.defects import interpolate_defects, spread_defects
 from processing.rig import Sensor
 
 Array = NDArray[Any]
@@ -42,24 +46,29 @@ _BIAS_STEP_DN: Final = 1.0 / 32.0
 _DARK_STEP_DN_PER_S: Final = 0.5
 """Steps of the maps: rounded to at most a sixty-fourth of a DN, where a Level-1 word is a quarter
 (12 bits); dark signal to as much in a sixteenth of a second."""
-_BAND_ROWS: Final = 128
+_BANDS: Final = 39
+"""Parts of a frame that threads share."""
+_UNREAD_NOISES: Final = 10.0
+_UNREAD_STEP_PX: Final = 256
+"""Of every line so many columns apart are compared with black; a lost packet is longer."""
 _MATHEMATICS: Final = {"contract", "nnan", "ninf", "nsz"}
 """No approximate reciprocals: compilers take them or not as loops happen to vectorise, and the same
 bytes must give the same pixels wherever the kernels were compiled."""
-_DEFECT_REACH_PX: Final = 8
-_NEAR_TAP: Final = 0.65
-"""Weight of each of the two nearest pixels; those behind them have a half less that."""
-_DIAGONAL: Final = 2**0.5
-_EVEN_COUNTS: Final = 32.0
-"""Level-1 counts (4 DN of 12 bits), a half of the noise: gradients this small are alike."""
 
 
 @dataclass(frozen=True)
 class FrameStatistics:
-    """What the pass saw of the exposed pixels: mean signal in DN, share of saturated ones."""
+    """What the pass saw of a frame.
+
+    `mean_dn` is the mean signal of the exposed pixels, `saturated_fraction` their saturated share,
+    `unread_fraction` the share of words far below black among those compared (None where black is
+    not above the noise), `lines` the means of bundles of Level-1 words where they were asked for.
+    """
 
     mean_dn: float
     saturated_fraction: float
+    unread_fraction: float | None
+    lines: LineMeans | None = None
 
 
 @dataclass(frozen=True)
@@ -139,6 +148,7 @@ def level1_from_level0(
     tdi_shifts: int,
     out: Array,
     scale: float = 1.0,
+    measure_lines: bool = False,
 ) -> FrameStatistics:
     """Fill `out` with the Level-1 words of a raw frame.
 
@@ -152,6 +162,7 @@ def level1_from_level0(
         out: (height, width) uint16, contiguous; overwritten.
         scale: multiplies the signal, after the offset was taken off. What it carries beyond the
             range of words counts as saturated.
+        measure_lines: whether the means of bundles along lines are wanted.
 
     Raises:
         ValueError: `raw` or `out` is not a uint16 frame of the sensor's size.
@@ -169,18 +180,27 @@ def level1_from_level0(
     offset_dn = corrector.min_bias_dn + corrector.min_dark_dn_per_s * dark_time_s
     counts = level1_counts_per_dn(sensor.bits)
     by_gain = scale * 0.5 * counts / max(1.0 + corrector.response_per_k * warmth, 0.5)
-    bands = (sensor.height_px + _BAND_ROWS - 1) // _BAND_ROWS
-    sums = np.zeros((bands, 2), np.float64)
+    exposed = exposed_rows(sensor, shifts)
+    first, end = exposed[0], exposed[1] + 1
+    by_row, by_column = line_sums(end - first, sensor.width_px)
+    if not measure_lines or not by_row.size or not by_column.size:
+        by_row, by_column = np.zeros((0, end - first), np.uint32), np.zeros((_BANDS, 0), np.uint32)
+    sums = np.zeros((len(by_column), 3), np.int64)
+    least = min_raw_value(sensor)
+    out[:first] = 0
+    out[end:] = 0
     if corrector.bias is None or corrector.dark is None or corrector.response is None:
         _flat_pass(
             raw,
             np.float32(offset_dn),
             np.float32(by_gain * corrector.flat_gain),
-            shifts,
-            sensor.tdi_row_sign,
             sensor.full_scale_dn,
+            least,
+            first,
             out,
             sums,
+            by_row,
+            by_column,
         )
     else:
         _map_pass(
@@ -193,21 +213,56 @@ def level1_from_level0(
             np.float32(offset_dn),
             np.float32(by_gain * _RESPONSE_UNIT * (shifts + 1)),
             shifts,
-            sensor.tdi_row_sign,
+            0 if sensor.tdi_row_sign < 0 else shifts,
             sensor.full_scale_dn,
+            least,
+            first,
             out,
             sums,
+            by_row,
+            by_column,
         )
     if corrector.defect is not None:
         if shifts not in corrector.defects_by_shifts:
-            corrector.defects_by_shifts[shifts] = _spread(
+            corrector.defects_by_shifts[shifts] = spread_defects(
                 corrector.defect, shifts, sensor.tdi_row_sign
             )
         mask, places = corrector.defects_by_shifts[shifts]
-        _interpolate_defects(out, mask, places, 1 if sensor.colour_filter_array == "none" else 2)
-    exposed = max((sensor.height_px - shifts) * sensor.width_px, 1)
-    total, saturated = sums.sum(axis=0)
-    return FrameStatistics(float(total) / counts / exposed, float(saturated) / exposed)
+        period = 1 if sensor.colour_filter_array == "none" else 2
+        add_pixels(out, places, first, -1, by_row, by_column)
+        interpolate_defects(out, mask, places, period)
+        add_pixels(out, places, first, 1, by_row, by_column)
+    pixels = max((end - first) * sensor.width_px, 1)
+    total, saturated, unread = (int(value) for value in sums.sum(axis=0))
+    for rows in (raw[:first], raw[end:]):
+        unread += int(np.count_nonzero(rows[:, ::_UNREAD_STEP_PX] < max(least, 0)))
+    compared = sensor.height_px * -(-sensor.width_px // _UNREAD_STEP_PX)
+    return FrameStatistics(
+        2.0 * total / counts / pixels,
+        saturated / pixels,
+        unread / compared if least > 0 else None,
+        means_of_sums(by_row, by_column, first) if by_row.size else None,
+    )
+
+
+def min_raw_value(sensor: Sensor) -> int:
+    """The raw word below which a pixel was not read out: without light it shows its black level.
+
+    Zero or less where black is not above the noise.
+    """
+    noise_dn = sensor.read_noise_e / sensor.electrons_per_dn
+    least_dn = int(sensor.black_dn - _UNREAD_NOISES * max(noise_dn, 1.0))
+    return least_dn * sensor.raw_units_per_dn
+
+
+def unread_fraction(sensor: Sensor, raw: Array) -> float | None:
+    """Share of words far below black among those compared, of a frame (h, w) that was not corrected
+    here; None where black is not above the noise."""
+    least = min_raw_value(sensor)
+    if least <= 0:
+        return None
+    seen = raw[:, ::_UNREAD_STEP_PX]
+    return float(np.count_nonzero(seen < least)) / seen.size
 
 
 def exposed_rows(sensor: Sensor, tdi_shifts: int) -> tuple[int, int]:
@@ -243,31 +298,27 @@ def _quantised(values: Array, good: Array, coarsest: float) -> tuple[Array, floa
     return _fixed_point(values - np.float32(least), unit, kind), least, unit
 
 
-def _spread(defect: Array, shifts: int, sign: int) -> tuple[Array, Array]:
-    mask = defect.copy()
-    for k in range(1, shifts + 1):
-        if sign > 0:
-            mask[k:] |= defect[:-k]
-        else:
-            mask[:-k] |= defect[k:]
-    return mask, np.argwhere(mask).astype(np.int32)
-
-
 @njit(cache=True, parallel=True, fastmath=_MATHEMATICS, nogil=True)
-def _flat_pass(raw, offset, factor, shifts, sign, full_scale, out, sums):
-    """The pass where one offset and one gain hold for all pixels."""
-    height, width = raw.shape
+def _flat_pass(raw, offset, factor, full_scale, least, first_row, out, sums, by_row, by_column):
+    """The pass where one offset and one gain hold for all pixels.
+
+    Corrects as many rows from `first_row` on as `by_row` has, in as many bands as `by_column`.
+    `sums` (bands, 3) takes half the Level-1 words, saturated and unread pixels.
+    """
+    width = raw.shape[1]
+    bands, height = len(by_column), by_row.shape[1]
+    tall = height // bands
     # Sums and limits stay 32 bits wide, so that vectors hold eight pixels and not four.
     ceiling = np.int32(full_scale)
-    for band in prange(sums.shape[0]):
+    for band in prange(bands):
         total = np.int64(0)
         saturated = np.int64(0)
-        for row in range(band * _BAND_ROWS, min((band + 1) * _BAND_ROWS, height)):
+        unread = np.int64(0)
+        begin = first_row + band * tall
+        end = first_row + height if band == bands - 1 else begin + tall
+        for row in range(begin, end):
             source = raw[row]
             target = out[row]
-            if (sign > 0 and row < shifts) or (sign < 0 and row >= height - shifts):
-                target[:] = 0
-                continue
             row_total = np.int32(0)
             row_saturated = np.int32(0)
             for k in range(width):
@@ -280,8 +331,9 @@ def _flat_pass(raw, offset, factor, shifts, sign, full_scale, out, sums):
                 row_saturated = np.int32(row_saturated + full)
             total += row_total
             saturated += row_saturated
-        sums[band, 0] = 2.0 * total
-        sums[band, 1] = saturated
+            unread += _unread(source, least)
+            add_line(target, row - first_row, row - begin, by_row, by_column[band])
+        sums[band, 0], sums[band, 1], sums[band, 2] = total, saturated, unread
 
 
 @njit(cache=True, parallel=True, fastmath=_MATHEMATICS, nogil=True)
@@ -295,67 +347,74 @@ def _map_pass(
     base,
     factor,
     shifts,
-    sign,
+    back,
     full_scale,
+    least,
+    first_row,
     out,
     sums,
+    by_row,
+    by_column,
 ):
-    """The pass with maps; running sums along the column give the means over the pixels visited."""
-    height, width = raw.shape
+    """The pass with maps; running sums along the column give the means over the pixels visited.
+
+    The charge of a row visited `shifts` + 1 rows, the first of them `back` rows before it. The rest
+    is as in `_flat_pass`.
+    """
+    width = raw.shape[1]
+    bands, height = len(by_column), by_row.shape[1]
+    tall = height // bands
     ceiling = np.int32(full_scale)
-    for band in prange(sums.shape[0]):
-        first = band * _BAND_ROWS
-        last = min(first + _BAND_ROWS, height)
+    for band in prange(bands):
+        begin = first_row + band * tall
+        end = first_row + height if band == bands - 1 else begin + tall
         dark_sum = np.zeros(width, np.int32)
         response_sum = np.zeros(width, np.int32)
-        low = first - shifts if sign > 0 else first
-        for visited in range(max(low, 0), min(low + shifts + 1, height)):
-            dark_row = dark[visited]
-            response_row = response[visited]
-            for k in range(width):
-                dark_sum[k] += np.int32(dark_row[k])
-                response_sum[k] += np.int32(response_row[k])
+        if begin < end:
+            for visited in range(begin - back, begin - back + shifts + 1):
+                dark_row = dark[visited]
+                response_row = response[visited]
+                for k in range(width):
+                    dark_sum[k] += np.int32(dark_row[k])
+                    response_sum[k] += np.int32(response_row[k])
         total = np.int64(0)
         saturated = np.int64(0)
-        for row in range(first, last):
-            low = row - shifts if sign > 0 else row
+        unread = np.int64(0)
+        for row in range(begin, end):
             source = raw[row]
             target = out[row]
-            if low < 0 or low + shifts >= height:
-                target[:] = 0
-            else:
-                bias_row = bias[row]
-                row_total = np.int32(0)
-                row_saturated = np.int32(0)
-                for k in range(width):
-                    dn = np.int32(source[k])
-                    offset = base + np.float32(bias_row[k]) * bias_unit
-                    offset += np.float32(dark_sum[k]) * dark_unit
-                    signal = (np.float32(dn) - offset) * (factor / np.float32(response_sum[k]))
-                    half = np.int32(signal + np.float32(0.5))
-                    half = min(max(half, np.int32(1)), np.int32(32767))
-                    full = np.int32((dn >= ceiling) | (half >= 32767))
-                    target[k] = np.uint16(2 * half + full)
-                    row_total = np.int32(row_total + half)
-                    row_saturated = np.int32(row_saturated + full)
-                total += row_total
-                saturated += row_saturated
-            coming = low + shifts + 1
-            if row + 1 == last:
-                continue
-            if low >= 0 and coming < height:
-                _slide(dark_sum, dark[low], dark[coming])
-                _slide(response_sum, response[low], response[coming])
-            elif coming < height:
-                for k in range(width):
-                    dark_sum[k] += np.int32(dark[coming, k])
-                    response_sum[k] += np.int32(response[coming, k])
-            elif low >= 0:
-                for k in range(width):
-                    dark_sum[k] -= np.int32(dark[low, k])
-                    response_sum[k] -= np.int32(response[low, k])
-        sums[band, 0] = 2.0 * total
-        sums[band, 1] = saturated
+            bias_row = bias[row]
+            row_total = np.int32(0)
+            row_saturated = np.int32(0)
+            for k in range(width):
+                dn = np.int32(source[k])
+                offset = base + np.float32(bias_row[k]) * bias_unit
+                offset += np.float32(dark_sum[k]) * dark_unit
+                signal = (np.float32(dn) - offset) * (factor / np.float32(response_sum[k]))
+                half = np.int32(signal + np.float32(0.5))
+                half = min(max(half, np.int32(1)), np.int32(32767))
+                full = np.int32((dn >= ceiling) | (half >= 32767))
+                target[k] = np.uint16(2 * half + full)
+                row_total = np.int32(row_total + half)
+                row_saturated = np.int32(row_saturated + full)
+            total += row_total
+            saturated += row_saturated
+            unread += _unread(source, least)
+            add_line(target, row - first_row, row - begin, by_row, by_column[band])
+            if row + 1 < end:
+                leaving = row - back
+                _slide(dark_sum, dark[leaving], dark[leaving + shifts + 1])
+                _slide(response_sum, response[leaving], response[leaving + shifts + 1])
+        sums[band, 0], sums[band, 1], sums[band, 2] = total, saturated, unread
+
+
+@njit(cache=True, nogil=True)
+def _unread(line, least):
+    """How many of the words compared are below the least one of a pixel that was read out."""
+    count = 0
+    for k in range(0, len(line), _UNREAD_STEP_PX):
+        count += line[k] < least
+    return count
 
 
 @njit(cache=True, nogil=True)
@@ -363,93 +422,3 @@ def _slide(sums, leaving, coming):
     """Move running sums on by one row."""
     for k in range(len(sums)):
         sums[k] += np.int32(coming[k]) - np.int32(leaving[k])
-
-
-@njit(cache=True, parallel=True, nogil=True)
-def _interpolate_defects(level1, mask, places, period):
-    """Fill each defect from the nearest good pixels on both sides, along the least gradient.
-
-    Directions of nearly the least gradient share, for their noise is not the same. Where two good
-    pixels lie on either side, all four are taken: a line through two cuts off every crest.
-
-    Pixels `period` apart in row or column are of one colour; no others are compared.
-
-    The gradient of a direction is the mean of what the pixels of a 5 x 5 neighbourhood differ from
-    their neighbour in that direction, good ones only: many chords, so that noise does not choose.
-    Only good pixels are read, so the order of the work does not matter.
-    """
-    height, width = level1.shape
-    for index in prange(places.shape[0]):
-        row = places[index, 0]
-        column = places[index, 1]
-        best = 1e30
-        marked = 0
-        total = weights = 0.0
-        for direction in range(4):
-            step_row = np.int64(0) if direction == 0 else np.int64(period)
-            step_column = np.int64(period)
-            if direction == 1:
-                step_column = np.int64(0)
-            elif direction == 3:
-                step_column = np.int64(-period)
-            # Two numbers each: an array would be asked of the heap for every defect.
-            before = after = 0.0
-            to_before = to_after = 0.0
-            saturated = 0
-            for side in range(2):
-                way = 2 * side - 1
-                for reach in range(1, _DEFECT_REACH_PX + 1):
-                    r = row + way * reach * step_row
-                    c = column + way * reach * step_column
-                    if r < 0 or c < 0 or r >= height or c >= width:
-                        break
-                    if mask[r, c] == 0 and level1[r, c] != 0:
-                        value = np.float64(level1[r, c] & 0xFFFE)
-                        saturated |= level1[r, c] & 1
-                        if side == 0:
-                            before, to_before = value, np.float64(reach)
-                        else:
-                            after, to_after = value, np.float64(reach)
-                        break
-            if to_before == 0.0 or to_after == 0.0:
-                continue
-            gradient = abs(after - before) / (to_before + to_after)
-            chords = 1
-            for r in range(max(row - 2, 0), min(row + 3, height)):
-                for c in range(max(column - 2, 0), min(column + 3, width)):
-                    r2 = r + step_row
-                    c2 = c + step_column
-                    if r2 >= height or c2 < 0 or c2 >= width:
-                        continue
-                    if mask[r, c] or mask[r2, c2] or level1[r, c] == 0 or level1[r2, c2] == 0:
-                        continue
-                    gradient += abs(np.float64(level1[r, c]) - np.float64(level1[r2, c2]))
-                    chords += 1
-            error = gradient / chords * (to_before + to_after)
-            if step_row != 0 and step_column != 0:
-                error *= _DIAGONAL
-            filled = before + (after - before) * to_before / (to_before + to_after)
-            r, c = row - 2 * step_row, column - 2 * step_column
-            r2, c2 = row + 2 * step_row, column + 2 * step_column
-            if (
-                to_before + to_after == 2.0
-                and r >= 0
-                and r2 < height
-                and min(c, c2) >= 0
-                and max(c, c2) < width
-                and not (mask[r, c] or mask[r2, c2] or level1[r, c] == 0 or level1[r2, c2] == 0)
-            ):
-                outer = np.float64(level1[r, c] & 0xFFFE) + np.float64(level1[r2, c2] & 0xFFFE)
-                filled = _NEAR_TAP * (before + after) + (0.5 - _NEAR_TAP) * outer
-            share = 1.0 / (error + _EVEN_COUNTS) ** 4
-            total += share * filled
-            weights += share
-            if error < best:
-                best = error
-                marked = saturated
-        found = 0
-        if weights > 0.0:
-            # Half of the word and its doubling leave the lowest bit to the saturation mark.
-            half = int(0.5 * total / weights + 0.5)
-            found = 2 * min(max(half, 1), 32767) + marked
-        level1[row, column] = found

@@ -1,6 +1,6 @@
 """The rig: the parts of the camera, and the file that describes them.
 
-A leaf: it imports nothing of ours. What follows from the geometry (overlaps, parameter counts) is
+What follows from the geometry (overlaps, parameter counts) is
 in `processing.geometry.topology`; where a sensor's pixels fall in the virtual image is in
 `processing.geometry.placement`.
 """
@@ -19,12 +19,12 @@ from processing.rig.model import (
 )
 from processing.rig.rig_file import (
     RIG_FORMAT,
+    RigError,
     find_rig,
     load_rig,
     rig_from_mapping,
     shipped_rigs,
 )
-from processing.rig.toml_table import RigError
 
 __all__ = [
     "RIG_FORMAT",

@@ -11,7 +11,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Final, Literal
+from itertools import pairwise
+from typing import Annotated, Final, Literal
+
+from pydantic import AfterValidator, ConfigDict, Field, Strict
+
+from processing.rig.value_types import Name, Number, Positive, Text, Triple
 
 VIRTUAL_CAMERA: Final = "virtual"
 """Name of the camera between converging heads in tables of cones."""
@@ -19,26 +24,65 @@ VIRTUAL_CAMERA: Final = "virtual"
 CALIBRATION_VALID_DAYS: Final = 730
 """Default of the rig file: customers require a calibration of the last two years."""
 
+SIDE_MAX_PX: Final = 65_535
+SENSOR_MAX_PIXELS: Final = 200_000_000
+IMAGE_MAX_PIXELS: Final = 500_000_000
+
 Timing = Literal["syntopic", "synchronous"]
 Role = Literal["pan", "colour"]
+BANDS: Final = ("pan", "red", "green", "blue", "nir", "red_edge")
+ColourFilterArray = Literal["none", "RGGB", "BGGR", "GRBG", "GBRG"]
+
+SidePx = Annotated[int, Strict(), Field(ge=1, le=SIDE_MAX_PX)]
+PitchUm = Annotated[float, Strict(), Field(ge=0.1, le=1000.0)]
+FocalLengthMm = Annotated[float, Strict(), Field(ge=0.1, le=100_000.0)]
+SkewPpmPerMm = Annotated[float, Strict(), Field(ge=-1000.0, le=1000.0)]
+OffsetNs = Annotated[int, Strict(), Field(ge=-10_000_000_000, le=10_000_000_000)]
+
+
+def _band(name: str) -> str:
+    if name not in BANDS:
+        raise ValueError(f"a band is one of {', '.join(BANDS)}")
+    return name
+
+
+Band = Annotated[
+    str, Strict(), AfterValidator(_band), Field(json_schema_extra={"enum": list(BANDS)})
+]
+
+
+def _ascending(steps: tuple[float, ...]) -> tuple[float, ...]:
+    """Two numbers or more, ascending by equal steps."""
+    widths = [b - a for a, b in pairwise(steps)]
+    if not widths or min(widths) <= 0 or max(widths) - min(widths) > 1e-6 * max(widths):
+        raise ValueError("two numbers or more are needed, ascending by equal steps")
+    return steps
+
+
+Steps = Annotated[tuple[Number, ...], AfterValidator(_ascending)]
+Rows = tuple[tuple[Number, ...], ...]
+
+_KNOWN_KEYS_ONLY: Final = ConfigDict(extra="forbid")
 
 
 @dataclass(frozen=True)
 class ThermalDrift:
     """What one kelvin of dC does to a sensor's place in its cone.
 
-    Source: docs/mathematics/drift.md#linear-model.
+    Source: docs/explanation/mathematics/drift.md#linear-model.
     """
 
-    x_um_per_k: float = 0.0
-    y_um_per_k: float = 0.0
-    rotation_urad_per_k: float = 0.0
-    scale_ppm_per_k: float = 0.0
-    sigma_um_per_k: float = 0.0
-    lag_s: float = 0.0
+    __pydantic_config__ = _KNOWN_KEYS_ONLY
+
+    x_um_per_k: Number = 0.0
+    y_um_per_k: Number = 0.0
+    rotation_urad_per_k: Number = 0.0
+    scale_ppm_per_k: Number = 0.0
+    sigma_um_per_k: Number = 0.0
+    lag_s: Number = 0.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Sensor:
     """One CCD: its pixels, its calibrated place in the layer of its cone, and its drift.
 
@@ -50,28 +94,30 @@ class Sensor:
     word: word = DN * `raw_units_per_dn`.
     """
 
-    name: str
-    serial: str
-    width_px: int
-    height_px: int
-    pitch_um: float
-    x_mm: float
-    y_mm: float
-    rotation_rad: float
-    scale: float
-    position_sigma_um: float
-    calibration_c: float
-    probe: str
-    drift: ThermalDrift
-    bits: int
-    black_dn: float
-    electrons_per_dn: float
-    read_noise_e: float
-    colour_filter_array: str
-    tdi_row_sign: int
-    justified: str = "right"
-    skew_x_ppm_per_mm: float = 0.0
-    skew_y_ppm_per_mm: float = 0.0
+    __pydantic_config__ = _KNOWN_KEYS_ONLY
+
+    name: Name
+    serial: Text = ""
+    width_px: SidePx
+    height_px: SidePx
+    pitch_um: PitchUm
+    x_mm: Number
+    y_mm: Number
+    rotation_rad: Number = 0.0
+    scale: Positive = 1.0
+    position_sigma_um: Number = 0.0
+    calibration_c: Number
+    probe: Text
+    drift: ThermalDrift = field(default_factory=ThermalDrift)
+    bits: Annotated[int, Strict(), Field(ge=1, le=16)] = 12
+    black_dn: Number = 0.0
+    electrons_per_dn: Positive = 1.0
+    read_noise_e: Number = 0.0
+    colour_filter_array: ColourFilterArray = "none"
+    tdi_row_sign: Literal[-1, 1] = 1
+    justified: Literal["right", "left"] = "right"
+    skew_x_ppm_per_mm: SkewPpmPerMm = 0.0
+    skew_y_ppm_per_mm: SkewPpmPerMm = 0.0
 
     @property
     def pitch_mm(self) -> float:
@@ -99,10 +145,12 @@ class LensGrid:
     taken at the measured place, bilinear between nodes, beyond them that of the border.
     """
 
-    x_mm: tuple[float, ...]
-    y_mm: tuple[float, ...]
-    dx_um: tuple[tuple[float, ...], ...]
-    dy_um: tuple[tuple[float, ...], ...]
+    __pydantic_config__ = _KNOWN_KEYS_ONLY
+
+    x_mm: Steps
+    y_mm: Steps
+    dx_um: Rows
+    dy_um: Rows
 
 
 @dataclass(frozen=True)
@@ -114,25 +162,51 @@ class Lens:
     of the cone's probe, `f_sigma_ppm` the standard deviation of the calibrated principal distance.
     """
 
-    f_mm: float
-    f_ppm_per_k: float
-    f_number: float
-    serial: str
-    dx0_mm: float
-    dy0_mm: float
-    df_mm: float
-    k1: float
-    k2: float
-    k3: float
-    p1: float
-    p2: float
-    b1: float
-    b2: float
+    __pydantic_config__ = _KNOWN_KEYS_ONLY
+
+    f_mm: FocalLengthMm
+    f_ppm_per_k: Number = 0.0
+    f_number: Positive = 5.6
+    serial: Text = ""
+    dx0_mm: Number = 0.0
+    dy0_mm: Number = 0.0
+    df_mm: Number = 0.0
+    k1: Number = 0.0
+    k2: Number = 0.0
+    k3: Number = 0.0
+    p1: Number = 0.0
+    p2: Number = 0.0
+    b1: Number = 0.0
+    b2: Number = 0.0
     residual_grid: LensGrid | None = None
-    f_sigma_ppm: float = 20.0
+    f_sigma_ppm: Positive = 20.0
 
 
-@dataclass(frozen=True)
+def _of_a_camera(sensor: Sensor) -> Sensor:
+    """A sensor of no more pixels than memory for frames is meant for."""
+    if sensor.width_px * sensor.height_px > SENSOR_MAX_PIXELS:
+        raise ValueError(f"width_px times height_px is {SENSOR_MAX_PIXELS} at most")
+    return sensor
+
+
+def _with_full_grid(lens: Lens) -> Lens:
+    """A lens whose grid, where it has one, has a value at every node."""
+    if lens.residual_grid is not None:
+        rows, columns = len(lens.residual_grid.y_mm), len(lens.residual_grid.x_mm)
+        for key in ("dx_um", "dy_um"):
+            lengths = [len(row) for row in getattr(lens.residual_grid, key)]
+            if lengths != [columns] * rows:
+                raise ValueError(
+                    f"residual_grid.{key} needs {rows} lists of {columns} numbers, as y_mm and x_mm"
+                )
+    return lens
+
+
+def _whole_stays_whole(ratio: float) -> float:
+    return int(ratio) if ratio == int(ratio) else ratio
+
+
+@dataclass(frozen=True, kw_only=True)
 class Cone:
     """One lens with one focal plane.
 
@@ -141,18 +215,23 @@ class Cone:
     `rotation_sigma_urad`. Where no cone is the master, master stands for the virtual camera.
     """
 
-    name: str
+    __pydantic_config__ = _KNOWN_KEYS_ONLY
+
+    name: Name
     role: Role
-    bands: tuple[str, ...]
-    position_mm: tuple[float, float, float]
-    rotation_rad: tuple[float, float, float]
-    probe: str
-    calibration_c: float
-    mark_to_mid_exposure_ns: int
-    mark_to_mid_exposure_sigma_ns: int
-    lens: Lens
-    sensors: tuple[Sensor, ...]
-    rotation_sigma_urad: float = 30.0
+    bands: tuple[Band, ...]
+    position_mm: Triple
+    rotation_rad: Triple
+    probe: Text
+    calibration_c: Number
+    mark_to_mid_exposure_ns: OffsetNs = 0
+    mark_to_mid_exposure_sigma_ns: Annotated[OffsetNs, Field(ge=0)] = 1000
+    lens: Annotated[Lens, AfterValidator(_with_full_grid)]
+    sensors: Annotated[
+        tuple[Annotated[Sensor, AfterValidator(_of_a_camera)], ...],
+        Field(alias="sensor", min_length=1),
+    ]
+    rotation_sigma_urad: Positive = 30.0
 
 
 @dataclass(frozen=True)
@@ -162,11 +241,13 @@ class VirtualImage:
     `colour_ratio`, pixels to the colour pixel, need not be whole; colour width and height are.
     """
 
-    width_px: int
-    height_px: int
-    pitch_um: float
-    f_mm: float
-    colour_ratio: float
+    __pydantic_config__ = _KNOWN_KEYS_ONLY
+
+    width_px: SidePx
+    height_px: SidePx
+    pitch_um: PitchUm
+    f_mm: FocalLengthMm
+    colour_ratio: Annotated[Positive, AfterValidator(_whole_stays_whole)] = 1
 
     @property
     def pitch_mm(self) -> float:

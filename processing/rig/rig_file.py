@@ -4,36 +4,133 @@ from __future__ import annotations
 
 import datetime
 import stat
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Final, Literal
 
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    Strict,
+    ValidationError,
+)
+
+from processing.errors import ProcessingError
 from processing.rig.model import (
     CALIBRATION_VALID_DAYS,
+    IMAGE_MAX_PIXELS,
     Cone,
-    Lens,
-    LensGrid,
     Rig,
-    Sensor,
-    ThermalDrift,
+    Timing,
     VirtualImage,
 )
-from processing.rig.toml_table import RigError, TomlTable
+from processing.rig.problem_sentences import (
+    Finding,
+    LineOf,
+    Location,
+    ProblemList,
+    findings_of,
+    key_of,
+    line_finder,
+    sentences,
+    shown,
+)
 from processing.rig.toml_text import TomlError, parse_toml
+from processing.rig.value_types import Name, Positive, Text
 
-RIG_FORMAT = 1
-RIG_FILE_MAX_BYTES = 1_000_000
-BANDS = ("pan", "red", "green", "blue", "nir", "red_edge")
-SIDE_MAX_PX = 65_535
-SENSOR_MAX_PIXELS = 200_000_000
-IMAGE_MAX_PIXELS = 500_000_000
+RIG_FORMAT: Final = 1
+RIG_FILE_MAX_BYTES: Final = 1_000_000
 CONES_MAX, SENSORS_MAX = 64, 256
-PITCH_LIMITS_UM = (0.1, 1000.0)
-FOCAL_LIMITS_MM = (0.1, 100_000.0)
-EXPOSURE_OFFSET_LIMITS_NS = (-10_000_000_000, 10_000_000_000)
-JUSTIFICATIONS = ("right", "left")
-MAX_SKEW_PPM_PER_MM = 1000.0
-COLOUR_FILTER_ARRAYS = ("none", "RGGB", "BGGR", "GRBG", "GBRG")
+DIRECTION: Final = "ideal_from_measured"
+"""Of the lens corrections of a rig file; another one is refused."""
+
+
+class RigError(ProblemList, ProcessingError, ValueError):
+    """A rig file that cannot be used; `problems` holds one sentence for each mistake found."""
+
+
+def _date(text: str) -> str:
+    try:
+        datetime.date.fromisoformat(text)
+    except ValueError:
+        raise ValueError("write YYYY-MM-DD") from None
+    return text
+
+
+def _fitting(image: VirtualImage) -> VirtualImage:
+    """An image of as many pixels as fit into memory, and of whole colour pixels."""
+    if image.width_px * image.height_px > IMAGE_MAX_PIXELS:
+        raise ValueError(f"width_px times height_px is {IMAGE_MAX_PIXELS} at most")
+    if not 1 <= image.colour_width_px * image.colour_height_px <= IMAGE_MAX_PIXELS:
+        raise ValueError(f"the colour image has 1 to {IMAGE_MAX_PIXELS} pixels; see colour_ratio")
+    for key in ("width_px", "height_px"):
+        colour_px = getattr(image, key) / image.colour_ratio
+        if not isinstance(image.colour_ratio, int) and abs(colour_px - round(colour_px)) > 1e-6:
+            raise ValueError(f"{key} is no multiple of a colour_ratio of {image.colour_ratio:g}")
+    return image
+
+
+ConeName = Annotated[Text, AfterValidator(lambda name: name or None)]
+"""The name of a cone, or an empty text where there is none."""
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
+
+
+class CalibrationTable(_Table):
+    """The calibration of a rig; it is trusted for `valid_days` after its date."""
+
+    id: Text
+    date: Annotated[Text, AfterValidator(_date)]
+    valid_days: Annotated[int, Strict(), Field(ge=1, le=2**53)] = CALIBRATION_VALID_DAYS
+
+
+class DefaultsTable(_Table):
+    """Values for all lenses and sensors that have none of their own."""
+
+    lens: dict[str, Any] = {}
+    sensor: dict[str, Any] = {}
+
+
+class RigFile(_Table):
+    """A camera of several heads (docs/reference/formats.md)."""
+
+    format: Literal[1] = 1
+    name: Name
+    title: Text = ""
+    timing: Timing
+    frame_interval_s: Positive
+    master_cone: ConeName | None = None
+    colour_master_cone: ConeName | None = None
+    reference_cone: Text
+    calibration: CalibrationTable
+    virtual_image: Annotated[VirtualImage, AfterValidator(_fitting)] | None = None
+    probe_serials: dict[str, Text] = {}
+    defaults: DefaultsTable = DefaultsTable()
+    cone: Annotated[tuple[Cone, ...], Field(min_length=1, max_length=CONES_MAX)]
+
+    @property
+    def rig(self) -> Rig:
+        """The rig that the file describes."""
+        return Rig(
+            name=self.name,
+            title=self.title,
+            timing=self.timing,
+            frame_interval_s=self.frame_interval_s,
+            master_cone=self.master_cone,
+            colour_master_cone=self.colour_master_cone,
+            reference_cone=self.reference_cone,
+            calibration_id=self.calibration.id,
+            calibration_date=self.calibration.date,
+            calibration_valid_days=self.calibration.valid_days,
+            virtual_image=self.virtual_image,
+            cones=self.cone,
+            probe_serials=self.probe_serials,
+        )
 
 
 def shipped_rigs() -> dict[str, Path]:
@@ -69,268 +166,133 @@ def load_rig(path: Path) -> Rig:
             raise RigError([f"{path}: not a regular file; give a rig file"])
         if status.st_size > RIG_FILE_MAX_BYTES:
             raise RigError([f"{path.name}: larger than {RIG_FILE_MAX_BYTES} bytes; not a rig file"])
-        content = parse_toml(path.read_bytes())
+        data = path.read_bytes()
+        content = parse_toml(data)
     except OSError as error:
         reason = error.strerror or type(error).__name__
         raise RigError([f"{path}: cannot be read ({reason}); give a readable file"]) from error
     except TomlError as error:
         raise RigError([f"{path.name}: not valid TOML ({error})"]) from error
-    return rig_from_mapping(content, path.name)
+    return rig_from_mapping(content, path.name, line_finder(data))
 
 
-def rig_from_mapping(content: Mapping[str, Any], file: str) -> Rig:
-    """Build a rig from parsed TOML; `file` names it in the error sentences."""
-    problems: list[str] = []
-    top = TomlTable(content, "", file, problems)
-    if top.integer("format", RIG_FORMAT) != RIG_FORMAT:
-        top.add_problem("format", f"this version reads format {RIG_FORMAT}")
-    defaults = top.table("defaults", optional=True)
-    calibration = top.table("calibration")
-    image = top.table("virtual_image", optional=True)
-    probes = top.table("probe_serials", optional=True)
-    rig = Rig(
-        name=top.name("name"),
-        title=top.text("title", ""),
-        timing="synchronous"
-        if top.choice("timing", ("syntopic", "synchronous")) == "synchronous"
-        else "syntopic",
-        frame_interval_s=top.number("frame_interval_s", positive=True),
-        master_cone=top.text("master_cone", "") or None,
-        colour_master_cone=top.text("colour_master_cone", "") or None,
-        reference_cone=top.text("reference_cone"),
-        calibration_id=calibration.text("id"),
-        calibration_date=_date(calibration),
-        calibration_valid_days=calibration.integer(
-            "valid_days", CALIBRATION_VALID_DAYS, positive=True
-        ),
-        virtual_image=_virtual_image(image) if image.content else None,
-        cones=tuple(_cone(cone, defaults) for cone in top.tables("cone")),
-        probe_serials={name: probes.text(name) for name in probes.content},
-    )
-    for table in (defaults, calibration, image, top):
-        table.refuse_unknown()
-    _check_names(rig, file, problems)
-    if problems:
-        raise RigError(problems)
-    return rig
+def rig_from_mapping(content: Mapping[str, Any], file: str, line_of: LineOf | None = None) -> Rig:
+    """Build a rig from parsed TOML; `file` names it in the error sentences.
 
-
-def _date(calibration: TomlTable) -> str:
-    text = calibration.text("date")
+    Raises:
+        RigError: with one sentence per mistake.
+    """
+    findings: list[Finding] = []
+    rig_file: RigFile | None = None
+    cones = [_with_defaults(cone, content) for cone in _tables(content, "cone")]
+    given = dict(content)
+    if cones and len(cones) == len(content["cone"]):
+        given["cone"] = cones
     try:
-        datetime.date.fromisoformat(text or "2000-01-01")
-    except ValueError:
-        calibration.add_problem("date", "write YYYY-MM-DD")
-    return text
+        rig_file = RigFile.model_validate(given)
+    except ValidationError as error:
+        findings += dict.fromkeys(
+            (_in_defaults(location, content), text) for location, text in findings_of(error)
+        )
+    findings += [*_lens_findings(content), *_name_findings(content, cones)]
+    if rig_file is None or findings:
+        raise RigError(sentences(findings, file, line_of))
+    return rig_file.rig
 
 
-def _virtual_image(table: TomlTable) -> VirtualImage:
-    width_px, height_px = _size(table, IMAGE_MAX_PIXELS)
-    image = VirtualImage(
-        width_px=width_px,
-        height_px=height_px,
-        pitch_um=table.number("pitch_um", positive=True, limits=PITCH_LIMITS_UM),
-        f_mm=table.number("f_mm", positive=True, limits=FOCAL_LIMITS_MM),
-        colour_ratio=_colour_ratio(table),
-    )
-    if not 1 <= image.colour_width_px * image.colour_height_px <= IMAGE_MAX_PIXELS:
-        table.add_problem("colour_ratio", f"the colour image has 1 to {IMAGE_MAX_PIXELS} pixels")
-    return image
+def _tables(content: Mapping[str, Any], key: str) -> list[Mapping[str, Any]]:
+    """The tables of a list; none where it is none."""
+    listed = content.get(key)
+    return [one for one in listed if isinstance(one, Mapping)] if isinstance(listed, list) else []
 
 
-def _size(table: TomlTable, pixels_max: int) -> tuple[int, int]:
-    """Width and height, so that no file asks for more memory than a camera needs."""
-    width_px, height_px = (
-        table.integer(key, positive=True, limits=(1, SIDE_MAX_PX))
-        for key in ("width_px", "height_px")
-    )
-    if width_px * height_px > pixels_max:
-        table.add_problem("width_px", f"width times height is {pixels_max} pixels at most")
-    return width_px, height_px
+def _table(content: Mapping[str, Any], *keys: str) -> Mapping[str, Any]:
+    """The table below these keys; empty where there is none."""
+    for key in keys:
+        found = content.get(key)
+        content = found if isinstance(found, Mapping) else {}
+    return content
 
 
-def _colour_ratio(table: TomlTable) -> float:
-    """A whole ratio stays whole; another one divides the image without rest."""
-    ratio = table.number("colour_ratio", 1, positive=True)
-    if ratio == int(ratio):
-        return int(ratio)
-    for key in ("width_px", "height_px"):
-        size = table.content.get(key)
-        if isinstance(size, int) and abs(size / ratio - round(size / ratio)) > 1e-6:
-            table.add_problem(key, f"at a colour_ratio of {ratio:g} it is a whole number of them")
-    return ratio
+def _with_defaults(cone: Mapping[str, Any], content: Mapping[str, Any]) -> dict[str, Any]:
+    """A cone whose lens and sensors have the values of `[defaults]`, and its probe, as theirs."""
+    full = dict(cone)
+    if isinstance(cone.get("lens"), Mapping):
+        full["lens"] = {**_table(content, "defaults", "lens"), **cone["lens"]}
+        full["lens"].pop("direction", None)
+    sensors = _tables(cone, "sensor")
+    if sensors and len(sensors) == len(cone["sensor"]):
+        inherited = {key: cone[key] for key in ("probe", "calibration_c") if key in cone}
+        defaults = _table(content, "defaults", "sensor")
+        full["sensor"] = [{**inherited, **defaults, **sensor} for sensor in sensors]
+    return full
 
 
-def _cone(table: TomlTable, defaults: TomlTable) -> Cone:
-    probe = table.text("probe")
-    calibration_c = table.number("calibration_c")
-    bands = table.texts("bands")
-    for band in bands:
-        if band not in BANDS:
-            table.add_problem("bands", f"a band is one of {', '.join(BANDS)}")
-    lens_defaults = defaults.table("lens", optional=True)
-    sensor_defaults = defaults.table("sensor", optional=True)
-    lens = table.table("lens").with_defaults(lens_defaults)
-    sensors = [s.with_defaults(sensor_defaults) for s in table.tables("sensor")]
-    cone = Cone(
-        name=table.name("name"),
-        role="pan" if table.choice("role", ("pan", "colour")) == "pan" else "colour",
-        bands=bands,
-        position_mm=table.triple("position_mm"),
-        rotation_rad=table.triple("rotation_rad"),
-        rotation_sigma_urad=table.number("rotation_sigma_urad", 30.0, positive=True),
-        probe=probe,
-        calibration_c=calibration_c,
-        mark_to_mid_exposure_ns=table.integer(
-            "mark_to_mid_exposure_ns", 0, limits=EXPOSURE_OFFSET_LIMITS_NS
-        ),
-        mark_to_mid_exposure_sigma_ns=table.integer(
-            "mark_to_mid_exposure_sigma_ns", 1000, limits=(0, EXPOSURE_OFFSET_LIMITS_NS[1])
-        ),
-        lens=_lens(lens),
-        sensors=tuple(_sensor(sensor, probe, calibration_c) for sensor in sensors),
-    )
-    table.refuse_unknown()
-    return cone
+def _in_defaults(location: Location, content: Mapping[str, Any]) -> tuple[int | str, ...]:
+    """The place of a key in the file: in `[defaults]` if the lens or sensor itself has none."""
+    match location:
+        case ("cone", int(i), "lens", str(key), *rest):
+            own, defaults = content["cone"][i]["lens"], ("defaults", "lens")
+        case ("cone", int(i), "sensor", int(j), str(key), *rest):
+            own, defaults = content["cone"][i]["sensor"][j], ("defaults", "sensor")
+        case _:
+            return tuple(location)
+    in_defaults = key not in own and key in _table(content, *defaults)
+    return (*defaults, key, *rest) if in_defaults else tuple(location)
 
 
-def _lens(table: TomlTable) -> Lens:
-    direction = table.text("direction", "ideal_from_measured")
-    if direction != "ideal_from_measured":
-        table.add_problem("direction", "a lens correction here is ideal_from_measured")
-    number = table.number
-    lens = Lens(
-        f_mm=number("f_mm", positive=True, limits=FOCAL_LIMITS_MM),
-        f_ppm_per_k=number("f_ppm_per_k", 0.0),
-        f_sigma_ppm=number("f_sigma_ppm", 20.0, positive=True),
-        f_number=number("f_number", 5.6, positive=True),
-        serial=table.text("serial", ""),
-        dx0_mm=number("dx0_mm", 0.0),
-        dy0_mm=number("dy0_mm", 0.0),
-        df_mm=number("df_mm", 0.0),
-        k1=number("k1", 0.0),
-        k2=number("k2", 0.0),
-        k3=number("k3", 0.0),
-        p1=number("p1", 0.0),
-        p2=number("p2", 0.0),
-        b1=number("b1", 0.0),
-        b2=number("b2", 0.0),
-        residual_grid=_lens_grid(table.table("residual_grid", optional=True)),
-    )
-    table.refuse_unknown()
-    return lens
+def _lens_findings(content: Mapping[str, Any]) -> Iterator[Finding]:
+    """Lens corrections of another direction than those of this program."""
+    places: list[tuple[tuple[int | str, ...], Mapping[str, Any]]] = [
+        (("cone", i, "lens"), _table(cone, "lens"))
+        for i, cone in enumerate(_tables(content, "cone"))
+    ]
+    for place, lens in [(("defaults", "lens"), _table(content, "defaults", "lens")), *places]:
+        if lens.get("direction", DIRECTION) != DIRECTION:
+            text = f"is {shown(lens['direction'])}; a lens correction here is {DIRECTION}"
+            yield (*place, "direction"), text
 
 
-def _lens_grid(table: TomlTable) -> LensGrid | None:
-    if not table.content:
-        return None
-    x_mm, y_mm = table.steps("x_mm"), table.steps("y_mm")
-    grid = LensGrid(
-        x_mm,
-        y_mm,
-        table.matrix("dx_um", len(y_mm), len(x_mm)),
-        table.matrix("dy_um", len(y_mm), len(x_mm)),
-    )
-    table.refuse_unknown()
-    return grid
-
-
-def _sensor(table: TomlTable, probe: str, calibration_c: float) -> Sensor:
-    drift = table.table("drift", optional=True)
-    sign = table.integer("tdi_row_sign", 1)
-    if sign not in (-1, 1):
-        table.add_problem("tdi_row_sign", "it is 1 (charge moves to higher rows) or -1")
-    bits = table.integer("bits", 12, positive=True)
-    if bits > 16:
-        table.add_problem("bits", "a pixel has at most 16 bits")
-    width_px, height_px = _size(table, SENSOR_MAX_PIXELS)
-    sensor = Sensor(
-        name=table.name("name"),
-        serial=table.text("serial", ""),
-        width_px=width_px,
-        height_px=height_px,
-        pitch_um=table.number(
-            "pitch_um",
-            positive=True,
-            requirement="a pixel pitch is positive",
-            limits=PITCH_LIMITS_UM,
-        ),
-        x_mm=table.number("x_mm"),
-        y_mm=table.number("y_mm"),
-        rotation_rad=table.number("rotation_rad", 0.0),
-        scale=table.number("scale", 1.0, positive=True),
-        position_sigma_um=table.number("position_sigma_um", 0.0),
-        calibration_c=table.number("calibration_c", calibration_c),
-        probe=table.text("probe", probe),
-        drift=ThermalDrift(
-            x_um_per_k=drift.number("x_um_per_k", 0.0),
-            y_um_per_k=drift.number("y_um_per_k", 0.0),
-            rotation_urad_per_k=drift.number("rotation_urad_per_k", 0.0),
-            scale_ppm_per_k=drift.number("scale_ppm_per_k", 0.0),
-            sigma_um_per_k=drift.number("sigma_um_per_k", 0.0),
-            lag_s=drift.number("lag_s", 0.0),
-        ),
-        bits=bits,
-        black_dn=table.number("black_dn", 0.0),
-        electrons_per_dn=table.number("electrons_per_dn", 1.0, positive=True),
-        read_noise_e=table.number("read_noise_e", 0.0),
-        colour_filter_array=table.choice("colour_filter_array", COLOUR_FILTER_ARRAYS, "none"),
-        tdi_row_sign=sign,
-        justified=table.choice("justified", JUSTIFICATIONS, "right"),
-        skew_x_ppm_per_mm=_skew(table, "skew_x_ppm_per_mm"),
-        skew_y_ppm_per_mm=_skew(table, "skew_y_ppm_per_mm"),
-    )
-    drift.refuse_unknown()
-    table.refuse_unknown()
-    return sensor
-
-
-def _skew(table: TomlTable, key: str) -> float:
-    skew = table.number(key, 0.0)
-    if abs(skew) > MAX_SKEW_PPM_PER_MM:
-        table.add_problem(key, f"a skew is {MAX_SKEW_PPM_PER_MM:g} ppm/mm at most")
-    return skew
-
-
-def _check_names(rig: Rig, file: str, problems: list[str]) -> None:
-    cones = [cone.name for cone in rig.cones]
-    sensors = [sensor.name for sensor in rig.sensors]
-    for kind, names, most in (("cone", cones, CONES_MAX), ("sensor", sensors, SENSORS_MAX)):
-        if len(names) > most:
-            problems.append(f"{file}: {len(names)} {kind}s; a rig has {most} at most")
-            continue
-        twice = dict.fromkeys(name for name in names if names.count(name) > 1)
-        problems.extend(f"{file}: {kind} name {n!r} is used twice; names are unique" for n in twice)
+def _name_findings(
+    content: Mapping[str, Any], cones: Sequence[Mapping[str, Any]]
+) -> Iterator[Finding]:
+    """Names that are used twice or name nothing, and what a rig of its kind cannot do without."""
+    sensors = [(i, j, s) for i, c in enumerate(cones) for j, s in enumerate(_tables(c, "sensor"))]
+    if len(sensors) > SENSORS_MAX:
+        yield ("cone",), f"has {len(sensors)} sensors; a rig has {SENSORS_MAX} at most"
+        return
+    names = [cone.get("name") for cone in cones]
+    places: dict[str, dict[Any, Location]] = {"cone": {}, "sensor": {}}
+    for kind, name, place in chain(
+        (("cone", name, ("cone", i, "name")) for i, name in enumerate(names)),
+        (("sensor", s.get("name"), ("cone", i, "sensor", j, "name")) for i, j, s in sensors),
+    ):
+        if isinstance(name, str) and places[kind].setdefault(name, place) != place:
+            yield place, f"is {name!r}, as is {key_of(places[kind][name])}; names are unique"
     for key in ("master_cone", "colour_master_cone", "reference_cone"):
-        name = getattr(rig, key)
-        if name is not None and name not in cones:
-            listed = ", ".join(cones) or "none"
-            problems.append(f"{file}: {key} is {name!r}; it names a cone of this rig: {listed}")
-    if rig.master_cone is None:
-        problems.extend(_master_missing(rig, file))
-    problems.extend(
-        f"{file}: cone {cone.name!r} has no sensor; give it [[cone.sensor]]"
-        for cone in rig.cones
-        if not cone.sensors
-    )
-    problems.extend(
-        f"{file}: probe_serials.{name} is of no probe here: {', '.join(rig.probes) or 'none'}"
-        for name in rig.probe_serials
-        if name not in rig.probes
-    )
-    problems.extend(
-        f"{file}: sensor {sensor.name!r} is left-justified; a rig with [virtual_image] has "
-        f"right-justified words"
-        for sensor in rig.sensors
-        if rig.virtual_image is not None and sensor.justified == "left"
-    )
-
-
-def _master_missing(rig: Rig, file: str) -> list[str]:
-    """Only heads that converge, all at one instant, do without a master cone."""
-    missing = f"{file}: master_cone is missing; it names the cone whose layer is the virtual image"
-    if rig.virtual_image is None or len(rig.pan_cones) < 2:
-        return [missing]
-    if rig.timing != "synchronous":
-        return [f"{missing}. Only a synchronous rig of converging PAN heads has none"]
-    return []
+        name = content.get(key)
+        if isinstance(name, str) and name not in names and (name or key == "reference_cone"):
+            listed = ", ".join(map(str, names)) or "none"
+            yield (key,), f"is {shown(name)}; it names a cone of this rig: {listed}"
+    stitched = isinstance(content.get("virtual_image"), Mapping)
+    if not content.get("master_cone"):
+        pan = [cone for cone in cones if cone.get("role") == "pan"]
+        hint = "is missing; it names the cone whose layer is the virtual image"
+        if not stitched or len(pan) < 2:
+            yield ("master_cone",), hint
+        elif content.get("timing") != "synchronous":
+            alone = "Only a synchronous rig of converging PAN heads has none"
+            yield ("master_cone",), f"{hint}. {alone}"
+    probes = [
+        table["probe"]
+        for table in (*cones, *(sensor for _, _, sensor in sensors))
+        if isinstance(table.get("probe"), str) and table["probe"]
+    ]
+    for name in _table(content, "probe_serials"):
+        if name not in probes:
+            listed = ", ".join(dict.fromkeys(probes)) or "none"
+            yield ("probe_serials", name), f"is of no probe here: {listed}"
+    for i, j, sensor in sensors:
+        if stitched and sensor.get("justified") == "left":
+            place = _in_defaults(("cone", i, "sensor", j, "justified"), content)
+            yield place, "is 'left'; a rig with [virtual_image] has right-justified words"

@@ -9,11 +9,13 @@ import tomllib
 from collections.abc import Mapping
 from typing import Any, Final
 
+from processing.errors import ProcessingError
+
 DEPTH_MAX: Final = 32
 """Tables and lists within one another; no file of ours has more than six."""
 
 
-class TomlError(ValueError):
+class TomlError(ProcessingError, ValueError):
     """Text that is not TOML; the message states why."""
 
 

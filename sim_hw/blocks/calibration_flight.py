@@ -12,9 +12,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from sim_hw.world.seeding import random_stream
-from sim_hw.world.true_camera import BODY_FROM_CAMERA, rotation_opk
+from sim_hw.world.true_camera import BODY_FROM_CAMERA
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -196,17 +197,11 @@ def _pose(
 
 def _level_from_body(angles: Array | tuple[float, float, float]) -> Array:
     """Heading about down, then pitch about right, then roll about forward."""
-    roll, pitch, heading = (float(a) for a in angles)
-    about_z = rotation_opk((0.0, 0.0, heading))
-    about_y = rotation_opk((0.0, pitch, 0.0))
-    return np.asarray(about_z @ about_y @ rotation_opk((roll, 0.0, 0.0)))
+    return np.asarray(Rotation.from_euler("ZYX", angles[::-1]).as_matrix())
 
 
 def _angles(unit_in_level: Array) -> Array:
-    r = unit_in_level
-    return np.array(
-        [math.atan2(r[2, 1], r[2, 2]), math.asin(-r[2, 0]), math.atan2(r[1, 0], r[0, 0])]
-    )
+    return np.asarray(Rotation.from_matrix(unit_in_level).as_euler("ZYX")[::-1])
 
 
 def _vector(skew: Array) -> Array:

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from sim_hw.world.seeding import random_stream
 from sim_hw.world.true_camera import rotation_opk
@@ -86,12 +87,7 @@ def table_2_rotation(name: str) -> Array:
     """Nadir from oblique, (3, 3), of table 2; the nadir head is one."""
     if name == NADIR:
         return np.eye(3)
-    phi, omega, kappa = (v * GRAD for v in TABLE_2_GRAD[name])
-    return np.asarray(
-        rotation_opk((0.0, phi, 0.0))
-        @ rotation_opk((omega, 0.0, 0.0))
-        @ rotation_opk((0, 0, kappa))
-    )
+    return np.asarray(Rotation.from_euler("YXZ", np.multiply(TABLE_2_GRAD[name], GRAD)).as_matrix())
 
 
 def simulate_oblique_block(

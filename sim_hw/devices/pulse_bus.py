@@ -1,4 +1,4 @@
-"""The emulated trigger unit, exactly as docs/pulse-bus.md describes it.
+"""The emulated trigger unit, exactly as docs/reference/flight/pulse-bus.md describes it.
 
 It counts, delays and reports when each output pulses; it knows no head.
 """

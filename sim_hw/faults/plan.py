@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from sim_hw.errors import SimulatorError
 from sim_hw.faults.catalogue import CATALOGUE, TOPICS, DeviceKind, FaultKind
 
 SCENARIO_MAX_BYTES = 1 << 20
@@ -23,7 +24,7 @@ _TEXT = re.compile(
 _KEYS = frozenset(("fault", "at_s", "at_pulse", "device", "duration_s"))
 
 
-class FaultPlanError(ValueError):
+class FaultPlanError(SimulatorError, ValueError):
     """Faults that cannot be planned; `problems` has one sentence a mistake."""
 
     def __init__(self, problems: Sequence[str]) -> None:

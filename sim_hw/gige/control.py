@@ -10,6 +10,7 @@ import threading
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 from sim_hw.gige import features as at
 from sim_hw.gige.gvcp import (
@@ -23,7 +24,7 @@ from sim_hw.gige.gvcp import (
     parse_command,
     parse_resend,
 )
-from sim_hw.gige.registers import RegisterMemory, RegisterRefusedError
+from sim_hw.gige.registers import RegisterRefusedError
 
 Peer = tuple[str, int]
 """Address and port of whoever sent a packet."""
@@ -48,10 +49,22 @@ class HeadActions:
     is_acquiring: Callable[[], bool]
 
 
+class Registers(Protocol):
+    """The registers behind a control channel; refusals raise `RegisterRefusedError`."""
+
+    def read(self, address: int, length: int) -> bytes: ...
+
+    def write(self, address: int, data: bytes, *, acquiring: bool = False) -> None: ...
+
+    def register(self, address: int) -> int: ...
+
+    def set_register(self, address: int, value: int) -> None: ...
+
+
 class ControlChannel:
     """Answers GVCP packets. Never raises, whatever arrives: what is not GVCP is counted."""
 
-    def __init__(self, registers: RegisterMemory, actions: HeadActions) -> None:
+    def __init__(self, registers: Registers, actions: HeadActions) -> None:
         self._registers = registers
         self._actions = actions
         self._controller: Peer | None = None

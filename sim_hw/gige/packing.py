@@ -19,6 +19,7 @@ BITS = {
     "Mono12": 12,
     "Mono12p": 12,
     "Mono12Packed": 12,
+    "Mono14": 14,
     "Mono16": 16,
 }
 """Significant bits of a pixel."""
@@ -29,7 +30,7 @@ def wire_pixels(
 ) -> NDArray[np.uint8] | NDArray[np.uint16]:
     """The bytes or words of a frame, contiguous; `image` has shape (height, width)."""
     bits = BITS[pixel_format]
-    if pixel_format in ("Mono12", "Mono16"):
+    if pixel_format in ("Mono12", "Mono14", "Mono16"):
         # As they are and where they are: a full frame is not copied to be sent.
         return np.ascontiguousarray(image, dtype="<u2")
     values: NDArray[np.uint16] = np.minimum(image >> max(0, SENSOR_BITS - bits), (1 << bits) - 1)

@@ -12,6 +12,7 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from sim_hw.errors import SimulatorError
 from sim_hw.gige import features as at
 from sim_hw.gige.description import description_xml
 from sim_hw.gige.features import (
@@ -35,7 +36,7 @@ _RESEND_WRITEMEM_CONCATENATION = 0x7
 _ACTION_AND_SCHEDULED = 1 << 6 | 1 << 17
 
 
-class RegisterRefusedError(Exception):
+class RegisterRefusedError(SimulatorError):
     """A read or write the head does not grant; `status` goes into the acknowledgement."""
 
     def __init__(self, status: Status) -> None:

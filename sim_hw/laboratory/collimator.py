@@ -19,6 +19,7 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
+from scipy.spatial.transform import Rotation
 
 from processing.rig import Cone, Lens, Rig, Sensor
 from sim_hw.laboratory.instrument_series import command, new_series, run, write_list
@@ -120,9 +121,8 @@ def target(u: Array, v: Array, edge: float) -> Array:
 
 def direction(alpha: float, beta: float) -> tuple[Array, Array, Array]:
     """To the target in the laboratory, and the axes of its plane: three unit vectors."""
-    (sa, ca), (sb, cb) = ((math.sin(x), math.cos(x)) for x in (alpha, beta))
-    to = np.array([sa * cb, sb, -ca * cb])
-    return to, np.array([ca, 0.0, sa]), np.array([-sa * sb, cb, ca * sb])
+    right, up, backwards = Rotation.from_euler("YX", [-alpha, beta]).as_matrix().T
+    return -backwards, right, up
 
 
 def seen_at(head: TrueHead, rotation: Array, alpha: float, beta: float) -> Array | None:

@@ -336,7 +336,10 @@ class DiscreteEventRig:
         self._answer(f"PULSEBUS 1 {self.rig.name} {outputs}", now_ns)
 
     def execute(self, line: bytes, now_ns: int) -> None:
-        """A line of the program; not received if the cable is out. See docs/pulse-bus.md."""
+        """A line of the program (docs/reference/flight/pulse-bus.md).
+
+        It is not received if the cable is out.
+        """
         if not self.trigger.is_connected(now_ns):
             return
         match line.decode().split():

@@ -1,7 +1,8 @@
 """`python -m sim_hw.processes.exposures RIG`: exposures on disk, without devices.
 
-Writes a mission folder in the format for hand-written missions (docs/formats.md), the laboratory's
-calibration and the truth. Rendering is separate so that benchmarks time the pipeline alone.
+Writes a mission folder in the format for hand-written missions (docs/reference/formats.md), the
+laboratory's calibration and the truth. Rendering is separate so that benchmarks time the pipeline
+alone.
 """
 
 from __future__ import annotations
@@ -15,7 +16,6 @@ from typing import Any
 
 import tifffile
 
-from processing.rig import RigError
 from sim_hw.__main__ import displacement, rig_file
 from sim_hw.world import sensor_calibration
 from sim_hw.world.atomic_file import atomic_file
@@ -180,7 +180,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 cloud_over=given.cloud_over,
             )
         )
-    except (RigError, ValueError) as error:
+    except ValueError as error:
         print(error, file=sys.stderr)
         return 2
     given.out.mkdir(parents=True, exist_ok=True)

@@ -24,6 +24,7 @@ from typing import Any
 
 from sim_hw.devices.pps_source import PpsSource
 from sim_hw.devices.pulse_bus import Firing, PulseBus
+from sim_hw.errors import SimulatorError
 from sim_hw.faults.channel import BytesDamage, Channel, for_device
 from sim_hw.faults.faulty_line import FaultyWire, FaultyWorldClock
 from sim_hw.faults.plan import read_plan
@@ -54,10 +55,6 @@ PROBE_DRIVERS = {"modbus": "modbus-rtu", "ascii": "ascii-line"}
 PROBE_OFFSET_SIGMA_C = 0.07
 PROBE_NOISE_SIGMA_C = 0.07
 """Together the 0.1 K that probes of this kind are good for."""
-
-
-class SimulatorError(RuntimeError):
-    """The emulator cannot start; the message gives the reason."""
 
 
 @dataclass(frozen=True)

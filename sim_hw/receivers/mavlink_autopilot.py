@@ -14,6 +14,8 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from scipy.spatial.transform import Rotation
+
 from sim_hw.devices.device_loop import DeviceLine, LineDevice
 from sim_hw.devices.pseudo_terminal import PseudoTerminal
 from sim_hw.faults.catalogue import MARK, NAVIGATION
@@ -248,8 +250,8 @@ class MavlinkAutopilot(LineDevice):
                 name, time_boot_ms=boot_ns // 1_000_000, roll=roll, pitch=pitch, yaw=yaw, **spins
             )
         if name == "ATTITUDE_QUATERNION":
-            q = quaternion(state)
-            values = dict(zip(("q1", "q2", "q3", "q4"), q, strict=True))
+            q = attitude(state).as_quat(canonical=True, scalar_first=True)
+            values = dict(zip(("q1", "q2", "q3", "q4"), q.tolist(), strict=True))
             spins = dict(zip(("rollspeed", "pitchspeed", "yawspeed"), rates, strict=True))
             return self._pack_message(name, time_boot_ms=boot_ns // 1_000_000, **values, **spins)
         return self._imu(state, rates, boot_ns)
@@ -313,9 +315,9 @@ class MavlinkAutopilot(LineDevice):
     def _body_rates(self, gps_ns: int) -> tuple[float, float, float]:
         """rad/s, from what the attitude is shortly before and after."""
         before, after = self._state(gps_ns - RATE_STEP_NS), self._state(gps_ns + RATE_STEP_NS)
-        w, x, y, z = product(conjugate(quaternion(before)), quaternion(after))
-        scale = 2 * math.copysign(1.0, w) / (2 * RATE_STEP_NS * 1e-9)
-        return x * scale, y * scale, z * scale
+        turned = (attitude(before).inv() * attitude(after)).as_rotvec()
+        x, y, z = (turned / (2 * RATE_STEP_NS * 1e-9)).tolist()
+        return x, y, z
 
     # What it answers
 
@@ -425,28 +427,7 @@ def _periods(hertz: Mapping[str, float]) -> dict[str, int]:
     return {name: round(NS_PER_S / each) if each else 0 for name, each in hertz.items()}
 
 
-Quaternion = tuple[float, float, float, float]
-
-
-def quaternion(state: ReceiverState) -> Quaternion:
-    """Body to north, east, down; w first and never negative."""
-    half = [math.radians(a) / 2 for a in (state.roll_deg, state.pitch_deg, state.heading_deg)]
-    roll = (math.cos(half[0]), math.sin(half[0]), 0.0, 0.0)
-    pitch = (math.cos(half[1]), 0.0, math.sin(half[1]), 0.0)
-    yaw = (math.cos(half[2]), 0.0, 0.0, math.sin(half[2]))
-    w, x, y, z = product(product(yaw, pitch), roll)
-    return (w, x, y, z) if w >= 0 else (-w, -x, -y, -z)
-
-
-def product(p: Quaternion, q: Quaternion) -> Quaternion:
-    """Hamilton's product."""
-    return (
-        p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3],
-        p[0] * q[1] + p[1] * q[0] + p[2] * q[3] - p[3] * q[2],
-        p[0] * q[2] - p[1] * q[3] + p[2] * q[0] + p[3] * q[1],
-        p[0] * q[3] + p[1] * q[2] - p[2] * q[1] + p[3] * q[0],
-    )
-
-
-def conjugate(q: Quaternion) -> Quaternion:
-    return q[0], -q[1], -q[2], -q[3]
+def attitude(state: ReceiverState) -> Rotation:
+    """Body to north, east, down."""
+    angles = (state.heading_deg, state.pitch_deg, state.roll_deg)
+    return Rotation.from_euler("ZYX", angles, degrees=True)

@@ -14,11 +14,14 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from sim_hw.world.ellipsoid import ecef_from_enu_rotation, geodetic_from_enu
 from sim_hw.world.seeding import random_stream
 
 Matrix = NDArray[np.float64]
+
+ENU_FROM_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 GRAVITY_MPS2 = 9.80665
 TURN_BANK_DEG = 20.0
@@ -182,12 +185,9 @@ class SimulatedFlight:
 
     def attitude_rad(self, pose: Pose) -> tuple[float, float, float]:
         """Roll, pitch and heading against the local level at the aircraft, as an IMU has them."""
-        east, north, up = self._local_from_enu(pose) @ pose.enu_from_body
-        return (
-            math.atan2(-up[1], -up[2]),
-            math.asin(up[0]),
-            math.atan2(east[0], north[0]) % (2 * math.pi),
-        )
+        ned_from_body = ENU_FROM_NED.T @ self._local_from_enu(pose) @ pose.enu_from_body
+        heading, pitch, roll = Rotation.from_matrix(ned_from_body).as_euler("ZYX")
+        return float(roll), float(pitch), float(heading % math.tau)
 
     def _local_from_enu(self, pose: Pose) -> Matrix:
         """East, north, up at the aircraft from those at the origin.
@@ -301,15 +301,5 @@ def _ramp(s: float, length: float, ramp: float) -> float:
 
 def enu_from_body(roll_rad: float, pitch_rad: float, heading_rad: float) -> Matrix:
     """Rotation from body (forward, right, down) to east, north, up."""
-    cr, sr = math.cos(roll_rad), math.sin(roll_rad)
-    cp, sp = math.cos(pitch_rad), math.sin(pitch_rad)
-    ch, sh = math.cos(heading_rad), math.sin(heading_rad)
-    ned_from_body = np.array(
-        [
-            [ch * cp, ch * sp * sr - sh * cr, ch * sp * cr + sh * sr],
-            [sh * cp, sh * sp * sr + ch * cr, sh * sp * cr - ch * sr],
-            [-sp, cp * sr, cp * cr],
-        ]
-    )
-    enu_from_ned = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
-    return np.asarray(enu_from_ned @ ned_from_body)
+    ned_from_body = Rotation.from_euler("ZYX", [heading_rad, pitch_rad, roll_rad]).as_matrix()
+    return np.asarray(ENU_FROM_NED @ ned_from_body)

@@ -11,6 +11,7 @@ line flown north is a map with north up. Samples are about one PAN ground sampli
 from __future__ import annotations
 
 import hashlib
+import importlib.util
 import json
 import shutil
 import tempfile
@@ -22,6 +23,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_hw.errors import SimulatorError
 from sim_hw.world import quilting, spline
 from sim_hw.world.ground_types import GROUNDS
 from sim_hw.world.seeding import random_stream
@@ -48,7 +50,7 @@ LENS_OF_SOURCE_PX = 0.8
 """The blur left in a photograph, taken out before our own lens puts its own in."""
 
 
-class SceneError(ValueError):
+class SceneError(SimulatorError, ValueError):
     """A scene is not available; the message gives the reason and the remedy."""
 
 
@@ -159,8 +161,21 @@ def _quilted(settings: SceneSettings) -> tuple[quilting.Picture, int, int]:
 
 
 def shipped_pictures() -> list[Path]:
-    """The photographs that come with the package."""
-    return [Path(__file__).parents[1] / "scenes" / name for name in SHIPPED]
+    """The photographs, in the source tree or in the distribution `syntopic-scenes`.
+
+    Raises:
+        SceneError: neither is there.
+    """
+    folder = Path(__file__).parents[1] / "scenes"
+    if not folder.is_dir():
+        spec = importlib.util.find_spec("syntopic_scenes")
+        if spec is None or not spec.submodule_search_locations:
+            raise SceneError(
+                "the photographs of the emulated ground are not installed. "
+                "Run: pip install syntopic-scenes"
+            )
+        folder = Path(spec.submodule_search_locations[0])
+    return [folder / name for name in SHIPPED]
 
 
 def radiance(path: Path) -> quilting.Picture:

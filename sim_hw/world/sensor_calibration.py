@@ -1,7 +1,7 @@
 """The emulated calibration laboratory: measures the emulated sensors and writes the results.
 
 What it writes is what a laboratory can know: averages of a stated number of frames with their
-noise, never the truth itself. The files are those the pipeline reads (docs/formats.md).
+noise, never the truth itself. The files are those the pipeline reads (docs/reference/formats.md).
 """
 
 from __future__ import annotations

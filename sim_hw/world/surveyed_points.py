@@ -32,7 +32,7 @@ def write_surveyed(
     survey_m: float = 0.02,
     measured_px: float = 0.1,
 ) -> None:
-    """Write `points.csv` and `measured.csv` (docs/formats.md, aerial triangulation).
+    """Write `points.csv` and `measured.csv` (docs/reference/formats.md, aerial triangulation).
 
     Args:
         marks: mid-exposures of the reference cone, exposure by exposure.

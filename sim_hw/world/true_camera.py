@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
+from scipy.spatial.transform import Rotation
 
 from processing.rig import Cone, Lens, Rig, Sensor
 from sim_hw.world.flight import Pose
@@ -186,11 +187,7 @@ def principal_distance_mm(cone: Cone, temperature_c: float) -> float:
 
 def rotation_opk(angles_rad: tuple[float, float, float]) -> Array:
     """R = Rx(omega) Ry(phi) Rz(kappa), (3, 3)."""
-    (so, co), (sp, cp), (sk, ck) = ((math.sin(a), math.cos(a)) for a in angles_rad)
-    rx = np.array([[1.0, 0, 0], [0, co, -so], [0, so, co]])
-    ry = np.array([[cp, 0, sp], [0, 1.0, 0], [-sp, 0, cp]])
-    rz = np.array([[ck, -sk, 0], [sk, ck, 0], [0, 0, 1.0]])
-    return np.asarray(rx @ ry @ rz)
+    return np.asarray(Rotation.from_euler("XYZ", angles_rad).as_matrix())
 
 
 def projection_centre_m(cone: Cone, pose: Pose) -> Array:

@@ -117,7 +117,7 @@ class TruthWriter:
 def exposure_truth(
     world: World, flight: SimulatedFlight, taken: Mapping[str, SensorExposure]
 ) -> dict[str, Any]:
-    """The arrays of one exposure's file; see docs/emulator.md for each."""
+    """The arrays of one exposure's file; see docs/reference/emulator.md for each."""
     mark = _mid_of_cone(world, world.rig.reference_cone, taken)
     master = _mid_of_cone(world, world.rig.master_cone, taken)
     known = [m for m in (mark, master) if m is not None]

@@ -1,4 +1,4 @@
-"""docs/formats.md is exact: its example runs, and it names every key that is read or written."""
+"""docs/reference/formats.md is exact: its example runs, and it names every key."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from daemon.mission.canonical_json import RecordError, parse_record
 from daemon.mission.exposure import Exposure, NavigationRecord, capture_bytes, from_json, to_json
 from daemon.mission.layout import Mission
 from daemon.mission.store.store import load_level0, verify
-from processing.quality.report import FIGURES, Flag, Thresholds
+from processing.quality.figures import FIGURES
+from processing.quality.report import Flag, Thresholds
 from processing.rig import Cone, Lens, Rig, Sensor, ThermalDrift, VirtualImage, load_rig
 from tests.daemon.small_camera import (
     HEIGHT_PX,
@@ -26,7 +27,7 @@ from tests.daemon.small_camera import (
     small_rig,
 )
 
-PAGE = Path(__file__).parents[2] / "docs" / "formats.md"
+PAGE = Path(__file__).parents[2] / "docs/reference/formats.md"
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +45,7 @@ def named(page, heading, end="\n## "):
 def by_hand(page, tmp_path, monkeypatch):
     (program,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     monkeypatch.chdir(tmp_path)
-    exec(compile(program, "docs/formats.md", "exec"), {})
+    exec(compile(program, "docs/reference/formats.md", "exec"), {})
     return Mission.open(tmp_path / "by-hand")
 
 

@@ -32,6 +32,7 @@ from drivers.contract import (
     LifeCycle,
     Record,
 )
+from tests.stopwatch import Stopwatch
 
 ADDRESS = "127.0.0.1"
 FAKE_CAMERA = "arv-fake-gv-camera-0.8"
@@ -170,15 +171,15 @@ def a_killed_head_is_found_again() -> dict[str, object]:
         flight.thread.start()
         flight.wait_active()
         flight.expose(2)
-        flight.start = time.monotonic()
         camera.kill()
         camera.wait(5)
-        flight.wait_event("lost", 1, 8)
-    lost_s = flight.events[-1][0]
+        watch = Stopwatch()
+        flight.wait_event("lost", 1, 60)
+        lost_s = watch.own_s
     with fake_camera():
-        restarted = time.monotonic()
-        flight.wait_event("opened", 2, 15)
-        reopened_s = time.monotonic() - restarted
+        watch = Stopwatch()
+        flight.wait_event("opened", 2, 60)
+        reopened_s = watch.own_s
         flight.wait_active()
         flight.expose(2)
         after = len(flight.frames)
@@ -200,12 +201,12 @@ def a_quick_restart_is_noticed() -> dict[str, object]:
         flight.thread.start()
         flight.wait_active()
         flight.expose(1)
-        flight.start = time.monotonic()
+        watch = Stopwatch()
         camera.kill()
         camera.wait(5)
     with fake_camera():
-        flight.wait_event("opened", 2, 15)
-        back_s = time.monotonic() - flight.start
+        flight.wait_event("opened", 2, 60)
+        back_s = watch.own_s
         flight.wait_active()
         flight.expose(2)
         flight.head.close()
@@ -241,13 +242,13 @@ def a_dead_controllers_hold_is_waited_out() -> dict[str, object]:
         event_names: list[str] = []
         holder.kill()
         holder.wait(5)
-        killed = time.monotonic()
+        watch = Stopwatch()
         flight.head.bind(
             lambda record: (
                 event_names.append(record.name) if isinstance(record, DeviceEvent) else None
             )
         )
-        waited_s = time.monotonic() - killed
+        waited_s = watch.own_s
         flight.thread.start()
         flight.wait_active()
         flight.expose(2)
@@ -343,11 +344,11 @@ def closing_a_dead_head_takes_two_seconds_at_most() -> dict[str, object]:
         flight.expose(1)
         camera.kill()
         camera.wait(5)
-        before = time.monotonic()
+        watch = Stopwatch()
         flight.head.close()
-        closed_s = time.monotonic() - before
-        flight.thread.join(5)
-        ended_s = time.monotonic() - before
+        closed_s = watch.own_s
+        flight.thread.join(60)
+        ended_s = watch.own_s
     return {"closed_s": closed_s, "ended_s": ended_s, "state": flight.head.state.value}
 
 

@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 
 pytestmark = [
+    pytest.mark.realtime,
     pytest.mark.peer,
     pytest.mark.skipif(
         shutil.which("arv-fake-gv-camera-0.8") is None,
@@ -109,7 +110,7 @@ def test_settings_that_the_head_refuses_come_all_at_once_and_let_it_go() -> None
     four, serial, line, small, absent = outcome["refusals"]
     assert "pixel_format is 'Mono12p'; the head has" in four
     assert "exposure_time_us is 5e+07; the head takes 10 to 1e+07" in four
-    assert "gain_db is 6; the head has no feature Gain in dB, set 0" in four
+    assert "gain_db is 6; the head has no gain in dB; it has GainRaw in steps of its own" in four
     assert "tdi_shifts is 12; the head has no feature TdiShifts, set 0" in four
     assert "serial number is 'T1' where 'T2' is configured" in serial
     assert "trigger_line = 'Line7' is refused" in line

@@ -36,7 +36,7 @@ from sim_hw.gige.gige_head import (
 from sim_hw.world.world_clock import FreeRunningClock
 
 pytest.importorskip("gi", reason="needs PyGObject (extra aravis) and gir1.2-aravis-0.8")
-pytestmark = pytest.mark.timeout(240)
+pytestmark = [pytest.mark.realtime, pytest.mark.timeout(240)]
 
 NETWORK = f"127.{1 + os.getpid() % 250}.77"
 """Addresses of this process's own: other tests have heads, too."""

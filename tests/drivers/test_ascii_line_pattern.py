@@ -45,9 +45,9 @@ def test_what_is_found_is_what_python_finds(
 )
 def test_a_pattern_that_hangs_a_backtracking_matcher_is_matched_in_time(text: str) -> None:
     pattern = LinePattern(text)
-    begin = time.perf_counter()
+    begin_s = time.process_time()
     assert pattern.search("a" * 255 + "!") is None
-    assert time.perf_counter() - begin < 1.0
+    assert time.process_time() - begin_s < 1.0
 
 
 @pytest.mark.parametrize(

@@ -40,6 +40,9 @@ from tests.drivers.uart_relay import UartRelay, sampled
 from tests.sim_hw.receiver_state import state_at
 from tests.system.demo_mission import syntopic
 
+pytestmark = pytest.mark.realtime
+
+
 DEVICES: dict[str, tuple[Callable[[], LineDevice], str, int]] = {
     # The u-blox sends NMEA in addition to its own: it is a u-blox all the same.
     "ublox": (lambda: UbloxReceiver(_clock(), state_at, rate_hz=1.0), "ublox", 38_400),

@@ -1,4 +1,4 @@
-"""The pages in docs/drivers name every setting with the default the driver really has."""
+"""The pages in docs/reference/drivers name every setting with the default the driver really has."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 from drivers.base import registry
 from drivers.base.settings import Setting
 
-DOCUMENTATION = Path(__file__).parents[2] / "docs" / "drivers"
+DOCUMENTATION = Path(__file__).parents[2] / "docs/reference/drivers"
 PAGES = [
     ("head", "aravis", "aravis.md"),
     ("thermometer", "modbus-rtu", "modbus-rtu.md"),

@@ -31,6 +31,9 @@ from sim_hw.world.world_clock import WorldClock
 from tests.drivers.fakes import RecordingSink, running
 from tests.sim_hw.receiver_state import NS, STATE, WEEK_NS
 
+pytestmark = pytest.mark.realtime
+
+
 WITHIN_S = 30.0
 METRES_PER_DEGREE = 111_320.0
 HOUR_NS = 3600 * NS

@@ -1,6 +1,7 @@
 """Fifty-two recordings: what we read is what gpsd read, or the difference has a reason.
 
-The table is docs/drivers/gpsd-recordings.md; `python -m tests.drivers.test_gpsd_corpus` writes it.
+The table is docs/reference/results/gpsd-recordings.md; `python -m tests.drivers.test_gpsd_corpus`
+writes it.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from tests.drivers.gpsd_corpus import (
 )
 from tests.drivers.real_gpsd import PROGRAM
 
-PAGE: Final = Path(__file__).parents[2] / "docs" / "drivers" / "gpsd-recordings.md"
+PAGE: Final = Path(__file__).parents[2] / "docs/reference/results/gpsd-recordings.md"
 AT_ONCE: Final = 8
 FLAT, NO_HEIGHT, NO_REPORT = (
     "2d, gpsd 3d",
@@ -98,6 +99,7 @@ THROUGH_GPSD: Final = {
 """Why what comes through the real gpsd differs, by kind of difference."""
 
 pytestmark = [
+    pytest.mark.realtime,
     pytest.mark.trust,
     pytest.mark.skipif(
         not CORPUS.is_dir(), reason="needs the recordings in ../shared/data/nav/gpsd-daemon"

@@ -22,8 +22,6 @@ from drivers.receivers.mavlink.boot_clock import GPS_EPOCH_UNIX_NS
 from drivers.receivers.mavlink.decoder import (
     MavlinkDecoder,
     Timesync,
-    angles_of,
-    interpolated_quaternion,
 )
 from drivers.receivers.mavlink.navigator import MavlinkNavigator
 from drivers.receivers.message_decoder import Nav
@@ -259,16 +257,6 @@ def test_a_checked_message_of_nonsense_raises_nothing(payload: bytes, name: str)
     stream_bytes = b"\xfd" + head + filled + crc.to_bytes(2, "little")
     decoder, _ = decode(bus.heartbeat() + bus.system_time() + stream_bytes)
     assert decoder.frames == 3
-
-
-def test_rotations_are_interpolated_along_the_shorter_arc() -> None:
-    def heading(degrees: float) -> tuple[float, float, float, float]:
-        half = math.radians(degrees) / 2
-        return math.cos(half), 0.0, 0.0, math.sin(half)
-
-    there = tuple(-n for n in heading(20.0))
-    _, _, angle = angles_of(interpolated_quaternion(heading(10.0), there, 0.25))
-    assert math.degrees(angle) == pytest.approx(12.5)
 
 
 # The device

@@ -9,12 +9,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from drivers.contract import EventMark, NavSample
-from drivers.receivers.mavlink.decoder import (
-    MavlinkDecoder,
-    angles_of,
-    interpolated_quaternion,
-    quaternion_of,
-)
+from drivers.receivers.mavlink.decoder import MavlinkDecoder
 from tests.drivers.test_mavlink import BOOT_MS, UNIX_US, Bus, decode, marks, samples
 
 
@@ -273,24 +268,3 @@ def test_a_measurement_that_is_no_number_is_bad(value: float) -> None:
     bad = dialect.MAVLink_highres_imu_message(0, *[0.5] * 5, value, *[0.5] * 7, 0)
     decoder, _ = decode(bus.heartbeat() + bus.pack_message(good) + bus.pack_message(bad))
     assert (decoder.bad_messages, decoder.seen["HIGHRES_IMU"]) == (1, 1)
-
-
-@pytest.mark.parametrize(
-    "attitude", [(0.1, 0.2, 0.3), (-0.4, 0.5, 6.0), (1.0, -1.2, 3.0), (3.0, 0.0, 0.0)]
-)
-def test_angles_and_quaternions_are_each_others_inverse(
-    attitude: tuple[float, float, float],
-) -> None:
-    assert angles_of(quaternion_of(*attitude)) == pytest.approx(attitude, abs=1e-12)
-    assert math.hypot(*quaternion_of(*attitude)) == pytest.approx(1.0)
-
-
-@pytest.mark.parametrize("share", [0.0, 0.3, 0.5, 1.0])
-@pytest.mark.parametrize("sign", [1, -1])
-def test_between_two_headings_the_shorter_arc_is_shared(share: float, sign: int) -> None:
-    first = quaternion_of(0.0, 0.0, math.radians(350.0))
-    w, x, y, z = quaternion_of(0.0, 0.0, math.radians(30.0))
-    second = (sign * w, sign * x, sign * y, sign * z)
-    heading = math.degrees(angles_of(interpolated_quaternion(first, second, share))[2])
-    assert heading == pytest.approx((350.0 + 40.0 * share) % 360.0, abs=1e-9)
-    assert interpolated_quaternion(first, first, share) == first

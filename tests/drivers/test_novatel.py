@@ -17,7 +17,7 @@ from drivers.receivers.novatel.decoder import NovatelDecoder
 from drivers.receivers.novatel.framing import crc32
 from drivers.timescales.gps_time import WEEK_NS
 
-NAV = Path(__file__).parents[3] / "shared" / "data" / "nav"
+NAV = Path(__file__).parent / "data"
 EXCERPT = Path(__file__).parent / "data" / "novatel-ins2-excerpt.gps"
 FINESTEERING, UNKNOWN = 180, 20
 WEEK = 2445
@@ -129,8 +129,6 @@ def test_damage_and_noise_raise_nothing_and_cost_no_later_message(data: st.DataO
 
 @pytest.mark.parametrize("path", [EXCERPT, NAV / "novatel" / "ins2.gps"])
 def test_every_recorded_solution_is_that_of_novatels_decoder(path: Path) -> None:
-    if not path.exists():
-        pytest.skip("needs NovAtel's recording in ../shared/data/nav/novatel")
     decoder, records = decode(path.read_bytes())
     parser = oem.Parser()
     parser.write(path.read_bytes())
@@ -147,8 +145,6 @@ def test_every_recorded_solution_is_that_of_novatels_decoder(path: Path) -> None
 
 def test_a_stream_that_is_nothing_but_sync_errors_gives_nothing_and_is_not_retained() -> None:
     path = NAV / "novatel" / "binary_sync_error.BIN"
-    if not path.exists():
-        pytest.skip("needs NovAtel's recording in ../shared/data/nav/novatel")
     data = path.read_bytes()
     decoder, records = decode(data, 500)
     assert (records, decoder.frames, decoder.bad_bytes) == ([], 0, len(data))

@@ -5,15 +5,17 @@ All kinds at once, each with its driver on an emulated receiver; the others are 
 
 from __future__ import annotations
 
-import os
 import socket
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import pytest
 
 from drivers.base import registry
 from drivers.contract import EventMark, NavSample
@@ -28,6 +30,9 @@ from sim_hw.receivers.ublox_receiver import UbloxReceiver
 from sim_hw.world.world_clock import WorldClock
 from tests.drivers.fakes import RecordingSink
 from tests.sim_hw.receiver_state import state_at
+
+pytestmark = pytest.mark.realtime
+
 
 WITHIN_S = 40.0
 SILENCE_S = 1.0
@@ -79,8 +84,13 @@ def running(pairs: list[Pair]) -> Iterator[None]:
     assert not any(thread.is_alive() for thread in threads)
 
 
-def held_descriptors() -> int:
-    return len(os.listdir("/proc/self/fd"))  # noqa: PTH208 - counted, not walked
+def held() -> Counter[str]:
+    """What is open and running, by what it refers to; what earlier tests left may end meanwhile."""
+    found = Counter(f"thread {thread.ident}" for thread in threading.enumerate())
+    for descriptor in Path("/proc/self/fd").iterdir():
+        with suppress(FileNotFoundError):  # the listing's own
+            found[str(descriptor.readlink())] += 1
+    return found
 
 
 def on_cables(folder: Path) -> list[Pair]:
@@ -96,7 +106,7 @@ def on_cables(folder: Path) -> list[Pair]:
 
 
 def test_a_pulled_cable_is_reported_and_healed_for_every_kind(tmp_path: Path) -> None:
-    held, threads = held_descriptors(), threading.active_count()
+    before_it = held()
     pairs = on_cables(tmp_path)
     with running(pairs):
         for pair in pairs:
@@ -117,7 +127,7 @@ def test_a_pulled_cable_is_reported_and_healed_for_every_kind(tmp_path: Path) ->
         lost = next(e for e in pair.recorder.events if e.name == "lost")
         assert lost.is_fault and "automatically" in lost.sentence
     assert pairs[-1].recorder.event_names == ["opened"], "the one nobody touched"
-    assert (held_descriptors(), threading.active_count()) == (held, threads), "nothing leaks"
+    assert held() - before_it == Counter(), "nothing leaks"
 
 
 def test_an_autopilot_that_falls_silent_and_restarts_is_received_again_at_the_right_time() -> None:

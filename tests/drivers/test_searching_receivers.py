@@ -24,7 +24,7 @@ from tests.drivers.test_gpsd import TPV, StubGpsd, flown, lines
 from tests.drivers.test_nmea import EXCERPT, epoch, sentence
 from tests.drivers.ubx_frames import nav_pvt
 
-pytestmark = pytest.mark.trust
+pytestmark = [pytest.mark.realtime, pytest.mark.trust]
 
 COLD = b"".join(
     sentence(body)

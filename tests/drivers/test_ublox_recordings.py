@@ -18,12 +18,8 @@ from tests.drivers.fakes import RecordingSink
 from tests.drivers.pty_line import PtyLine
 from tests.drivers.ubx_frames import frame
 
-RECORDINGS = Path(__file__).parents[3] / "shared" / "data" / "nav" / "gpsd"
+RECORDINGS = Path(__file__).parent / "data" / "gpsd"
 EXCERPT = Path(__file__).parent / "data" / "ublox-neo-m8l-excerpt.ubx"
-
-needs_recordings = pytest.mark.skipif(
-    not RECORDINGS.is_dir(), reason="needs gpsd's recordings in ../shared/data/nav/gpsd"
-)
 
 
 def _theirs(path: Path, identity: str) -> list[Any]:
@@ -32,7 +28,6 @@ def _theirs(path: Path, identity: str) -> list[Any]:
         return [message for _, message in reader if message and message.identity == identity]
 
 
-@needs_recordings
 @pytest.mark.peer
 @pytest.mark.parametrize(("name", "epochs"), [("ublox-neo-m8l", 19), ("ublox-zed-f9r", 30)])
 def test_every_recorded_epoch_has_the_gps_time_of_its_nav_timegps(name: str, epochs: int) -> None:
@@ -52,7 +47,6 @@ def test_every_recorded_epoch_has_the_gps_time_of_its_nav_timegps(name: str, epo
         assert sample.satellites == pvt.numSV
 
 
-@needs_recordings
 @pytest.mark.peer
 def test_the_recorded_m8t_has_18_leap_seconds_and_no_damage() -> None:
     path = RECORDINGS / "u-blox-m8t-time.log"
@@ -63,7 +57,6 @@ def test_the_recorded_m8t_has_18_leap_seconds_and_no_damage() -> None:
     assert decoder.bad_messages == 0
 
 
-@needs_recordings
 @pytest.mark.peer
 def test_attitude_of_the_recorded_m8l_is_that_of_the_same_time_of_week() -> None:
     path = RECORDINGS / "ublox-neo-m8l.log"

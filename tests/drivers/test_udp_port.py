@@ -17,6 +17,9 @@ from drivers.transport.udp_port import SenderFilter, open_udp_port
 from tests.drivers.fakes import RecordingSink, running
 from tests.drivers.test_mavlink import BOOT_MS, Bus, free_udp_port
 
+pytestmark = pytest.mark.realtime
+
+
 WITHIN_S = 30.0
 S = 1_000_000_000
 OURS, FOREIGN = 475_000_000, 100_000_000

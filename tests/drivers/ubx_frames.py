@@ -15,6 +15,17 @@ def frame(class_id: int, message_id: int, payload: bytes) -> bytes:
     return b"\xb5\x62" + body + bytes((a, b))
 
 
+def without(recorded: bytes, class_id: int, message_id: int) -> bytes:
+    """A recording of whole frames without those of one message."""
+    frames, at = [], 0
+    while (at := recorded.find(b"\xb5\x62", at)) >= 0:
+        end = at + 8 + struct.unpack_from("<H", recorded, at + 4)[0]
+        if recorded[at + 2 : at + 4] != bytes((class_id, message_id)):
+            frames.append(recorded[at:end])
+        at = end
+    return b"".join(frames)
+
+
 def nav_pvt(
     itow_ms: int,
     utc: tuple[int, int, int, int, int, int],

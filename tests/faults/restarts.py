@@ -320,7 +320,7 @@ class Figures:
     disturbances: list[str]
 
     def row(self, device: Device) -> str:
-        """A row of the table in docs/faults.md."""
+        """A row of the table in docs/reference/results/faults.md."""
         cells = [
             device.name,
             str(self.kills),

@@ -11,7 +11,7 @@ from pathlib import Path
 from benchmarks.fast_flight import FastFlight
 from benchmarks.pairing import SMALL_RIG, shortcomings
 from daemon.configuration.model import LimitsSection
-from daemon.onboard.pipeline.worker import report_unprocessed
+from daemon.products.exposure_products import report_unprocessed
 from processing.quality.report import Flag
 from sim_hw.faults.plan import PlannedFault
 

@@ -18,7 +18,7 @@ from sim_hw.gige.gige_head import ExposureRequest, FrameSize, GigeHead, HeadIden
 from sim_hw.world.world_clock import FreeRunningClock
 
 pytest.importorskip("gi", reason="needs PyGObject (extra aravis)")
-pytestmark = pytest.mark.timeout(240)
+pytestmark = [pytest.mark.realtime, pytest.mark.timeout(240)]
 
 ADDRESS = "127.61.7.2"
 WIDTH_PX, HEIGHT_PX = 128, 96

@@ -21,6 +21,9 @@ from sim_hw.receivers.emulated_receiver import ReceiverState
 from sim_hw.receivers.ublox_receiver import UbloxReceiver
 from sim_hw.world.world_clock import NS_PER_WEEK, WorldClock
 
+pytestmark = pytest.mark.realtime
+
+
 WITHIN_S = 20.0
 STATE = ReceiverState(48.0, 11.0, 500.0, (60.0, 0.0, 0.0), 0.0, 0.0, 0.0)
 POLL_REQUEST = bytes.fromhex("01 04 00 00 00 01 31 ca")

@@ -19,7 +19,7 @@ from tests.faults.restarts import (
 
 pytest.importorskip("gi", reason="needs PyGObject (extra aravis)")
 pytest.importorskip("pymavlink", reason="needs pymavlink (extra mavlink)")
-pytestmark = pytest.mark.timeout(400)
+pytestmark = [pytest.mark.realtime, pytest.mark.timeout(400)]
 
 MARGIN_S = 6.0
 """What a loaded machine may add to a stated time."""

@@ -126,7 +126,8 @@ def rig() -> Target:
 
 
 def configuration() -> Target:
-    from daemon.configuration.model import ConfigurationError, from_mapping
+    from daemon.configuration.model import ConfigurationError
+    from daemon.configuration.service_file import from_mapping
     from processing.rig.toml_text import TomlError, parse_toml
 
     seed = (
@@ -436,13 +437,11 @@ def adjustment_table() -> Target:
 
 def laboratory_series() -> Target:
     from daemon.postflight.calibration.laboratory.laboratory_series import SeriesError, read_series
+    from daemon.postflight.calibration.laboratory.radiometric import RadiometricSeries
     from processing.rig import RigError, shipped_rigs
 
     def parse(data: bytes) -> object:
-        series = read_series(_file("series.json", data).parent, kind="radiometric")
-        files = [series.file(image) for image in series.images]
-        series.checked()
-        return files
+        return read_series(_file("series.json", data).parent, RadiometricSeries)
 
     (_folder() / "rig.toml").write_bytes(shipped_rigs()["rededge"].read_bytes())
     content = {"format": 1, "kind": "radiometric", "date": "2026-01-01", "images": [{"file": "a"}]}

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from benchmarks.rendered import conditions_of, errors_of, radiometry_of, take, world_settings
 from processing.geometry.conditions import Conditions
 from processing.pipelines.stitched import Pipeline, PipelineSettings, Product
+from processing.quality.figures.stitching import PrecisionFigures
 from processing.radiometry.calibration import RadiometricCalibration
 from processing.rig import Cone, Rig, Sensor
 from sim_hw.world.snapshots import RigElectronics, Snapshot
@@ -86,7 +87,7 @@ class Outcome:
 
     @property
     def stated_sigma_px(self) -> float:
-        value = self.product.report.figures["stitched_sigma_px"]
+        value = self.product.report.figures.of(PrecisionFigures).stitched_sigma_px
         assert isinstance(value, float)
         return value
 
@@ -103,7 +104,7 @@ class Outcome:
         return " ".join(finding.sentence for finding in self.product.report.findings)
 
     def figure(self, name: str) -> Any:
-        return self.product.report.figures.get(name)
+        return self.product.report.figures.as_json().get(name)
 
 
 @cache

@@ -18,7 +18,8 @@ from processing.geometry.conditions import (
     usable_temperatures,
 )
 from processing.geometry.placement import nominal_placements
-from processing.quality.report import Figure, Flag, Thresholds
+from processing.quality.figures import Figure, QualityFigures
+from processing.quality.report import Flag, Thresholds
 from processing.rig import Rig, find_rig
 
 
@@ -28,7 +29,8 @@ def rig() -> Rig:
 
 
 def figures(rig: Rig, conditions: Conditions) -> dict[str, Figure]:
-    return condition_figures(rig, conditions, usable_temperatures(rig, conditions, Thresholds()))
+    temperatures = usable_temperatures(rig, conditions, Thresholds())
+    return QualityFigures(*condition_figures(rig, conditions, temperatures)).as_json()
 
 
 def test_ground_sampling_distance_is_height_by_pitch_over_focal_length(rig: Rig) -> None:
@@ -128,7 +130,7 @@ def test_cones_are_brought_to_the_exposure_time_of_their_kind() -> None:
     times_s = {sensor.name: 0.012 if sensor.name in "RGBN" else 0.004 for sensor in rig.sensors}
     scales = exposure_scales(rig, times_s | {"R": 0.006, "SU30": 0.008, "N": 0.0121})
     assert {name: s for name, s in scales.items() if s != 1.0} == {"R": 2.0, "SU30": 0.5}
-    assert exposure_scale_figures(scales)["exposure_scale"] in (2.0, 0.5)
+    assert exposure_scale_figures(scales).exposure_scale in (2.0, 0.5)
     times_s |= {"R": 0.0058}
     assert reference_exposure_times(rig, times_s)["R"] == 0.0058
     assert reference_exposure_times(rig, times_s)["SU30"] == 0.004

@@ -1,7 +1,7 @@
 """Over ground that is hard to stitch the image is right, or its report states that it is not.
 
 Rendered by the emulator, held against its truth; the whole set, with pictures, is in
-docs/accuracy.md.
+docs/reference/results/accuracy.md.
 """
 
 from __future__ import annotations

@@ -12,8 +12,9 @@ import pytest
 
 from processing.geometry.conditions import unknown_exposure_figures
 from processing.geometry.placement import nominal_placements
-from processing.quality.band_levels import level_steps, levels_of
+from processing.quality.band_levels import level_steps
 from processing.quality.common_windows import measure_common_windows
+from processing.quality.figures.image import BandLevelFigures
 from processing.quality.local_sharpness import local_blur_figures
 from processing.quality.word_format import wrong_format
 from tests.processing.injected_errors import (
@@ -122,21 +123,21 @@ def test_unknown_exposure_times_of_pan_lost_or_of_all_heads_are_not_named(
     def unknown(*without: str, lost: str = "") -> Any:
         stated = {n: t for n, t in times_s.items() if n not in without}
         figures = unknown_exposure_figures(error_free.rig, present - {lost}, stated)
-        return figures["exposure_unknown_sensors"]
+        return figures.exposure_unknown_sensors
 
-    assert unknown() is None and unknown("SU00", "SU30") is None
-    assert unknown("B", lost="B") is None and unknown("B") == "B"
-    assert unknown(*times_s) is None
+    assert unknown() == () and unknown("SU00", "SU30") == ()
+    assert unknown("B", lost="B") == () and unknown("B") == ("B",)
+    assert unknown(*times_s) == ()
 
 
 def test_red_exposed_half_as_long_without_saying_so_is_seen_over_a_flight(
     error_free: InjectedExposure,
 ) -> None:
-    usual = error_free.outcome().product.report.figures
+    usual = error_free.outcome().product.report.figures.of(BandLevelFigures).level_by_band
     changed = error_free.with_frame("R", gain(0.5)).outcome()
     assert changed.verdict == "good"  # one exposure cannot show it
-    halved = changed.product.report.figures
-    flight = {3: levels_of(usual), 4: levels_of(halved), 6: {}, 7: levels_of(usual)}
+    halved = changed.product.report.figures.of(BandLevelFigures).level_by_band
+    flight = {3: usual, 4: halved, 6: {}, 7: usual}
     down, up = level_steps(flight)
     assert (down.band, down.before, down.exposure) == ("red", 3, 4)
     assert (up.band, up.before, up.exposure) == ("red", 4, 7)
@@ -153,8 +154,8 @@ def test_common_ground_of_few_frames_finds_no_blur_and_raises_nothing(
         assert ground is not None and ground.names == tuple(
             s.name for s in error_free.rig.sensors if s.name in names
         )
-        for kind in ("pan", "colour"):
-            deficit = local_blur_figures(error_free.rig, ground)[f"{kind}_blur_deficit"]
+        blur = local_blur_figures(error_free.rig, ground)
+        for deficit in (blur.pan_blur_deficit, blur.colour_blur_deficit):
             assert deficit is None or deficit < 0.12
 
 

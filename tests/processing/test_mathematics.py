@@ -1,4 +1,4 @@
-"""The formulas of docs/mathematics, written down again from the pages alone, against the code."""
+"""The formulas of docs/explanation/mathematics, written again from the pages, against the code."""
 
 from __future__ import annotations
 
@@ -11,17 +11,21 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from processing.bundle.curvature_refraction import RayModel, corrected_rays, refraction_coefficient
-from processing.bundle.rotations import rotations_from_vectors
 from processing.geometry.drift import lag_step, physical_similarity
 from processing.geometry.lens import ideal_from_measured
-from processing.geometry.orientation import grid_from_camera, level_from_body, omega_phi_kappa
+from processing.geometry.orientation import grid_from_camera
 from processing.geometry.placement import (
     corrected_mm_from_raw,
     nominal_placements,
     vip_mm_from_raw,
 )
 from processing.geometry.projective import apply_projective
-from processing.geometry.rotation import rotation_matrix
+from processing.geometry.rotation import (
+    level_from_body,
+    omega_phi_kappa,
+    rotation_matrix,
+    rotations_from_vectors,
+)
 from processing.geometry.virtual_camera import GroundPlane, offset_mm, vip_from_layer
 from processing.image.kernels import cubic_weights, phase_corrected_weights
 from processing.mosaic.datum import datum_constraints
@@ -54,7 +58,7 @@ def test_a_small_rotation_moves_an_image_point_as_the_matrix_of_the_page() -> No
     page = np.array([[x * y / f, -f - x * x / f, -y], [f + y * y / f, -x * y / f, x]])
     assert small_rotation_design(np.array([[x, y]]), f)[:, :, 0] == pytest.approx(page)
     w = np.array([2e-6, -3e-6, 1e-6])
-    ray = rotations_from_vectors(w[None])[0] @ np.array([x, y, -f])
+    ray = rotations_from_vectors(w) @ np.array([x, y, -f])
     moved = -f * ray[:2] / ray[2] - np.array([x, y])
     assert moved == pytest.approx(page @ w, abs=1e-9)
 

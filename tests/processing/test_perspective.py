@@ -10,10 +10,13 @@ import pytest
 from processing.geometry.conditions import Conditions
 from processing.pipelines.perspective import (
     HeadPipeline,
+    HeadSettings,
     has_diverging_axes,
     perspective_of,
     raw_of_perspective,
 )
+from processing.quality.figures.image import SignalStepFigures, UnreadFigures, WordFormatFigures
+from processing.quality.figures.stitching import MethodFigures
 from processing.quality.report import QualityReport
 from processing.rig import Cone, Rig, find_rig
 from sim_hw.world.true_camera import true_camera, undistorted
@@ -108,7 +111,7 @@ def test_a_missing_frame_leaves_the_other_heads_and_reports_it() -> None:
     }
     product = HeadPipeline(rig).process(frames, Conditions())
     assert set(product.heads) == {"nadir", "5", "7", "19"}
-    assert product.report.figures["missing_sensors"] == "8"
+    assert product.report.figures.of(MethodFigures).missing_sensors == ("8",)
     assert product.report.verdict.value != "good"
     for head in product.heads.values():
         assert list(head.bands) == ["red", "green", "blue"]
@@ -126,22 +129,29 @@ def _lit_heads(rig: Rig) -> dict[str, np.ndarray]:
 @pytest.mark.trust
 def test_wrong_values_steps_and_unread_lines_of_a_head_are_named() -> None:
     rig = find_rig("midas-mini")
-    pipeline, healthy = HeadPipeline(rig, threads=1), _lit_heads(rig)
+    pipeline, healthy = HeadPipeline(rig, settings=HeadSettings(threads=1)), _lit_heads(rig)
     assert pipeline.process(healthy, Conditions()).report.verdict.value == "good"
 
     def report(change: np.ndarray) -> QualityReport:
         return pipeline.process({**healthy, "8": change}, Conditions()).report
 
     swapped = report(healthy["8"].byteswap())
-    assert swapped.verdict.value == "refly" and swapped.figures["word_format_sensors"] == "8"
+    assert swapped.verdict.value == "refly"
+    assert swapped.figures.of(WordFormatFigures).word_format_sensors == ("8",)
     stepped = healthy["8"].copy()
     stepped[500:] += np.uint16(90)
     step = report(stepped)
-    assert step.verdict.value == "usable" and step.figures["signal_step_sensor"] == "8"
-    assert abs(step.figures["signal_step_at"] - 499) <= 1
+    assert (
+        step.verdict.value == "usable"
+        and step.figures.of(SignalStepFigures).signal_step_sensor == "8"
+    )
+    assert abs(step.figures.of(SignalStepFigures).signal_step_at - 499) <= 1
     cut = healthy["8"].copy()
     cut[-30:] = 0
     unread = report(cut)
-    assert unread.verdict.value == "usable" and unread.figures["unread_worst_sensor"] == "8"
+    assert (
+        unread.verdict.value == "usable"
+        and unread.figures.of(UnreadFigures).unread_worst_sensor == "8"
+    )
     sentences = " ".join(finding.sentence for finding in unread.findings)
     assert "was not read out" in sentences and "signal changes" not in sentences

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from processing.pipelines.stitched import Pipeline, PipelineSettings, Product
+from processing.quality.figures.stitching import DisplacedSensorFigures, DisplacementFigures
 from processing.quality.report import Flag, Verdict
 from processing.radiometry.calibration import load_radiometry
 from sim_hw.world import sensor_calibration
@@ -55,9 +56,10 @@ def test_the_earlier_method_is_far_worse_and_without_tdm_worse_still(flown: Flow
 
 def test_the_displaced_sensor_is_named_over_real_imagery(flown: Flown) -> None:
     report = flown.product.report
-    assert report.figures["displaced_sensor"] == "SU02"
-    x, y = report.figures["displacement_x_px"], report.figures["displacement_y_px"]
-    assert isinstance(x, float) and isinstance(y, float)
+    assert report.figures.of(DisplacedSensorFigures).displaced_sensor == "SU02"
+    moved = report.figures.of(DisplacementFigures)
+    x, y = moved.displacement_x_px, moved.displacement_y_px
+    assert x is not None and y is not None
     assert np.hypot(x - DISPLACED[0], y - DISPLACED[1]) < 0.12
     assert report.flags == Flag.DISPLACED_SENSOR and report.verdict is Verdict.USABLE
 

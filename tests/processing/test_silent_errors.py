@@ -14,7 +14,7 @@ from benchmarks.silent_errors.clean import clean_rows
 from benchmarks.silent_errors.faults import FAULTS
 from benchmarks.silent_errors.limits import LIMITS, L, X, table
 
-DOCUMENT = Path(__file__).parents[2] / "docs" / "validity.md"
+DOCUMENT = Path(__file__).parents[2] / "docs/explanation/validity.md"
 SAMPLE = {
     X: ("slip", "principal-distance", "sensor-displaced", "probes-all", "gain-step"),
     L: ("cone-turned", "half-frame", "words"),

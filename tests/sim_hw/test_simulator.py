@@ -23,15 +23,19 @@ import serial
 from pymodbus.client import ModbusSerialClient
 from pyubx2 import UBXReader
 
+from sim_hw.errors import SimulatorError
 from sim_hw.gige import features as at
 from sim_hw.processes.head_process import FirstLine
-from sim_hw.processes.simulator import SimulatorError, head_addresses
+from sim_hw.processes.simulator import head_addresses
 from sim_hw.world.electronics import Electronics, true_sensor
 from sim_hw.world.rendering import ExposureParameters, light_on_sensor
 from sim_hw.world.scene import open_scene
 from sim_hw.world.truth import world_of
 from sim_hw.world.world import World, WorldSettings
 from tests.sim_hw.gige.test_gige_head import Controller
+
+pytestmark = pytest.mark.realtime
+
 
 READY_WITHIN_S = 90.0
 ENDS_WITHIN_S = 60.0

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from tests.stopwatch import slowdown
+
 ROOT = Path(__file__).parents[2]
 FLIGHT_WITHIN_S = 300.0
 
@@ -32,7 +34,7 @@ def syntopic(
         cwd=ROOT,
         capture_output=True,
         text=True,
-        timeout=within_s,
+        timeout=within_s * slowdown(),
         check=False,
     )
 

@@ -22,11 +22,7 @@ from tests.system.demo_mission import DemoMission, syntopic
 pytestmark = [pytest.mark.system, pytest.mark.timeout(400)]
 
 PAGE = Path(__file__).parent / "foxglove"
-PACKAGES = {
-    "react": "react@17.0.2",
-    "react-dom": "react-dom@17.0.2",
-    "studio": "@foxglove/studio-base@1.48.0",
-}
+PACKAGES = {"react": "react", "react-dom": "react-dom", "studio": "@foxglove/studio-base"}
 WITHIN_S = 60.0
 PROBLEMS = "[...document.querySelectorAll('button')].find(b => b.innerText.startsWith('Problems'))"
 
@@ -43,8 +39,8 @@ def studio(tmp_path: Path) -> Iterator[str]:
     """The address Foxglove Studio is served at."""
     folder = tmp_path / "www"
     shutil.copytree(PAGE, folder)
-    for name, wanted in PACKAGES.items():
-        npm_package(wanted, tmp_path / name).rename(folder / name)
+    for name, package in PACKAGES.items():
+        (folder / name).symlink_to(npm_package(package))
     with ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=folder)) as server:
         serving = threading.Thread(target=server.serve_forever)
         serving.start()

@@ -31,12 +31,17 @@ from daemon.errors import DaemonError
 from daemon.mission.layout import Mission
 from daemon.mission.store import direct_io, store
 from daemon.mission.store.radiometry_folder import RadiometryFolder
-from daemon.onboard.pipeline.pipeline_pool import PipelinePool
-from daemon.onboard.pipeline.worker import configure_threads, process_exposure
 from daemon.orientation.exterior_orientation import mount_of
 from daemon.products.exposure_conditions import conditions_of
-from daemon.products.processor import Processor, make_products
-from daemon.products.product_files import ProductFiles
+from daemon.products.exposure_products import (
+    ExposureProducts,
+    FlightGeometry,
+    make_products,
+    process_exposure,
+)
+from daemon.products.pipeline_pool import PipelinePool
+from daemon.products.processing_threads import configure_threads
+from daemon.products.processor import Processor
 from daemon.products.stitched_image import build_stitched
 from processing.matching.tie_points import TiePoints
 from processing.pipelines.stitched import Pipeline, PipelineSettings, Product
@@ -96,10 +101,11 @@ def measure(
     frames = {name: np.array(frame) for name, frame in stored.items()}
     conditions = conditions_of(exposure, rig, plan, Flag(0))
     product = pipeline.process(frames, conditions)
-    processor, mount = Processor(pipeline, build_stitched), mount_of(mission)[0]
+    processor = Processor(pipeline, build_stitched)
+    flown = FlightGeometry(mount_of(mission)[0], plan)
 
-    def make(worker: Processor) -> ProductFiles:
-        return make_products(worker, mount, plan, exposure, frames, conditions)
+    def make(worker: Processor) -> ExposureProducts:
+        return make_products(worker, flown, exposure, frames)
 
     result = {
         "rig": rig.name,
@@ -116,7 +122,7 @@ def measure(
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     result["peak_rss_mib"] = round(peak / 1024)
     pipeline.settings = replace(pipeline.settings, geometry=True, baselines=True)
-    process_exposure(processor, mission, mount, plan, exposure, frames)
+    process_exposure(processor, mission, flown, exposure, frames)
     result |= _geometry(mission, folder / "truth")
     if peers and "skipped" not in result["peers"]["nona_enblend"]:
         geometry = _peer_geometry(rig, mission, folder / "truth", tie_points)
@@ -126,7 +132,7 @@ def measure(
 
 def _timed(
     pipeline: Pipeline,
-    make: Callable[[], ProductFiles],
+    make: Callable[[], ExposureProducts],
     frames: Mapping[str, NDArray[np.uint16]],
     product: Product,
     runs: int,
@@ -142,17 +148,17 @@ def _timed(
 
         def free() -> None:
             began = time.process_time()
-            report, contents = make()
+            products = make()
             started = time.perf_counter()
-            _to_disk(contents, Path(scratch))
+            _to_disk(products.contents, Path(scratch))
             stages.setdefault("writing", []).append(time.perf_counter() - started)
-            for stage, seconds in report["timings_s"].items():
+            for stage, seconds in products.report["timings_s"].items():
                 stages.setdefault(stage, []).append(seconds)
             cpu_s.append(time.process_time() - began)
 
         def fixed() -> None:
             pipeline.settings = replace(settings, method="fixed")
-            _to_disk(make()[1], Path(scratch))
+            _to_disk(make().contents, Path(scratch))
             pipeline.settings = settings
 
         def copy() -> None:
@@ -179,7 +185,11 @@ def _timed(
 
 
 def _side_by_side(
-    processor: Processor, make: Callable[[Processor], ProductFiles], *, parallel: int, count: int
+    processor: Processor,
+    make: Callable[[Processor], ExposureProducts],
+    *,
+    parallel: int,
+    count: int,
 ) -> dict[str, Any]:
     """Throughput and latency of exposures processed in parallel, as in the service.
 
@@ -197,7 +207,7 @@ def _side_by_side(
             started = time.perf_counter()
             folder = Path(scratch) / str(number)
             folder.mkdir()
-            _to_disk(make(worker)[1], folder)
+            _to_disk(make(worker).contents, folder)
             ended = time.perf_counter()
             ends.append(ended)
             used.append(time.process_time())

@@ -12,12 +12,25 @@ from dataclasses import MISSING, dataclass, field, fields
 from enum import Enum
 from typing import Any, Final, get_type_hints
 
+from pydantic import BaseModel, Field, create_model
+
 from daemon.mission.canonical_json import (
     EXACT_INTEGER_LIMIT,
-    Fields,
     RecordError,
     canonical_bytes,
     parse_record,
+)
+from daemon.mission.record_types import (
+    Count,
+    Finite,
+    Instant,
+    Integer,
+    LeapSeconds,
+    LongText,
+    NedVelocity,
+    Ordinal,
+    Scalars,
+    read_record,
 )
 from drivers.contract import (
     ClockReading,
@@ -33,6 +46,10 @@ from drivers.contract import (
     TriggerPulse,
     Velocity,
 )
+from processing.rig.value_types import Flag
+
+AUDIT_TOPIC: Final = "audit"
+"""Topic of operator commands, with their authors and answers."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +90,7 @@ LoggedRecord = (
 def message_of(record: Record | LoggedTrigger) -> Message:
     """The message of a record: raw bytes as they came, everything else as canonical JSON.
 
-    The keys are the names of the record's fields (docs/formats.md).
+    The keys are the names of the record's fields (docs/reference/formats.md).
     """
     if isinstance(record, RawBytes):
         return Message(f"raw/{record.device}", record.mono_ns, record.data)
@@ -90,14 +107,10 @@ def record_of(message: Message) -> LoggedRecord | None:
     read = _READERS.get(message.topic.partition("/")[0])
     if read is None:
         return None
-    problems: list[str] = []
     try:
-        record = read(
-            Fields(parse_record(message.payload, message.topic), "", message.topic, problems)
-        )
+        return read(parse_record(message.payload, message.topic), message.topic)
     except RecordError:
         return None
-    return None if problems else record
 
 
 def lenient_json_bytes(content: Mapping[str, Any]) -> bytes:
@@ -136,39 +149,29 @@ def _trigger_json(record: LoggedTrigger) -> dict[str, Any]:
     }
 
 
-def _trigger(fields: Fields) -> LoggedTrigger:
+class _TriggerRecord(BaseModel):
+    """The keys of a message of `trigger`."""
+
+    number: Ordinal
+    sequence: Instant
+    mono_ns: Instant
+    sigma_ns: Count
+    count: Count
+    spread_ns: Count = 1_000
+    delays_ns: dict[str, Integer] = {}
+    strobe_delay_ns: Count = 0
+
+
+def _trigger(content: Mapping[str, Any], topic: str) -> LoggedTrigger:
+    read = read_record(_TriggerRecord, content, topic)
     pulse = TriggerPulse(
-        sequence=_needed(fields, "sequence"),
-        mono_ns=_needed(fields, "mono_ns"),
-        sigma_ns=fields.integer("sigma_ns"),
-        count=fields.integer("count"),
-        spread_ns=fields.integer("spread_ns", 1_000),
+        sequence=read.sequence,
+        mono_ns=read.mono_ns,
+        sigma_ns=read.sigma_ns,
+        count=read.count,
+        spread_ns=read.spread_ns,
     )
-    delays_ns = {
-        cone: value for cone, value in fields.scalars("delays_ns").items() if isinstance(value, int)
-    }
-    strobe_ns = fields.integer("strobe_delay_ns", 0)
-    return LoggedTrigger(fields.integer("number", minimum=1), pulse, delays_ns, strobe_ns)
-
-
-def _needed(fields: Fields, key: str) -> int:
-    value = fields.instant(key)
-    if value is None:
-        fields.add_problem(key, "a decimal string is needed")
-        return 0
-    return value
-
-
-def _status(fields: Fields, key: str) -> FrameStatus:
-    return FrameStatus(fields.choice(key, [status.value for status in FrameStatus]))
-
-
-def _flag(fields: Fields, key: str) -> bool:
-    return fields.flag(key, default=False)
-
-
-def _leap_seconds(fields: Fields, key: str) -> int | None:
-    return fields.integer_or_none(key, minimum=-1000)
+    return LoggedTrigger(read.number, pulse, read.delays_ns, read.strobe_delay_ns)
 
 
 def _text(value: int | None) -> str | None:
@@ -196,38 +199,42 @@ _INSTANTS: Final = frozenset(
 )
 """Written as texts: they may exceed what JSON's numbers hold."""
 
-_TYPE_READERS: Final[Mapping[Any, Callable[[Fields, str], Any]]] = {
-    "leap_seconds": _leap_seconds,
-    **{(name, int): _needed for name in _INSTANTS},
-    **{(name, int | None): Fields.instant for name in _INSTANTS},
-    str: Fields.text,
-    int: Fields.integer,
-    int | None: Fields.integer_or_none,
-    float: Fields.number,
-    float | None: Fields.number_or_none,
-    bool: _flag,
-    Velocity | None: Fields.velocity,
-    Mapping[str, float | int | str]: Fields.scalars,
-    FrameStatus: _status,
+_TYPES: Final[Mapping[Any, Any]] = {
+    "leap_seconds": LeapSeconds | None,
+    **{(name, int): Instant for name in _INSTANTS},
+    **{(name, int | None): Instant | None for name in _INSTANTS},
+    str: LongText,
+    int: Count,
+    int | None: Count | None,
+    float: Finite,
+    float | None: Finite | None,
+    bool: Flag,
+    Velocity | None: NedVelocity | None,
+    Mapping[str, float | int | str]: Scalars,
+    FrameStatus: FrameStatus,
 }
-"""How a field is read: by its name, its name and type, or its type."""
+"""The type of a field in a record: by its name, its name and type, or its type."""
 
 
-def _reader(kind: type[Any]) -> Callable[[Fields], LoggedRecord]:
-    """A function that reads a record field by field, as the fields are declared."""
-    field_readers = {
-        name: next(_TYPE_READERS[key] for key in (name, (name, hint), hint) if key in _TYPE_READERS)
-        for name, hint in get_type_hints(kind).items()
-    }
-    # A log of an earlier version has no later fields: those have defaults.
-    optional = {one.name for one in fields(kind) if one.default is not MISSING}
-    return lambda given: kind(
-        **{
-            name: read_field(given, name)
-            for name, read_field in field_readers.items()
-            if name in given.content or name not in optional
-        }
-    )
+def _reader(kind: type[Any]) -> Callable[[Mapping[str, Any], str], LoggedRecord]:
+    """A function that reads a record whose keys are the fields of a class."""
+    hints = get_type_hints(kind)
+    keys: dict[str, Any] = {}
+    for one in fields(kind):
+        hint = hints[one.name]
+        by = next(key for key in (one.name, (one.name, hint), hint) if key in _TYPES)
+        # A log of an earlier version has no later fields: those have defaults.
+        keys[one.name] = (_TYPES[by], _default(one))
+    model: type[BaseModel] = create_model(kind.__name__, **keys)
+    return lambda content, topic: kind(**vars(read_record(model, content, topic)))
 
 
-_READERS: Final = {"trigger": _trigger} | {topic: _reader(kind) for topic, kind in _KINDS.items()}
+def _default(one: Any) -> Any:
+    if one.default is not MISSING:
+        return one.default
+    return ... if one.default_factory is MISSING else Field(default_factory=one.default_factory)
+
+
+_Reader = Callable[[Mapping[str, Any], str], LoggedRecord]
+_READERS: Final[dict[str, _Reader]] = {topic: _reader(kind) for topic, kind in _KINDS.items()}
+_READERS["trigger"] = _trigger

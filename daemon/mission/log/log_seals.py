@@ -10,9 +10,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from contextlib import closing
 
-from daemon.mission.canonical_json import Fields, RecordError, parse_record, plain_name
+from pydantic import BaseModel
+
+from daemon.mission.canonical_json import RecordError, parse_record, plain_name
 from daemon.mission.layout import Mission
 from daemon.mission.log.flight_log import logs_of
+from daemon.mission.record_types import Count, read_record
 from daemon.mission.store import durable
 from daemon.mission.store.level0_folder import hash_file
 from daemon.mission.verification.chain_file import ChainFile, LogSeal
@@ -75,6 +78,11 @@ def close_run(mission: Mission, chain: ChainFile, by: str) -> bool:
     return chain.close_run(by, {name: hash_file(mission.path / name) for name in present})
 
 
+class _SealList(BaseModel):
+    format: Count
+    logs: dict[str, LogSeal] = {}
+
+
 def read_seals(mission: Mission) -> Mapping[str, LogSeal]:
     """Seals of a mission of format 1 by the log's name; none where there is no list.
 
@@ -86,15 +94,4 @@ def read_seals(mission: Mission) -> Mapping[str, LogSeal]:
         content = parse_record((mission.log_dir / SEALS_FILE).read_bytes(), name)
     except FileNotFoundError:
         return {}
-    problems: list[str] = []
-    fields = Fields(content, "", name, problems)
-    fields.integer("format")
-    logs = fields.object("logs")
-    seals = {}
-    for log in logs.content if logs else {}:
-        one = logs.object(log) if logs else None
-        if one is not None:
-            seals[log] = LogSeal(one.integer("nbytes"), one.sha256("sha256"))
-    if problems:
-        raise RecordError(problems)
-    return seals
+    return read_record(_SealList, content, name).logs

@@ -10,10 +10,14 @@ import secrets
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from daemon.mission.canonical_json import Fields, RecordError, canonical_bytes, parse_record
+from pydantic import BaseModel, Field
+
+from daemon.mission.canonical_json import canonical_bytes, parse_record
+from daemon.mission.record_types import Count, Ordinal, read_record
 from daemon.mission.store import durable
+from processing.rig.value_types import Name
 
 STATE_FILE = "disks.json"
 STATE_FORMAT = 1
@@ -28,10 +32,15 @@ class Generation:
     exposure that that may be missing on a disk dropped at the beginning of this generation.
     """
 
-    number: int
-    token: str
-    disks: tuple[str, ...]
-    first: int = 1
+    number: Ordinal
+    token: Name
+    disks: tuple[Name, ...] = ()
+    first: Count = 1
+
+
+class _History(BaseModel):
+    format: Count
+    generations: Annotated[tuple[Generation, ...], Field(min_length=1)]
 
 
 Generations = tuple[Generation, ...]
@@ -69,21 +78,7 @@ def read_generations(mission: Path) -> Generations:
         content = parse_record((mission / STATE_FILE).read_bytes(), STATE_FILE)
     except FileNotFoundError:
         return ()
-    problems: list[str] = []
-    fields = Fields(content, "", STATE_FILE, problems)
-    fields.integer("format")
-    history = tuple(
-        Generation(
-            one.integer("number", minimum=1),
-            one.name("token"),
-            one.names("disks"),
-            one.integer("first", 1),
-        )
-        for one in fields.objects("generations")
-    )
-    if problems or not history:
-        raise RecordError(problems or [f"{STATE_FILE}: names no generation"])
-    return history
+    return read_record(_History, content, STATE_FILE).generations
 
 
 def write_generations(mission: Path, history: Generations) -> None:

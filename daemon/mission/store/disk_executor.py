@@ -14,6 +14,7 @@ from concurrent.futures import Future
 from functools import partial
 from typing import TypeVar
 
+from daemon.errors import DaemonError
 from daemon.mission.store.disk_identity import Disk
 
 STALL_STEP_S = 0.25
@@ -22,7 +23,7 @@ STALL_STEP_S = 0.25
 T = TypeVar("T")
 
 
-class DroppedError(OSError):
+class DroppedError(DaemonError, OSError):
     """The disk was dropped while work on it was running; the result is discarded."""
 
     def __init__(self, disk: Disk) -> None:

@@ -1,7 +1,7 @@
 """Whether a frame is what its record and its rig say, and whether its settings are possible.
 
 Compared is what is given on both sides; what a record written by hand leaves out is not compared
-(docs/formats.md).
+(docs/reference/formats.md).
 """
 
 from __future__ import annotations

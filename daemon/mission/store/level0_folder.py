@@ -1,6 +1,6 @@
 """Reading an exposure's Level-0 folder back: its record, its frames, and their hashes.
 
-The folder may be ours or laid out by hand (docs/formats.md). Writing is in
+The folder may be ours or laid out by hand (docs/reference/formats.md). Writing is in
 `daemon.mission.store.store`.
 """
 

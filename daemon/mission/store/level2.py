@@ -10,25 +10,26 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, PlainValidator
 
 from daemon.errors import DaemonError
 from daemon.mission.canonical_json import (
-    Fields,
     RecordError,
     canonical_bytes,
     parse_record,
     plain_name,
 )
 from daemon.mission.layout import Mission
+from daemon.mission.record_types import LongText, read_record
 from daemon.mission.store import direct_io
 from daemon.mission.store.level0 import tiff_parts
 from daemon.mission.store.publication import published, sweep
 
-VERDICTS = ("good", "usable", "refly")
+Verdict = Literal["good", "usable", "refly"]
 BAND_ORDER = ("red", "green", "blue", "nir")
 QUICKLOOK_QUALITY = 85
 THUMBNAIL_WIDTH_PX, THUMBNAIL_QUALITY = 200, 60
@@ -147,10 +148,46 @@ def write_folder(
         OSError: the disk refused; an earlier folder is still there.
     """
     with published(final) as part:
-        return {
-            name: direct_io.create_file(part / name, parts, mode=0o644)
-            for name, parts in contents.items()
-        }
+        return write_files(part, contents)
+
+
+def write_files(
+    folder: Path, contents: Mapping[str, Sequence[bytes | memoryview]]
+) -> dict[str, int]:
+    """Write files into a folder; each is durable on return.
+
+    Args:
+        folder: it exists.
+        contents: bytes by file name.
+
+    Returns:
+        Sizes in bytes by file name.
+
+    Raises:
+        OSError: the disk refused.
+    """
+    return {
+        name: direct_io.create_file(folder / name, parts, mode=0o644)
+        for name, parts in contents.items()
+    }
+
+
+def _figure(value: Any) -> Any:
+    if value is None or isinstance(value, str | int | float):
+        return value
+    raise ValueError("a number or a text is needed")
+
+
+class _ReportFinding(BaseModel):
+    sentence: LongText
+    flag: LongText = ""
+    verdict: Verdict = "good"
+
+
+class _Report(BaseModel):
+    verdict: Verdict
+    findings: tuple[_ReportFinding, ...] = ()
+    figures: dict[str, Annotated[Any, PlainValidator(_figure)]] = {}
 
 
 def read_report(folder: Path) -> dict[str, Any] | None:
@@ -166,19 +203,7 @@ def read_report(folder: Path) -> dict[str, Any] | None:
         return None
     except OSError as error:
         raise RecordError([f"{name}: cannot be read ({error.strerror})"]) from error
-    problems: list[str] = []
-    fields = Fields(content, "", name, problems)
-    fields.choice("verdict", VERDICTS)
-    for finding in fields.objects("findings"):
-        finding.text("sentence")
-        finding.text("flag", "")
-        finding.choice("verdict", VERDICTS, "good")
-    figures = fields.object("figures")
-    for figure, value in (figures.content if figures else {}).items():
-        if not (value is None or isinstance(value, str | int | float)):
-            problems.append(f"{name}: figures.{figure} is {value!r}; a number or a text is needed")
-    if problems:
-        raise RecordError(problems)
+    read_record(_Report, content, name)
     return content
 
 

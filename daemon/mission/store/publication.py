@@ -16,7 +16,7 @@ import os
 import re
 import secrets
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 
 from daemon.mission.store import durable
@@ -32,6 +32,45 @@ _NAME_TAKEN = frozenset({errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR})
 _LEFTOVER = re.compile(r"(?P<final>.+?)(?P<token>\.[0-9a-f]{8})?(?P<suffix>\.part|\.replaced)")
 
 
+class StagedFolder:
+    """A new folder for a set of files, which takes the name `final` when it is published.
+
+    `part` is where the files are written; they must be durable before `publish`. `close` removes
+    what was not published, or the earlier set that was replaced.
+
+    Args:
+        final: the folder; the one above it is made where it is missing.
+
+    Raises:
+        OSError: the disk refused.
+    """
+
+    def __init__(self, final: Path) -> None:
+        durable.make_directories(final.parent)
+        sweep(final.parent, final.name)
+        self.final = final
+        self.part, self._lock = _begin(final)
+
+    def publish(self) -> None:
+        """Give the files their final name in one step; an earlier set is replaced.
+
+        Raises:
+            OSError: the disk refused; an earlier set is still there.
+        """
+        durable.sync_directory(self.part)
+        _take_name(self.part, self.final)
+        durable.sync_directory(self.final.parent)
+
+    def close(self) -> None:
+        """Remove the part folder; call it once, whatever happened."""
+        try:
+            with suppress(OSError):
+                durable.remove_tree(self.part)
+        finally:
+            if self._lock is not None:
+                os.close(self._lock)
+
+
 @contextmanager
 def published(final: Path) -> Iterator[Path]:
     """A new folder to write a set of files into; it takes the name `final` when the block ends.
@@ -45,22 +84,9 @@ def published(final: Path) -> Iterator[Path]:
     Raises:
         OSError: the disk refused.
     """
-    durable.make_directories(final.parent)
-    sweep(final.parent, final.name)
-    part, lock = _begin(final)
-    try:
-        yield part
-        durable.sync_directory(part)
-        _take_name(part, final)
-        durable.sync_directory(final.parent)
-    finally:
-        try:
-            # Either what was begun and failed, or the set that was replaced.
-            with suppress(OSError):
-                durable.remove_tree(part)
-        finally:
-            if lock is not None:
-                os.close(lock)
+    with closing(StagedFolder(final)) as staged:
+        yield staged.part
+        staged.publish()
 
 
 def sweep(folder: Path, name: str = "") -> list[str]:

@@ -1,7 +1,7 @@
 """Level-0 on disk: frames become *stored*, then their record is *sealed*.
 
 An exposure is stored when its folder has its final name, everything in it and above it is synced,
-and the index has committed it (docs/durability.md). Reading back is in
+and the index has committed it (docs/reference/results/durability.md). Reading back is in
 `daemon.mission.store.level0_folder`, checking in `daemon.mission.verification.verification`, what a
 crash leaves behind in `daemon.mission.verification.recovery`.
 """

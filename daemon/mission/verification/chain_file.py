@@ -15,23 +15,31 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
+
+from pydantic import BaseModel, model_validator
 
 from daemon.mission.canonical_json import (
-    Fields,
     RecordError,
     canonical_bytes,
     parse_record,
     sha256_hex,
 )
+from daemon.mission.record_types import Count, LongText, Ordinal, Sha256, read_record
 from daemon.mission.store import durable
+from processing.rig.value_types import Name
 
 CHAIN_FILE = "chain.jsonl"
-CHAIN_FORMAT = 1
+CHAIN_FORMAT: Literal[1] = 1
 LINE_MAX_BYTES = 1_000_000
 """No line of ours comes near this; a longer one counts as damaged."""
 
-_KINDS = ("begun", "stored", "sealed", "log", "log-sealed", "closed")
+_KEYS_OF_KINDS = {
+    "number": ("stored", "sealed"),
+    "log": ("log", "log-sealed"),
+    "nbytes": ("log-sealed",),
+}
+"""Keys that a line of these kinds cannot be without."""
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 
 
@@ -39,8 +47,28 @@ _SHA256 = re.compile(r"[0-9a-f]{64}")
 class LogSeal:
     """Size and hash of a log that nothing is added to any more."""
 
-    nbytes: int
-    sha256: str
+    nbytes: Count
+    sha256: Sha256 = ""
+
+
+class _Entry(BaseModel):
+    """The keys of a line, apart from its hash."""
+
+    format: Literal[1] = CHAIN_FORMAT
+    kind: Literal["begun", "stored", "sealed", "log", "log-sealed", "closed"]
+    number: Ordinal | None = None
+    log: Name | None = None
+    sha256: Sha256 = ""
+    nbytes: Count | None = None
+    mission_sha256: Sha256 = ""
+    rebuilt_utc: LongText = ""
+
+    @model_validator(mode="after")
+    def _has_the_keys_of_its_kind(self) -> _Entry:
+        for key, kinds in _KEYS_OF_KINDS.items():
+            if self.kind in kinds and getattr(self, key) is None:
+                raise ValueError(f"{key} is missing; it is needed")
+        return self
 
 
 @dataclass(frozen=True)
@@ -309,29 +337,23 @@ class _Reader:
         )
 
     def _note(self, entry: Mapping[str, Any], name: str) -> None:
-        problems: list[str] = []
-        fields = Fields(entry, "entry", name, problems)
-        kind = fields.choice("kind", _KINDS)
-        number = fields.integer("number", minimum=1) if kind in ("stored", "sealed") else 0
-        log = fields.name("log") if kind in ("log", "log-sealed") else ""
-        sha256 = fields.sha256("sha256")
-        nbytes = fields.integer("nbytes") if kind == "log-sealed" else 0
-        genesis_sha256 = fields.sha256("mission_sha256")
-        if fields.integer("format", CHAIN_FORMAT) != CHAIN_FORMAT:
-            fields.add_problem("format", f"this version reads format {CHAIN_FORMAT}")
-        if problems:
-            self._problems += problems
-        elif kind == "begun":
-            self._genesis_sha256 = genesis_sha256
-            self._rebuilt_utc = fields.text("rebuilt_utc", "")
-        elif kind == "stored":
-            self._stored[number] = sha256
-        elif kind == "sealed":
-            self._sealed[number] = (*self._sealed.get(number, ()), sha256)
-        elif kind == "closed":
+        try:
+            line = read_record(_Entry, entry, name)
+        except RecordError as error:
+            self._problems += error.problems
+            return
+        if line.kind == "begun":
+            self._genesis_sha256 = line.mission_sha256
+            self._rebuilt_utc = line.rebuilt_utc
+        elif line.kind == "closed":
             self._closing = entry
-        else:
-            self._logs[log] = LogSeal(nbytes, sha256) if kind == "log-sealed" else None
+        elif line.kind == "stored" and line.number:
+            self._stored[line.number] = line.sha256
+        elif line.kind == "sealed" and line.number:
+            self._sealed[line.number] = (*self._sealed.get(line.number, ()), line.sha256)
+        elif line.log:
+            seal = None if line.nbytes is None else LogSeal(line.nbytes, line.sha256)
+            self._logs[line.log] = seal if line.kind == "log-sealed" else None
 
 
 def _expected(entry: Mapping[str, Any], previous_sha256: str) -> tuple[bytes, str]:

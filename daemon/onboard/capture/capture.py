@@ -35,6 +35,7 @@ from drivers.contract import (
     FrameMemory,
     Head,
     Record,
+    Trigger,
 )
 
 CLOSE_TIMEOUT_S = 3.0
@@ -67,6 +68,7 @@ class _Capture:
                 self.heads[spec.name] = device
                 self.heads_of_output.setdefault(spec.output, []).append(device)
         self.trigger_spec = trigger_spec
+        self.trigger: Trigger | None = None
         self.requesters = [
             TimesyncRequester(device, self._sink)
             for _, device in self.devices.values()
@@ -92,8 +94,7 @@ class _Capture:
             elif isinstance(request, Fire | ApplyExposureSettings):
                 self.requests.put(request)
             elif isinstance(request, Ping):
-                counted = {name: dict(d.statistics()) for name, (_, d) in self.devices.items()}
-                self.link.send(Pong(counted))
+                self.link.send(Pong(self._statistics()))
         self.requests.put(None)
         for requester in self.requesters:
             requester.stop()
@@ -106,6 +107,13 @@ class _Capture:
         deadline = time.monotonic() + CLOSE_TIMEOUT_S
         for thread in (*closers, *threads):
             thread.join(max(0.0, deadline - time.monotonic()))
+
+    def _statistics(self) -> dict[str, dict[str, int]]:
+        """The counters of every device, by its name."""
+        counted = {name: dict(device.statistics()) for name, (_, device) in self.devices.items()}
+        if self.trigger is not None:
+            counted[self.trigger.name] = dict(self.trigger.statistics())
+        return counted
 
     def _deliver(self, spec: DeviceSpec, device: Device) -> None:
         try:
@@ -124,7 +132,7 @@ class _Capture:
         if self.trigger_spec is None:
             return
         spec = self.trigger_spec
-        trigger = open_device(spec, heads=self.heads_of_output)
+        self.trigger = trigger = open_device(spec, heads=self.heads_of_output)
         programmed: Mapping[str, int] = {}
         try:
             self.link.send(Bound("trigger", spec.name, dict(trigger.bind())))

@@ -60,6 +60,15 @@ class MissingPrerequisite:
         return f"{self.sentence} ({self.action})"
 
 
+def absent_parts(readiness: Readiness) -> list[str]:
+    """Devices and data that have not come yet, as text."""
+    absent = list(readiness.absent)
+    if readiness.needs_time and readiness.position_age_s is None:
+        absent.append("time and position")
+    never_read = (probe for probe, reading in readiness.probes_c.items() if reading is None)
+    return absent + [f"temperature of {probe}" for probe in never_read]
+
+
 def missing_prerequisites(
     readiness: Readiness, limits: LimitsSection
 ) -> tuple[MissingPrerequisite, ...]:

@@ -1,4 +1,4 @@
-"""Decisions of the service and their instants, as messages of the flight log.
+"""What a flight decides at an instant, and the messages of the flight log that repeat it.
 
 The instant determines which exposures are stored or sealed. It is recorded because a loaded machine
 evaluates later. `daemon.postflight.replay` repeats the decisions.
@@ -11,14 +11,16 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, cast
 
 from daemon.mission.canonical_json import RecordError, parse_record
-from daemon.mission.exposure import Exposure
+from daemon.mission.exposure import CaptureRecord, Exposure
 from daemon.mission.log.log_records import Message, lenient_json_bytes
-from daemon.onboard.flight.flight import Flight, PendingStore
+from daemon.onboard.timing.gps_clock import ClockEvent
+from drivers.contract import EventMark
 
 TOPIC = "decision"
 Kind = Literal[
-    "begin", "order", "not-fired", "tick", "stored", "not-stored", "sealed", "not-sealed", "process"
-]
+    "begin", "order", "not-fired", "advance", "stored", "not-stored", "sealed", "not-sealed",
+    "seal-refused", "timeouts-expired", "process",
+]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -52,38 +54,45 @@ def decision_of(message: Message) -> Decision | None:
 
 
 @dataclass(frozen=True)
-class Tick:
-    """Exposures due at an instant: to store, given up (number, cause), and to seal.
+class PendingStore:
+    """An exposure to be stored: its frames have arrived or timed out."""
 
-    `provisional` is the record of an exposure that only awaits a second mark before it is sealed.
+    capture: CaptureRecord
+    slots: Mapping[str, int]
+
+
+@dataclass(frozen=True)
+class Actions:
+    """What is due at `mono_ns`, in the order in which it is done. Each is returned once.
+
+    Attributes:
+        mono_ns: the instant.
+        store: exposures whose frames go to disk.
+        lost: number and cause of exposures of which no frame arrived in time.
+        spurious: marks that belong to no exposure.
+        seal: the record that goes to disk. The next one is returned after this one is sealed.
+        provisional: a record that only awaits a second mark before it is sealed.
+        clock_events: events of the clocks.
+        next_ns: the next instant at which something is due without a new record; None for none.
     """
 
-    to_store: tuple[PendingStore, ...]
-    given_up: tuple[tuple[int, str], ...]
-    to_seal: Exposure | None
-    provisional: Exposure | None
-    asked_to_seal: bool
-    resolved: int
+    mono_ns: int
+    store: tuple[PendingStore, ...] = ()
+    lost: tuple[tuple[int, str], ...] = ()
+    spurious: tuple[EventMark, ...] = ()
+    seal: Exposure | None = None
+    provisional: Exposure | None = None
+    clock_events: tuple[ClockEvent, ...] = ()
+    next_ns: int | None = None
 
     @property
-    def detail(self) -> dict[str, Any] | None:
-        """Content for the flight log; None if nothing was due."""
-        content = {
-            "store": [due.capture.number for due in self.to_store],
-            "given_up": [number for number, _ in self.given_up],
-            "seal": None if self.to_seal is None else self.to_seal.number,
-            "foreseen": None if self.provisional is None else self.provisional.number,
-            "resolved": self.resolved,
+    def decision(self) -> Decision | None:
+        """The decision for the flight log; None if no exposure and no mark is concerned."""
+        detail = {
+            "store": [due.capture.number for due in self.store],
+            "lost": [number for number, _ in self.lost],
+            "spurious": len(self.spurious),
+            "seal": None if self.seal is None else self.seal.number,
+            "provisional": None if self.provisional is None else self.provisional.number,
         }
-        return {**content, "asked_to_seal": self.asked_to_seal} if any(content.values()) else None
-
-
-def tick(flight: Flight, mono_ns: int, *, may_seal: bool, allow_provisional: bool = True) -> Tick:
-    """Everything that is due now; `may_seal`: the writer has no record to seal."""
-    to_store = tuple(flight.due_to_store(mono_ns))
-    given_up = tuple(flight.due_to_give_up(mono_ns))
-    to_seal = flight.due_to_seal(mono_ns) if may_seal else None
-    provisional = (
-        flight.due_provisionally() if may_seal and allow_provisional and to_seal is None else None
-    )
-    return Tick(to_store, given_up, to_seal, provisional, may_seal, len(flight.resolved_marks))
+        return Decision("advance", self.mono_ns, detail=detail) if any(detail.values()) else None

@@ -1,7 +1,7 @@
 """Table of all events: name, severity, cause and action.
 
-The table is `events.toml` in this folder. `syntopic explain` and docs/events.md are generated from
-it. A test compares it with the events that the code emits.
+The table is `events.toml` in this folder. `syntopic explain` and docs/reference/flight/events.md
+are generated from it. A test compares it with the events that the code emits.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def entry_of(name: str) -> EventDefinition | None:
 
 
 def as_markdown() -> str:
-    """The table as the page docs/events.md."""
+    """The table as the page docs/reference/flight/events.md."""
     rows = [f"| `{e.name}` | {e.severity} | {e.cause} | {e.action} |" for e in TABLE]
     return (
         "\n".join((_PREFACE, "| event | severity | cause | action |", "|---|---|---|---|"))

@@ -10,7 +10,10 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from daemon.mission.canonical_json import Fields, RecordError, canonical_bytes, parse_record
+from pydantic import BaseModel
+
+from daemon.mission.canonical_json import RecordError, canonical_bytes, parse_record
+from daemon.mission.record_types import LongText, Ordinal, read_record
 
 FILE = "unhandled-faults.json"
 """In the root of missions: the unacknowledged faults of the last run."""
@@ -208,16 +211,18 @@ _FAULT_OF_EVENT: Mapping[object, tuple[str, str]] = {
 _KEYS = ("id", "device", "sentence", "count")
 
 
+class _SavedFault(BaseModel):
+    id: LongText
+    device: LongText
+    sentence: LongText
+    count: Ordinal = 1
+
+
 def _latch(content: Mapping[str, Any]) -> LatchedFault | None:
-    problems: list[str] = []
-    fields = Fields(dict(content), "", FILE, problems)
-    latch = LatchedFault(
-        fields.text("id"),
-        fields.text("device"),
-        fields.text("sentence"),
-        count=fields.integer("count", 1, minimum=1),
-    )
-    return None if problems else latch
+    try:
+        return LatchedFault(**vars(read_record(_SavedFault, content, FILE)))
+    except RecordError:
+        return None
 
 
 def _newest_first(latch: LatchedFault) -> int:

@@ -1,7 +1,7 @@
 """Table of the quality flags of an exposure: name, cause and action.
 
 The table is `flags.toml` in this folder; `syntopic explain` prints it. The bits are in
-docs/formats.md, and a test compares the names with those of the reports.
+docs/reference/formats.md, and a test compares the names with those of the reports.
 """
 
 from __future__ import annotations

@@ -1,24 +1,23 @@
 """The open exposures of a flight, from the pulse to the sealed record.
 
-Pure bookkeeping on given instants. Input: frames, marks, navigation and temperatures. Output: the
-exposures that are due to be stored, sealed or given up. `daemon.onboard.service.service` handles
-processes and disk.
+Pure bookkeeping on given instants. Input: the records of the devices, pulses, and results of the
+disk. Output: `Flight.advance` returns the actions that are due.
+`daemon.onboard.service.exposure_sequence` carries them out.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from typing import Any, ClassVar, Final
 
 from daemon.configuration.model import LimitsSection
-from daemon.mission.exposure import (
-    CaptureRecord,
-    Exposure,
-    FrameRecord,
-    RecordState,
-)
+from daemon.mission.exposure import CaptureRecord, Exposure, FrameRecord, RecordState
+from daemon.onboard.flight.decisions import Actions, PendingStore
+from daemon.onboard.flight.fault_latches import DELIVERING
+from daemon.onboard.flight.flight_identity import FlightIdentity
 from daemon.onboard.flight.ledger import Ledger
+from daemon.onboard.flight.open_exposure import OpenExposure
 from daemon.onboard.flight.record_builder import build_record, instant_of
 from daemon.onboard.flight.temperatures import TemperatureHistory
 from daemon.onboard.timing.device_clocks import DeviceClocks
@@ -27,10 +26,12 @@ from daemon.onboard.timing.matching import Cause, FiredPulse, Matcher
 from daemon.orientation.navigation import Track
 from drivers.contract import (
     ClockReading,
+    DeviceEvent,
     EventMark,
     Frame,
     NavSample,
     PpsEdge,
+    Record,
     TemperatureSample,
 )
 from processing.geometry.drift import lagged_sensors
@@ -39,65 +40,20 @@ from processing.rig import Rig
 
 NS = 1_000_000_000
 NO_FLAG = Flag(0)
-
-
-@dataclass(frozen=True)
-class FlightIdentity:
-    """Values that every record of a flight contains."""
-
-    boot_id: str
-    line_id: str
-    calibration_id: str
-    calibration_sha256: str
-    configuration_sha256: str
-    software: str
-    simulated: bool
-
-
-@dataclass(frozen=True)
-class PendingStore:
-    """An exposure to be stored: its frames have arrived or timed out."""
-
-    capture: CaptureRecord
-    slots: Mapping[str, int]
-
-
-@dataclass
-class _OpenExposure:
-    number: int
-    ordered_mono_ns: int
-    pulse: FiredPulse | None = None
-    frames: dict[str, Frame] = field(default_factory=dict)
-    flags: Flag = NO_FLAG
-    causes: dict[str, str] = field(default_factory=dict)
-    ambiguous: dict[str, str] = field(default_factory=dict)
-    """Cause by head, for frames that arrived and may belong to this exposure."""
-    line_id: str = ""
-    strip_id: str = ""
-    being_stored: CaptureRecord | None = None
-    stored: CaptureRecord | None = None
-    disks: tuple[str, ...] = ()
-    provisional: tuple[EventMark, Flag, Exposure] | None = None
-    lost: str = ""
-
-    @property
-    def reported_flags(self) -> Flag:
-        """The flags, with FRAME_AMBIGUOUS if a missing frame may have arrived unattributed."""
-        has_ambiguous_frame = self.ambiguous.keys() - self.frames.keys() - self.causes.keys()
-        return self.flags | (Flag.FRAME_AMBIGUOUS if has_ambiguous_frame else NO_FLAG)
-
-    def missing_cause(self, head: str) -> str:
-        """Why the frame of a head is missing."""
-        return self.causes.get(head) or self.ambiguous.get(head, "no frame came")
+_LAST_NS: Final = 2**63
+SEAL_RETRY_NS: Final = NS
+"""Delay before a record that the disk refused is sealed again."""
+_NOT_AWAITED = frozenset({"lost", "absent"})
+"""Device events after which a head is not awaited."""
 
 
 class Flight:
     """Exposures between trigger and seal.
 
-    Every method that takes an instant takes `mono_ns`. Slots of frames that are not used are
-    collected in `idle_slots`, to be returned to the heads. Marks that became final after their
-    arrival are in `resolved_marks`. Heads in `absent_heads` are known to be lost; their frames are
-    not awaited. While `disk_is_low` is set, ordered exposures get the flag DISK_LOW.
+    Every method that takes an instant takes `mono_ns`. Heads in `absent_heads` are known to be
+    lost; their frames are not awaited. While `disk_is_low` is set, ordered exposures get the flag
+    DISK_LOW. `sealing` is the record that is with the writer: one at a time, so that the chain of
+    hashes has one order.
     """
 
     def __init__(
@@ -118,14 +74,16 @@ class Flight:
         self._steps_reported: dict[str, int] = {}
         self.track = Track()
         self.temperatures = TemperatureHistory(lagged_sensors(rig))
-        self.idle_slots: list[tuple[str, int]] = []
-        self.resolved_marks: list[tuple[EventMark, Cause]] = []
         self.absent_heads: set[str] = set()
         self.disk_is_low = False
+        self.sealing: Exposure | None = None
+        self._seal_after_ns = 0
+        self._are_timeouts_expired = False
+        self._receivers: set[str] = set()
         self.serial_of_head = serial_of_head
         self._cone_of_head = {head: rig.cone_of(head) for head in serial_of_head}
         self._matcher = Matcher({h: c.name for h, c in self._cone_of_head.items()}, self.clock)
-        self._open: dict[int, _OpenExposure] = {}
+        self._open: dict[int, OpenExposure] = {}
         self._next_number = first_number
 
     @property
@@ -136,7 +94,7 @@ class Flight:
     @property
     def awaits_frames(self) -> bool:
         """Whether heads are still exposing or sending."""
-        return any(not e.lost and e.being_stored is None for e in self._open.values())
+        return any(exposure.awaits_frames for exposure in self._open.values())
 
     def order(self, mono_ns: int, line_id: str | None = None, strip_id: str = "") -> int:
         """Open the exposure of a trigger that is being ordered; return its number.
@@ -147,7 +105,7 @@ class Flight:
         self._next_number += 1
         line = self.identity.line_id if line_id is None else line_id
         flags = Flag.DISK_LOW if self.disk_is_low else NO_FLAG
-        self._open[number] = _OpenExposure(
+        self._open[number] = OpenExposure(
             number, mono_ns, line_id=line, strip_id=strip_id, flags=flags
         )
         self.ledger.trigger(number)
@@ -165,16 +123,39 @@ class Flight:
 
     def fired(self, pulse: FiredPulse) -> None:
         """The pulse was given."""
-        self._open[pulse.number].pulse = pulse
+        if (exposure := self._open.get(pulse.number)) is not None:
+            exposure.pulse = pulse
         self._matcher.pulse(pulse)
 
-    def frame(self, frame: Frame) -> Cause:
-        """A frame arrived. Its slot is kept only where the frame is used."""
+    def not_fired(self, number: int, sentence: str) -> None:
+        """The trigger unit gave no pulse or did not answer: the exposure is lost."""
+        exposure = self._open.get(number)
+        if exposure is not None and not exposure.frames:
+            exposure.lost = sentence
+
+    # Records of the devices
+
+    def take(self, record: Record) -> Cause | None:
+        """Take in a record of a device.
+
+        Returns:
+            What became of a frame or mark; None for other records. The slot of a frame is retained
+            only if the frame is used. A mark that is used or pending may change until its
+            exposure is sealed.
+        """
+        handler = self._handlers.get(type(record))
+        return None if handler is None else handler(self, record)
+
+    def has_pulse_of(self, frame: Frame) -> bool:
+        """Whether the pulse of a frame is already known."""
+        return self._matcher.has_pulse_of(frame)
+
+    def _frame(self, frame: Frame) -> Cause:
         self._read_latch(frame)
         match = self._matcher.frame(frame)
         cause = match.cause
         exposure = None if match.number is None else self._open.get(match.number)
-        if cause is Cause.USED and (exposure is None or exposure.being_stored is not None):
+        if cause is Cause.USED and (exposure is None or not exposure.awaits_frames):
             cause = Cause.LATE
         self.ledger.frame(frame.head, cause.value)
         if exposure is not None:
@@ -186,12 +167,7 @@ class Flight:
         for number in match.possible:
             if number in self._open:
                 self._open[number].ambiguous[frame.head] = _AMBIGUITIES[cause]
-        self.idle_slots.append((frame.head, frame.slot))
         return cause
-
-    def has_pulse_of(self, frame: Frame) -> bool:
-        """Whether the pulse of a frame is already known."""
-        return self._matcher.has_pulse_of(frame)
 
     def _read_latch(self, frame: Frame) -> None:
         at_ns, mono_ns = frame.device_clock_ns, frame.device_clock_mono_ns
@@ -199,72 +175,119 @@ class Flight:
             reading = ClockReading(frame.head, at_ns, mono_ns, frame.latch_sigma_ns)
             self.device_clocks.read(reading)
 
-    def mark(self, mark: EventMark) -> Cause:
-        """An event mark arrived. USED and PENDING may change until its exposure is sealed."""
+    def _mark(self, mark: EventMark) -> Cause:
         cause = self._matcher.mark(mark).cause
         is_open = cause in (Cause.USED, Cause.PENDING)
         self.ledger.mark(Cause.PENDING.value if is_open else cause.value)
         return cause
 
-    def pps(self, edge: PpsEdge) -> None:
-        """An edge of the pulse per second arrived."""
-        self.clock.pps_edge(edge.mono_ns, edge.sigma_ns)
-        self._matcher.marks.reconsider()
-
-    def clock_reading(self, reading: ClockReading) -> None:
-        """A device's clock was read."""
-        self.device_clocks.read(reading)
-
-    def clock_events(self, mono_ns: int) -> list[ClockEvent]:
-        """Events of the clocks since the last call."""
-        events = self.clock.events(mono_ns)
-        for device, steps in self.device_clocks.steps().items():
-            if steps > self._steps_reported.get(device, 0):
-                self._steps_reported[device] = steps
-                events.append(
-                    ClockEvent(
-                        "device-clock-stepped",
-                        True,
-                        f"the clock of {device} stepped or restarted; it is estimated again; "
-                        "check its power supply if this repeats",
-                    )
-                )
-        return events
-
-    def land(self) -> None:
-        """End the flight: pending marks become spurious."""
-        self._give_up_marks(2**63)
-
-    def navigation(self, sample: NavSample) -> None:
-        """A position arrived."""
+    def _navigation(self, sample: NavSample) -> None:
+        self._receivers.add(sample.receiver)
         if sample.time_valid:
             self.track.add(sample)
             self.clock.message_arrived(sample.gps_ns, sample.mono_ns)
             self._matcher.marks.reconsider()
 
-    def temperature(self, sample: TemperatureSample) -> None:
-        """A probe was read."""
+    def _pps(self, edge: PpsEdge) -> None:
+        self.clock.pps_edge(edge.mono_ns, edge.sigma_ns)
+        self._matcher.marks.reconsider()
+
+    def _clock_reading(self, reading: ClockReading) -> None:
+        self.device_clocks.read(reading)
+
+    def _temperature(self, sample: TemperatureSample) -> None:
         self.temperatures.add(sample)
 
-    def due_to_store(self, mono_ns: int) -> list[PendingStore]:
-        """Exposures whose frames are complete or timed out; each is returned once."""
-        due = []
+    def _device_event(self, event: DeviceEvent) -> None:
+        if event.name in DELIVERING:
+            self.absent_heads.discard(event.device)
+            if event.device in self._receivers:
+                self.clock.receiver_recovered()
+        elif event.name in _NOT_AWAITED:
+            self.absent_heads.add(event.device)
+
+    _handlers: ClassVar[Mapping[type, Callable[[Flight, Any], Cause | None]]] = {
+        Frame: _frame,
+        EventMark: _mark,
+        NavSample: _navigation,
+        PpsEdge: _pps,
+        ClockReading: _clock_reading,
+        TemperatureSample: _temperature,
+        DeviceEvent: _device_event,
+    }
+
+    # What is due
+
+    def advance(self, mono_ns: int) -> Actions:
+        """The actions that are due at an instant; each is returned once."""
+        store = tuple(self._due_to_store(mono_ns))
+        lost = tuple(self._due_to_give_up(mono_ns))
+        mark_wait_ns = round((self.limits.mark_timeout_s + self.limits.frame_timeout_s) * NS)
+        spurious = self._give_up_marks(
+            _LAST_NS if self._are_timeouts_expired else mono_ns - mark_wait_ns
+        )
+        if self.sealing is None and mono_ns >= self._seal_after_ns:
+            self.sealing = seal = self._due_to_seal(mono_ns)
+            provisional = self._due_provisionally() if seal is None else None
+        else:
+            seal = provisional = None
+        clock_events = (*self.clock.events(mono_ns), *self._clock_steps())
+        next_ns = self._next_ns(mark_wait_ns)
+        return Actions(mono_ns, store, lost, spurious, seal, provisional, clock_events, next_ns)
+
+    def expire_timeouts(self) -> None:
+        """End all waiting: what is open is stored and sealed with what is there."""
+        self._are_timeouts_expired = True
+
+    def land(self) -> None:
+        """End the flight: pending marks become spurious."""
+        self._give_up_marks(_LAST_NS)
+
+    def _has_waited(self, exposure: OpenExposure, timeout_s: float, mono_ns: int) -> bool:
+        waited_ns = mono_ns - exposure.ordered_mono_ns
+        return self._are_timeouts_expired or waited_ns > timeout_s * NS
+
+    def _next_ns(self, mark_wait_ns: int) -> int | None:
+        """The instant after which the next time-out has expired."""
+        frame_ns, mark_ns = (
+            round(timeout_s * NS)
+            for timeout_s in (self.limits.frame_timeout_s, self.limits.mark_timeout_s)
+        )
+        ends_ns = [
+            exposure.ordered_mono_ns + frame_ns
+            for exposure in self._open.values()
+            if exposure.awaits_frames
+        ]
+        oldest = next(iter(self._open.values()), None)
+        if oldest is not None and self.sealing is None:
+            if oldest.lost:
+                ends_ns.append(self._seal_after_ns)
+            elif oldest.stored is not None:
+                ends_ns.append(max(self._seal_after_ns, oldest.ordered_mono_ns + mark_ns))
+        pending_ns = self._matcher.marks.oldest_pending_ns
+        if pending_ns is not None:
+            ends_ns.append(pending_ns + mark_wait_ns)
+        return min(ends_ns) + 1 if ends_ns else None
+
+    def _due_to_store(self, mono_ns: int) -> Iterator[PendingStore]:
+        """Exposures whose frames are complete or timed out."""
         for exposure in self._open.values():
-            if exposure.being_stored is not None or exposure.lost or not exposure.frames:
+            if not exposure.awaits_frames or not exposure.frames:
                 continue
-            waited_ns = mono_ns - exposure.ordered_mono_ns
-            is_timed_out = waited_ns > self.limits.frame_timeout_s * NS
-            if is_timed_out or self._is_complete(exposure) or self._must_release_slots(exposure):
+            if (
+                self._has_waited(exposure, self.limits.frame_timeout_s, mono_ns)
+                or self._is_complete(exposure)
+                or self._must_release_slots(exposure)
+            ):
                 exposure.being_stored = self._capture(exposure)
                 slots = {head: frame.slot for head, frame in exposure.frames.items()}
-                due.append(PendingStore(exposure.being_stored, slots))
-        return due
+                yield PendingStore(exposure.being_stored, slots)
 
-    def _is_complete(self, exposure: _OpenExposure) -> bool:
+    def _is_complete(self, exposure: OpenExposure) -> bool:
         """Whether every head that can send its frame has done so."""
         return exposure.frames.keys() >= self.serial_of_head.keys() - self.absent_heads
 
-    def _must_release_slots(self, exposure: _OpenExposure) -> bool:
+    def _must_release_slots(self, exposure: OpenExposure) -> bool:
         """Whether a newer exposure needs the slots of this one.
 
         A silent head must not exhaust the memory of the others. Heads deliver in order: a head that
@@ -276,23 +299,69 @@ class Flight:
             for other in self._open.values()
         )
 
-    def due_to_give_up(self, mono_ns: int) -> list[tuple[int, str]]:
-        """Exposures without any frame in time: now lost, with the cause; returned once."""
-        lost = []
+    def _due_to_give_up(self, mono_ns: int) -> Iterator[tuple[int, str]]:
+        """Exposures without any frame in time: now lost, with the cause."""
         for exposure in self._open.values():
-            waited_ns = mono_ns - exposure.ordered_mono_ns
-            if exposure.frames or exposure.lost or waited_ns <= self.limits.frame_timeout_s * NS:
+            if not exposure.awaits_frames or exposure.frames:
                 continue
-            cause = "no pulse was given" if exposure.pulse is None else "no head sent a frame"
-            lost.append((exposure.number, cause))
-            self._mark_lost(exposure, cause)
-        return lost
+            if self._has_waited(exposure, self.limits.frame_timeout_s, mono_ns):
+                has_pulse = exposure.pulse is not None
+                exposure.lost = "no head sent a frame" if has_pulse else "no pulse was given"
+                yield exposure.number, exposure.lost
 
-    def not_fired(self, number: int, sentence: str) -> None:
-        """The trigger unit gave no pulse or did not answer: the exposure is lost."""
-        exposure = self._open.get(number)
-        if exposure is not None and not exposure.frames:
-            self._mark_lost(exposure, sentence)
+    def _due_to_seal(self, mono_ns: int) -> Exposure | None:
+        """The oldest open exposure, once it is stored or lost and its mark and navigation final."""
+        exposure = next(iter(self._open.values()), None)
+        if exposure is None:
+            return None
+        if exposure.lost:
+            return self._seal(exposure, self._capture(exposure), state="lost")
+        if exposure.stored is None:
+            return None
+        is_final = self._matcher.marks.is_corroborated(exposure.number) and self._has_navigation(
+            exposure
+        )
+        if is_final or self._has_waited(exposure, self.limits.mark_timeout_s, mono_ns):
+            return self._seal(exposure, exposure.stored)
+        return None
+
+    def _due_provisionally(self) -> Exposure | None:
+        """The oldest open exposure that only awaits a second mark.
+
+        It is sealed with this record unless the second mark reassigns its own mark.
+        """
+        exposure = next(iter(self._open.values()), None)
+        if exposure is None or exposure.stored is None or exposure.lost or exposure.provisional:
+            return None
+        mark = self._matcher.mark_of(exposure.number)
+        if mark is None or not self._has_navigation(exposure):
+            return None
+        record = self._compose(exposure, exposure.stored, mark)
+        exposure.provisional = mark, exposure.reported_flags, record
+        return record
+
+    def _has_navigation(self, exposure: OpenExposure) -> bool:
+        mark = self._matcher.mark_of(exposure.number)
+        return mark is not None and self.track.covers(mark.gps_ns)
+
+    def _give_up_marks(self, before_mono_ns: int) -> tuple[EventMark, ...]:
+        spurious = tuple(self._matcher.marks.give_up(before_mono_ns))
+        for _ in spurious:
+            self.ledger.mark(Cause.SPURIOUS.value)
+        return spurious
+
+    def _clock_steps(self) -> Iterator[ClockEvent]:
+        for device, steps in self.device_clocks.steps().items():
+            if steps > self._steps_reported.get(device, 0):
+                self._steps_reported[device] = steps
+                yield ClockEvent(
+                    "device-clock-stepped",
+                    True,
+                    f"the clock of {device} stepped or restarted; it is estimated again; "
+                    "check its power supply if this repeats",
+                )
+
+    # Results of the disk
 
     def stored(
         self, number: int, frames: tuple[FrameRecord, ...], disks: tuple[str, ...] = ()
@@ -310,55 +379,25 @@ class Flight:
         """The disk refused the pixels: the exposure is lost."""
         exposure = self._open[number]
         if exposure.stored is None:
-            self._mark_lost(exposure, sentence)
+            exposure.lost = sentence
 
-    def due_to_seal(self, mono_ns: int) -> Exposure | None:
-        """The oldest open exposure, once it is stored or lost and its mark and navigation final."""
-        mark_wait_ns = round((self.limits.mark_timeout_s + self.limits.frame_timeout_s) * NS)
-        self._give_up_marks(mono_ns - mark_wait_ns)
-        if not self._open:
-            return None
-        exposure = next(iter(self._open.values()))
-        if exposure.lost:
-            return self._seal(exposure, self._capture(exposure), state="lost")
-        if exposure.stored is None:
-            return None
-        waited_ns = mono_ns - exposure.ordered_mono_ns
-        is_waiting = waited_ns <= self.limits.mark_timeout_s * NS
-        is_corroborated = self._matcher.marks.is_corroborated(exposure.number)
-        if is_waiting and not (is_corroborated and self._has_navigation(exposure)):
-            return None
-        return self._seal(exposure, exposure.stored)
-
-    def due_provisionally(self) -> Exposure | None:
-        """The oldest open exposure that only awaits a second mark; returned once.
-
-        It is sealed with this record unless the second mark reassigns its own mark.
-        """
-        exposure = next(iter(self._open.values()), None)
-        if exposure is None or exposure.stored is None or exposure.lost or exposure.provisional:
-            return None
-        mark = self._matcher.mark_of(exposure.number)
-        if mark is None or not self._has_navigation(exposure):
-            return None
-        record = self._compose(exposure, exposure.stored, mark)
-        exposure.provisional = mark, exposure.reported_flags, record
+    def sealed(self, number: int) -> Exposure:
+        """The record is on disk: the exposure is closed. Returns the record."""
+        record = self._close(number)
+        self.ledger.sealed(number)
         return record
 
-    def _has_navigation(self, exposure: _OpenExposure) -> bool:
-        mark = self._matcher.mark_of(exposure.number)
-        return mark is not None and self.track.covers(mark.gps_ns)
-
-    def sealed(self, number: int, state: RecordState) -> None:
-        """The record is on disk: the exposure is closed."""
-        self._close(number, state)
-        self.ledger.sealed(number)
-
-    def not_sealed(self, number: int, state: RecordState) -> None:
+    def not_sealed(self, number: int) -> None:
         """The disk refused the record: the exposure is closed, and recovery seals it later."""
-        self._close(number, state)
+        self._close(number)
 
-    def _close(self, number: int, state: RecordState) -> None:
+    def seal_refused(self, mono_ns: int) -> None:
+        """The disk refused the record and may take it later: it is due again after a delay."""
+        self.sealing, self._seal_after_ns = None, mono_ns + SEAL_RETRY_NS
+
+    def _close(self, number: int) -> Exposure:
+        record, self.sealing = self.sealing, None
+        assert record is not None and record.number == number
         exposure = self._open.pop(number)
         causes = {
             head: exposure.missing_cause(head)
@@ -369,62 +408,16 @@ class Flight:
             causes["exposure"] = exposure.lost
         if self._matcher.mark_of(number) is not None:
             self.ledger.mark(Cause.USED.value)
-        self.ledger.set_state(number, state, causes)
+        self.ledger.set_state(number, record.state, causes)
+        return record
 
-    def _give_up_marks(self, before_mono_ns: int) -> None:
-        for mark in self._matcher.marks.give_up(before_mono_ns):
-            self.ledger.mark(Cause.SPURIOUS.value)
-            self.resolved_marks.append((mark, Cause.SPURIOUS))
+    # Records
 
-    def _mark_lost(self, exposure: _OpenExposure, cause: str) -> None:
-        exposure.lost = cause
-        self.idle_slots += [(head, frame.slot) for head, frame in exposure.frames.items()]
-
-    def _capture(self, exposure: _OpenExposure) -> CaptureRecord:
-        usable = {} if exposure.lost else _in_order(exposure.frames, self.serial_of_head)
-        missing = [
-            (head, exposure.lost or exposure.missing_cause(head))
-            for head in self.serial_of_head
-            if head not in usable
-        ]
-        flags = exposure.reported_flags | (Flag.FRAME_MISSING if missing else NO_FLAG)
-        return CaptureRecord(
-            number=exposure.number,
-            trigger_sequence=exposure.number,
-            trigger_mono_ns=exposure.pulse.mono_ns if exposure.pulse else exposure.ordered_mono_ns,
-            trigger_sigma_ns=exposure.pulse.sigma_ns if exposure.pulse else 0,
-            boot_id=self.identity.boot_id,
-            frames=tuple(self._frame_record(frame) for frame in usable.values()),
-            missing=tuple(missing),
-            line_id=exposure.line_id,
-            strip_id=exposure.strip_id,
-            calibration_id=self.identity.calibration_id,
-            calibration_sha256=self.identity.calibration_sha256,
-            configuration_sha256=self.identity.configuration_sha256,
-            software=self.identity.software,
-            simulated=self.identity.simulated,
-            flags=int(flags),
-        )
-
-    def _frame_record(self, frame: Frame) -> FrameRecord:
-        return FrameRecord(
-            sensor=frame.head,
-            head_serial=self.serial_of_head[frame.head],
-            file="",
-            sha256="",
-            width_px=frame.width_px,
-            height_px=frame.height_px,
-            pixel_format=frame.pixel_format,
-            device_ns=frame.device_ns,
-            counter=frame.counter,
-            exposure_time_us=frame.exposure_time_us,
-            temperature_c=frame.temperature_c,
-            mono_ns=frame.mono_ns,
-            settings=dict(frame.settings),
-        )
+    def _capture(self, exposure: OpenExposure) -> CaptureRecord:
+        return exposure.capture(self.serial_of_head, self.identity)
 
     def _seal(
-        self, exposure: _OpenExposure, stored: CaptureRecord, *, state: RecordState | None = None
+        self, exposure: OpenExposure, stored: CaptureRecord, *, state: RecordState | None = None
     ) -> Exposure:
         mark = self._matcher.mark_of(exposure.number)
         if mark is None and self._matcher.marks.has_ambiguous(exposure.number):
@@ -437,7 +430,7 @@ class Flight:
         return record if state is None else replace(record, state=state)
 
     def _compose(
-        self, exposure: _OpenExposure, stored: CaptureRecord, mark: EventMark | None
+        self, exposure: OpenExposure, stored: CaptureRecord, mark: EventMark | None
     ) -> Exposure:
         record = build_record(
             self.rig,
@@ -449,10 +442,6 @@ class Flight:
             exposure.reported_flags,
         )
         return replace(record, disks=exposure.disks)
-
-
-def _in_order(frames: Mapping[str, Frame], heads: Iterable[str]) -> dict[str, Frame]:
-    return {head: frames[head] for head in heads if head in frames}
 
 
 _FRAME_FLAGS = {

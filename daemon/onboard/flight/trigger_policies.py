@@ -9,11 +9,11 @@ import math
 from collections.abc import Mapping
 from typing import Protocol
 
+from daemon.orientation.geodesy import east_north_m, place_at
 from drivers.contract import NavSample
 from processing.rig import Rig
 
 NANOSECONDS = 1_000_000_000
-EARTH_RADIUS_M = 6_371_000.0
 
 
 class TriggerPolicy(Protocol):
@@ -59,7 +59,7 @@ class DistanceTrigger:
         speed = math.hypot(*nav.velocity_ned_mps[:2])
         if speed < 1.0:
             return None
-        flown_m = _distance_m(self._origin, nav.position)
+        flown_m = math.hypot(*east_north_m(self._origin, nav.position))
         left_ns = round((self.distance_m - flown_m) / speed * NANOSECONDS)
         return max(nav.mono_ns + left_ns, last_fired_ns + self.min_interval_ns)
 
@@ -69,11 +69,7 @@ class DistanceTrigger:
             return
         ahead_s = (mono_ns - nav.mono_ns) / NANOSECONDS
         velocity = nav.velocity_ned_mps or (0.0, 0.0, None)
-        north_m, east_m = velocity[0] * ahead_s, velocity[1] * ahead_s
-        latitude = nav.position[0] + math.degrees(north_m / EARTH_RADIUS_M)
-        shrink = math.cos(math.radians(nav.position[0]))
-        longitude = nav.position[1] + math.degrees(east_m / (EARTH_RADIUS_M * shrink))
-        self._origin = (latitude, longitude)
+        self._origin = place_at(nav.position, velocity[1] * ahead_s, velocity[0] * ahead_s)
 
 
 def pulse_delays_ns(
@@ -103,10 +99,3 @@ def pulse_delays_ns(
     }
     earliest = min(times_ns.values())
     return {name: time_ns - earliest for name, time_ns in times_ns.items()}
-
-
-def _distance_m(a: tuple[float, float], b: tuple[float, float]) -> float:
-    """Distance of two points (latitude, longitude in degrees), metres, good for kilometres."""
-    north = math.radians(b[0] - a[0]) * EARTH_RADIUS_M
-    east = math.radians(b[1] - a[1]) * EARTH_RADIUS_M * math.cos(math.radians(a[0]))
-    return math.hypot(north, east)

@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from daemon.configuration.model import ConfigurationError, PlanSection
+from daemon.configuration.model import PlanSection
 from daemon.errors import DaemonError
 from daemon.mission.layout import Mission
 from daemon.onboard.monitoring.flight_state import FlightState
@@ -194,7 +194,7 @@ def _load_context(path: Path, configured: PlanSection | None) -> _PlanContext | 
             return None
         _, section = mount_of(mission)
         rig, plan = load_rig(mission.rig_path), read_plan(mission.plan_path)
-    except (OSError, DaemonError, ConfigurationError, RigError):
+    except (OSError, DaemonError, RigError):
         return None
     along_m, across_m = image_on_ground_m(rig, section.height_above_ground_m)
     relief, flat_ground_reason = relief_or_reason(configured or section)

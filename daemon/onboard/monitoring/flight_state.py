@@ -76,6 +76,7 @@ class FlightState:
         self._mission: Json = {}
         self._status: Json = {}
         self._devices: dict[str, Json] = {}
+        self._counters: Mapping[str, Any] = {}
         self._latches = FaultLatches()
         self._exposures: dict[int, Json] = {}
         self._dropped_verdicts = dict.fromkeys(VERDICT_RANK, 0)
@@ -93,7 +94,7 @@ class FlightState:
         handler = _HANDLERS.get(kind)
         if handler is not None:
             handler(self, event)
-        if kind not in ("status", "judged", "processed"):
+        if kind not in ("status", "counters", "judged", "processed"):
             self._events.append({"sequence": self.sequence, **event})
 
     def brief(self) -> Json:
@@ -127,6 +128,11 @@ class FlightState:
         }[part]
         newer = [item for item in items if item["sequence"] > after]
         return sorted(newer, key=lambda item: item["sequence"])
+
+    def devices(self) -> list[Json]:
+        """Every device with its counters, which are not part of telemetry: they change always."""
+        listed = self.changed("devices", 0)
+        return [{**device, "counters": self._counters.get(device["name"], {})} for device in listed]
 
     def snapshot(self) -> Json:
         """The complete state, for a new client."""
@@ -195,6 +201,10 @@ class FlightState:
             device["state"] = "searching"
         elif event.get("name") in DELIVERING or event.get("name") == FIXED:
             device["state"] = "ready"
+
+    def _on_counters(self, event: Mapping[str, Any]) -> None:
+        counters = event.get("devices")
+        self._counters = counters if isinstance(counters, Mapping) else {}
 
     def _on_fault(self, event: Mapping[str, Any]) -> None:
         self._phase = "fault"
@@ -343,6 +353,7 @@ _HANDLERS: Mapping[str, Callable[[FlightState, Mapping[str, Any]], None]] = {
     "mission": FlightState._on_mission,
     "bound": FlightState._on_bound,
     "device": FlightState._on_device,
+    "counters": FlightState._on_counters,
     "fault": FlightState._on_fault,
     "phase": FlightState._on_phase,
     "status": FlightState._on_status,

@@ -29,7 +29,7 @@ def exposition(state: FlightState) -> bytes:
 class _FlightCollector(Collector):
     def __init__(self, state: FlightState) -> None:
         self._brief = state.brief()
-        self._devices = state.changed("devices", 0)
+        self._devices = state.devices()
         self._exposures = state.changed("exposures", 0)
 
     def collect(self) -> Iterator[Metric]:
@@ -62,6 +62,15 @@ class _FlightCollector(Collector):
             labels = [device["name"], str(device["kind"] or "")]
             ready.add_metric(labels, float(device["state"] == "ready"))
         yield ready
+        counters = CounterMetricFamily(
+            "syntopic_device_events",
+            "Counters of a device's driver, by its name there.",
+            labels=["device", "kind", "counter"],
+        )
+        for device in self._devices:
+            for name, count in sorted(device["counters"].items()):
+                counters.add_metric([device["name"], str(device["kind"] or ""), name], count)
+        yield counters
         standing = sum(fault["stands"] for fault in brief["faults"])
         yield GaugeMetricFamily("syntopic_faults_standing", "Faults that stand.", value=standing)
         yield from self._gauges(status)

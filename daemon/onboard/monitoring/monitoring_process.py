@@ -15,7 +15,7 @@ import uvicorn
 from fastapi import FastAPI
 from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 
-from daemon.configuration.model import ConfigurationError, MountSection, PlanSection, WatchSection
+from daemon.configuration.model import MountSection, PlanSection, WatchSection
 from daemon.errors import DaemonError
 from daemon.mission.canonical_json import RecordError
 from daemon.mission.exposure import navigation_from_json
@@ -333,7 +333,7 @@ def _rig_and_ground(path: Path) -> tuple[Rig, MountSection, float] | None:
         mission = Mission.open(path)
         mount, plan = mount_of(mission)
         return load_rig(mission.rig_path), mount, plan.ground_height_m
-    except (OSError, DaemonError, ConfigurationError, RigError):
+    except (OSError, DaemonError, RigError):
         return None
 
 

@@ -2,7 +2,8 @@
 
 No client has a queue. A client has cursors into the state. Each record holds the brief state
 and, as far as the budget allows, the changes after each cursor. A slow link therefore costs
-freshness, never memory, and ends up with the same state. The schema is in docs/telemetry.md.
+freshness, never memory, and ends up with the same state. The schema is in
+docs/reference/flight/telemetry.md.
 """
 
 from __future__ import annotations

@@ -1,31 +1,28 @@
 """The pipeline worker: Level-0 in, Level-2 products and a verdict out.
 
 It reads an exposure from shared memory if its frames are still there, else from disk. It never
-delays capture. Several exposures are processed at a time (`daemon.onboard.pipeline.pipeline_pool`).
+delays capture. Several exposures are processed at a time (`daemon.products.pipeline_pool`).
 """
 
 from __future__ import annotations
 
-import os
-import sys
+import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from concurrent.futures import Future
+from contextlib import closing
 from dataclasses import dataclass, field
 from functools import partial
-from queue import Empty, SimpleQueue
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.configuration.model import MountSection, PlanSection
 from daemon.errors import DaemonError
 from daemon.mission.exposure import Exposure
 from daemon.mission.layout import Mission
 from daemon.mission.store import level2, store
+from daemon.mission.store.publication import StagedFolder
 from daemon.onboard.capture.frame_ring import FrameRing
-from daemon.onboard.pipeline.pipeline_pool import PipelinePool
 from daemon.onboard.service.messages import (
     BeginProcessing,
     FramesRead,
@@ -34,6 +31,7 @@ from daemon.onboard.service.messages import (
     Process,
     Processed,
     ProcessFailed,
+    ProductsStaged,
     RecordFinalized,
     Stop,
     UseMission,
@@ -44,20 +42,23 @@ from daemon.onboard.service.messages import (
     WorkerSettings,
 )
 from daemon.onboard.service.processes import ServiceConnection
-from daemon.orientation.exterior_orientation import mount_of, sealed_exposures
-from daemon.orientation.ground_model import GroundModel, ground_of
-from daemon.planning.overlaps import Overlaps, OverlapShares
-from daemon.products.exposure_conditions import capture_flags, conditions_of
-from daemon.products.processor import Processor, build_processor, histograms_of, make_products
-from daemon.products.product_files import ProductFiles
-from processing.quality.evaluation import evaluate
-from processing.quality.report import Flag, as_json
+from daemon.orientation.exterior_orientation import mount_of
+from daemon.orientation.ground_model import ground_of
+from daemon.planning.overlaps import Overlaps, OverlapShares, overlaps_of
+from daemon.products.exposure_products import (
+    ExposureProducts,
+    FlightGeometry,
+    make_products,
+    report_unprocessed,
+)
+from daemon.products.pipeline_pool import PipelinePool
+from daemon.products.processing_threads import configure_threads
+from daemon.products.processor import Processor, build_processor
+from processing.quality.report import Flag
 from processing.rig import Rig, find_rig
 
-SWITCH_INTERVAL_S = 0.001
-"""How long one thread may hold the interpreter while another waits to enter a kernel."""
-FINALIZE_TIMEOUT_S = 3600.0
-"""How long products wait for a record that the disk refuses; the writer retries it."""
+FAILURES = (OSError, ValueError, ArithmeticError, np.linalg.LinAlgError)
+"""Errors that cost an exposure its products; the frames are stored."""
 
 
 def main(link: ServiceConnection, settings: WorkerSettings, rings: tuple[FrameRing, ...]) -> None:
@@ -81,9 +82,8 @@ def main(link: ServiceConnection, settings: WorkerSettings, rings: tuple[FrameRi
     rig, mission = processor.rig, Mission.open(begin.mission)
     pool = PipelinePool[Processor](processor, settings.processing.parallel_exposures)
     mount, _ = mount_of(mission)
-    plan = settings.plan
-    overlaps, ground = overlaps_of(mission, rig), ground_of(rig, mount, plan)
-    context = WorkerContext(link, rig, mission, mount, plan, rings, overlaps, ground)
+    geometry = FlightGeometry(mount, settings.plan, ground_of(rig, mount, settings.plan))
+    context = WorkerContext(link, rig, mission, geometry, rings, overlaps_of(mission, rig))
     link.send(WorkerReady(time.monotonic() - started))
     in_progress: set[Future[None]] = set()
     while not isinstance(message := link.receive(timeout_s=1.0), Stop):
@@ -92,18 +92,18 @@ def main(link: ServiceConnection, settings: WorkerSettings, rings: tuple[FrameRi
         elif isinstance(message, Process):
             # Not in a thread of the pool: overlaps depend on the preceding exposures.
             overlap_shares = context.overlap_shares_of(message.exposure)
-            context.begin(message)
             in_progress.add(pool.submit(partial(context.process, message, overlap_shares)))
         elif isinstance(message, RecordFinalized):
-            context.finalize(message)
+            # In a thread of the pool: a slow disk must not delay the answer to a ping.
+            in_progress.add(pool.submit(partial(_finalize, context, message)))
         elif isinstance(message, UseMission):
             context.mission = Mission(message.mission, message.mission.name)
         done = {future for future in in_progress if future.done()}
         in_progress -= done
         for future in done:
             future.result()  # an internal error ends the process; the service reports it
-    context.abandon_pending()
     pool.end()
+    context.drop_staged()
 
 
 def build(settings: WorkerSettings) -> Processor:
@@ -126,96 +126,53 @@ def _wait_for_begin(link: ServiceConnection) -> BeginProcessing | None:
     return None
 
 
-def configure_threads() -> None:
-    """Let threads take turns, and sleep where they wait; call it before the first kernel runs.
-
-    OpenMP's threads spin by default, which takes the core from the exposures processed in parallel.
-    """
-    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-    sys.setswitchinterval(SWITCH_INTERVAL_S)
+def _finalize(context: WorkerContext, message: RecordFinalized, _processor: Processor) -> None:
+    context.finalize(message)
 
 
-def overlaps_of(mission: Mission, rig: Rig) -> Overlaps:
-    """The footprints of what has been flown of a mission, as far as its records can be read."""
-    mount, plan = mount_of(mission)
-    overlaps = Overlaps(rig, mount, plan.ground_height_m)
-    # Verification names what cannot be read; no flight is given up for an overlap.
-    for exposure in sealed_exposures(mission).results.values():
-        overlaps.add(exposure)
-    return overlaps
+@dataclass(frozen=True)
+class _StagedProducts:
+    """Products on disk without their final name, and the message that follows publication."""
 
-
-def process_exposure(
-    processor: Processor,
-    mission: Mission,
-    mount: MountSection,
-    plan: PlanSection,
-    exposure: Exposure,
-    frames: Mapping[str, NDArray[np.uint16]],
-    flags: Flag = Flag(0),  # noqa: B008 - an immutable value
-    *,
-    overlap_shares: OverlapShares | None = None,
-    ground: GroundModel | None = None,
-    frames_read: Callable[[], None] | None = None,
-) -> tuple[dict[str, Any], Mapping[str, int]]:
-    """Make the images of one exposure and write its Level-2 folder.
-
-    Returns:
-        The content of quality.json, and the files written with their sizes in bytes.
-    """
-    conditions = conditions_of(exposure, processor.rig, plan, flags, overlap_shares, ground=ground)
-    report, contents = make_products(
-        processor, mount, plan, exposure, frames, conditions, frames_read=frames_read
-    )
-    return report, level2.write_folder(mission.level2(exposure.number), contents)
-
-
-def report_unprocessed(rig: Rig, exposure: Exposure, flags: Flag) -> dict[str, Any]:
-    """The quality report of an exposure that has no image: what capture knows of it."""
-    known_flags = capture_flags(exposure, rig) | flags | Flag.NOT_PROCESSED
-    if exposure.simulated:
-        known_flags |= Flag.SIMULATED
-    missing = [sensor for sensor, _ in exposure.missing]
-    report = as_json(evaluate({}, capture_flags=known_flags, missing_sensors=missing))
-    return {**report, "exposure": exposure.number}
+    exposure: Exposure
+    flags: Flag
+    folder: StagedFolder
+    done: Processed
 
 
 @dataclass
 class WorkerContext:
     """Shared state of the exposures in the pipeline.
 
-    `mission` changes when another disk becomes the leading one; it is looked up at each read and
-    write.
+    Products of an unsealed exposure are staged: on disk, without their final name. They occupy no
+    processor. `mission` changes when another disk becomes the leading one; it is looked up at each
+    read and write.
     """
 
     link: ServiceConnection
     rig: Rig
     mission: Mission
-    mount: MountSection
-    plan: PlanSection
+    geometry: FlightGeometry
     rings: tuple[FrameRing, ...]
     overlaps: Overlaps
-    ground: GroundModel | None
-    provisional_records: dict[int, SimpleQueue[tuple[Exposure, OverlapShares] | None]] = field(
-        default_factory=dict
-    )
-
-    def begin(self, message: Process) -> None:
-        """Begin an exposure; for an unsealed one a `RecordFinalized` follows."""
-        if not message.is_sealed:
-            self.provisional_records[message.exposure.number] = SimpleQueue()
+    _staged: dict[int, _StagedProducts] = field(default_factory=dict)
+    _finalized: dict[int, bool] = field(default_factory=dict)
+    _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def finalize(self, finalized: RecordFinalized) -> None:
-        """Pass on the final record of an exposure in progress, or None if there is none."""
-        if (outcome := self.provisional_records.get(finalized.number)) is None:
-            return  # it could not be processed, which was reported
-        record = finalized.exposure
-        outcome.put(None if record is None else (record, self.overlap_shares_of(record)))
+        """Publish or drop products that wait for their record, or that will be computed soon."""
+        number, is_confirmed = finalized.number, finalized.is_confirmed
+        with self._lock:
+            staged = self._staged.pop(number, None)
+            if staged is None:
+                self._finalized[number] = is_confirmed
+        if staged is not None:
+            self._end(staged, is_confirmed=is_confirmed)
 
-    def abandon_pending(self) -> None:
-        """At the end: do not wait for records that are not sealed."""
-        for outcome in list(self.provisional_records.values()):
-            outcome.put(None)
+    def drop_staged(self) -> None:
+        """At the end: remove products whose record is not sealed."""
+        for staged in self._staged.values():
+            staged.folder.close()
 
     def overlap_shares_of(self, exposure: Exposure) -> OverlapShares:
         """The overlaps of an exposure; call it in the order they were made."""
@@ -225,7 +182,7 @@ class WorkerContext:
     def process(
         self, message: Process, overlap_shares: OverlapShares, processor: Processor
     ) -> None:
-        """Process one exposure and send the result."""
+        """Process one exposure; publish its products if its record is sealed, else stage them."""
         started = time.monotonic()
         exposure = message.exposure
         flags = Flag(0)
@@ -235,39 +192,55 @@ class WorkerContext:
                 frames = store.load_level0(self.mission.level0(exposure.number), self.rig)[0]
             else:
                 frames = self._frames_in_memory(exposure, message.slots)
-            histograms = histograms_of(self.rig, frames)
-            products = self._compute_products(
-                message.exposure, frames, flags, overlap_shares, processor
-            )
-            if not message.is_sealed:
-                wait_started = time.monotonic()
-                finalized = self.provisional_records[exposure.number].get(
-                    timeout=FINALIZE_TIMEOUT_S
-                )
-                started += time.monotonic() - wait_started
-                if finalized is None:
-                    return
-                if finalized[0] != exposure:
-                    # Its mark was reassigned: compute and report the products again.
-                    exposure = finalized[0]
-                    frames = store.load_level0(self.mission.level0(exposure.number), self.rig)[0]
-                    products = self._compute_products(
-                        exposure, frames, flags, finalized[1], processor
-                    )
-            report, contents = products
-            files = level2.write_folder(self.mission.level2(exposure.number), contents)
-        except (OSError, ValueError, ArithmeticError, np.linalg.LinAlgError, Empty) as error:
-            sentence = (
-                f"exposure {exposure.number} was stored but not processed: {error}; "
-                f"run syntopic process {self.mission.path} after landing"
-            )
-            report = report_unprocessed(self.rig, exposure, flags)
-            self.link.send(ProcessFailed(exposure.number, sentence, report))
+            products = self._compute_products(exposure, frames, flags, overlap_shares, processor)
+            folder = StagedFolder(self.mission.level2(exposure.number))
+            try:
+                files = level2.write_files(folder.part, products.contents)
+            except BaseException:
+                folder.close()
+                raise
+        except FAILURES as error:
+            self._report_failure(exposure, flags, error)
             return
-        finally:
-            self.provisional_records.pop(exposure.number, None)
         seconds = time.monotonic() - started
-        self.link.send(Processed(exposure.number, report, files, seconds, histograms))
+        done = Processed(exposure.number, products.report, files, seconds, products.histograms)
+        staged = _StagedProducts(exposure, flags, folder, done)
+        if message.is_sealed:
+            self._end(staged, is_confirmed=True)
+        else:
+            self._stage(staged)
+
+    def _stage(self, staged: _StagedProducts) -> None:
+        number = staged.exposure.number
+        with self._lock:
+            is_confirmed = self._finalized.pop(number, None)
+            if is_confirmed is None:
+                self._staged[number] = staged
+        if is_confirmed is None:
+            self.link.send(ProductsStaged(number))
+        else:
+            self._end(staged, is_confirmed=is_confirmed)
+
+    def _end(self, staged: _StagedProducts, *, is_confirmed: bool) -> None:
+        with closing(staged.folder) as folder:
+            if not is_confirmed:
+                return
+            try:
+                if folder.final != self.mission.level2(staged.exposure.number):
+                    raise OSError("the leading disk changed before its products were published")
+                folder.publish()
+            except OSError as error:
+                self._report_failure(staged.exposure, staged.flags, error)
+                return
+        self.link.send(staged.done)
+
+    def _report_failure(self, exposure: Exposure, flags: Flag, error: Exception) -> None:
+        sentence = (
+            f"exposure {exposure.number} was stored but not processed: {error}; "
+            f"run syntopic process {self.mission.path} after landing"
+        )
+        report = report_unprocessed(self.rig, exposure, flags)
+        self.link.send(ProcessFailed(exposure.number, sentence, report))
 
     def _compute_products(
         self,
@@ -276,21 +249,18 @@ class WorkerContext:
         flags: Flag,
         overlap_shares: OverlapShares,
         processor: Processor,
-    ) -> ProductFiles:
+    ) -> ExposureProducts:
         """The products of an exposure; the verdict is sent before they are written."""
-        conditions = conditions_of(
-            exposure, self.rig, self.plan, flags, overlap_shares, ground=self.ground
-        )
         products = make_products(
             processor,
-            self.mount,
-            self.plan,
+            self.geometry,
             exposure,
             frames,
-            conditions,
+            flags,
+            overlap_shares,
             frames_read=partial(self.link.send, FramesRead(exposure.number)),
         )
-        self.link.send(VerdictReady(exposure.number, products[0]))
+        self.link.send(VerdictReady(exposure.number, products.report))
         return products
 
     def _frames_in_memory(

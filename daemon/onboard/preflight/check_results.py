@@ -8,7 +8,7 @@ from __future__ import annotations
 import enum
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any
 
 
 class CheckOutcome(enum.StrEnum):
@@ -48,14 +48,6 @@ class CheckResult:
             "prevents": self.is_blocking,
             "found": dict(self.found),
         }
-
-
-EXIT_STATUS: Final[Mapping[CheckOutcome, int]] = {
-    CheckOutcome.PASS: 0,
-    CheckOutcome.FAIL: 1,
-    CheckOutcome.WAITING: 3,
-}
-"""Of `syntopic check`; 2 is a configuration that is refused."""
 
 
 def worst_outcome(results: Iterable[CheckResult]) -> CheckOutcome:

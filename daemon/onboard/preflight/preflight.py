@@ -10,13 +10,18 @@ import time
 from collections.abc import Callable, Sequence
 
 from daemon.configuration.model import Configuration
+from daemon.onboard.capture.device_states import DeviceStates
 from daemon.onboard.capture.devices import stated_serial_problems
-from daemon.onboard.flight.arming import MissingPrerequisite, Readiness, missing_prerequisites
+from daemon.onboard.flight.arming import (
+    MissingPrerequisite,
+    Readiness,
+    absent_parts,
+    missing_prerequisites,
+)
 from daemon.onboard.flight.flight import Flight
 from daemon.onboard.flight.phases import Phase, PhaseInputs, PhaseMachine
 from daemon.onboard.pipeline.pipeline_queue import PipelineQueue
 from daemon.onboard.service.flight_line import FlightLine
-from daemon.onboard.service.record_ingest import RecordIngest
 from processing.rig import Rig
 
 IMMEDIATE_START = 'the configuration (trigger.start = "immediate")'
@@ -35,14 +40,14 @@ class Preflight:
         rig: Rig,
         flight: Flight,
         line: FlightLine,
-        ingest: RecordIngest,
+        devices: DeviceStates,
         pipeline: PipelineQueue,
     ) -> None:
         self._configuration = configuration
         self._rig = rig
         self._flight = flight
         self._line = line
-        self._ingest = ingest
+        self._devices = devices
         self._pipeline = pipeline
         self._machine = PhaseMachine()
         self.accepted: frozenset[str] = frozenset()
@@ -61,6 +66,10 @@ class Preflight:
         readiness = self._readiness(time.monotonic_ns())
         missing = missing_prerequisites(readiness, self._configuration.limits)
         return tuple(item for item in missing if item.name not in self.accepted)
+
+    def absent(self) -> list[str]:
+        """Absent devices and data, as text."""
+        return absent_parts(self._readiness(time.monotonic_ns()))
 
     def arm(self) -> None:
         """Arm by command; the service stays armed while no prerequisite is missing."""
@@ -92,9 +101,9 @@ class Preflight:
 
     def _readiness(self, mono_ns: int) -> Readiness:
         configuration, flight = self._configuration, self._flight
-        active = self._ingest.active
-        absent = [f"head {h.sensor}" for h in configuration.head if h.sensor not in active]
-        if not self._ingest.has_trigger:
+        delivering = self._devices.delivering
+        absent = [f"head {h.sensor}" for h in configuration.head if h.sensor not in delivering]
+        if not self._devices.has_trigger:
             absent.append("trigger")
         last = flight.track.last
         read = {t.probe: (t.value_c, t.age_ns * 1e-9) for t in flight.temperatures.at(mono_ns)}
@@ -111,7 +120,7 @@ class Preflight:
             probes_c={probe: read.get(probe) for probe in probes},
             serials_unreported=[
                 head
-                for head, serial in self._ingest.serials.items()
+                for head, serial in self._devices.serials.items()
                 if not serial and self._rig.sensor(head).serial
             ],
             serials_mismatched=stated_serial_problems(configuration, self._rig),

@@ -10,22 +10,25 @@ import asyncio
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import ClassVar
 
 from daemon.configuration.model import Configuration
+from daemon.mission.interrupted_mission import disks_of, interrupted_mission
 from daemon.mission.layout import Mission
 from daemon.mission.mirror.mirror_startup import FoundDisks, begin_mirrored, resume_mirrored
 from daemon.onboard.preflight.check_results import CheckOutcome
-from daemon.onboard.preflight.prerequisites import CHECKS, CHECKS_AFTER_RESTART, prerequisites
+from daemon.onboard.preflight.prerequisites import (
+    CHECKS_AFTER_RESTART,
+    CHECKS_AT_START,
+    prerequisites,
+)
 from daemon.onboard.preflight.resumption import resume
-from daemon.onboard.service.message_dispatcher import MessageDispatcher
-from daemon.onboard.service.messages import WorkerBuilt, WorkerRefused
-from daemon.onboard.service.record_ingest import EmitEvent
-from daemon.onboard.service.startup import create_mission, disks_of, interrupted_mission
+from daemon.onboard.service.message_dispatcher import Handlers
+from daemon.onboard.service.messages import EmitEvent, WorkerBuilt, WorkerRefused
+from daemon.onboard.service.startup import create_mission
 from processing.rig import Rig
 
 
-class Preparation(MessageDispatcher):
+class Preparation:
     """Preparation of the mission.
 
     `rig` is the rig in use: that of the mission if one is resumed. `interrupted` is the mission to
@@ -69,7 +72,7 @@ class Preparation(MessageDispatcher):
             self.interrupted = interrupted_mission(self._configuration)
         else:
             self.interrupted = self.disks.mission
-        checks = CHECKS if self.interrupted is None else CHECKS_AFTER_RESTART
+        checks = CHECKS_AT_START if self.interrupted is None else CHECKS_AFTER_RESTART
         results = await asyncio.to_thread(prerequisites, self._configuration, self.rig, checks)
         for result in results:
             if result.outcome is CheckOutcome.FAIL and not result.is_blocking:
@@ -112,4 +115,7 @@ class Preparation(MessageDispatcher):
     def _on_refused(self, refused: WorkerRefused) -> None:
         self._fail(refused.sentence)
 
-    handlers: ClassVar = {WorkerBuilt: _on_built, WorkerRefused: _on_refused}
+    @property
+    def handlers(self) -> Handlers:
+        """The messages of the worker before the flight."""
+        return {WorkerBuilt: self._on_built, WorkerRefused: self._on_refused}

@@ -1,7 +1,7 @@
-"""Prerequisites that are checked before any device is opened, by `run` at its start and by `check`.
+"""What is missing before any device is opened: one list of checks, for `run` and for `check`.
 
 Both call `prerequisites`, so that their results agree. `daemon.onboard.capture.devices` evaluates
-the properties of devices, `daemon.onboard.flight.arming` the prerequisites of arming.
+the properties of devices that answered, `daemon.onboard.flight.arming` what is missing for arming.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from daemon.mission.store.health import read_health
 from daemon.onboard.capture.devices import frame_nbytes
 from daemon.onboard.capture.head_network import head_network
 from daemon.onboard.preflight.check_results import CheckOutcome, CheckResult, failed, passed
+from daemon.onboard.preflight.import_names import import_names
 from drivers.base import registry
 from drivers.base.extras import MissingExtraError, require
 from processing.rig import Rig
@@ -59,10 +60,9 @@ def libraries(configuration: Configuration, rig: Rig) -> Iterator[CheckResult]:
     }
     if configuration.watch is not None:
         needed |= {"watch"} | ({"mavlink"} if configuration.watch.mavlink is not None else set())
-    if configuration.plan.elevation is not None:
-        needed.add("geodesy")
-        if configuration.plan.elevation.suffix.lower() != ".asc":
-            needed.add("geotiff")
+    elevation = configuration.plan.elevation
+    if elevation is not None and elevation.suffix.lower() != ".asc":
+        needed.add("geotiff")
     for extra in sorted(needed):
         try:
             require(extra)
@@ -219,7 +219,16 @@ def pace(configuration: Configuration, rig: Rig) -> Iterator[CheckResult]:
         yield passed("disk", "pace", rates)
 
 
+def monitoring(configuration: Configuration, _rig: Rig) -> Iterator[CheckResult]:
+    """Port, tokens, certificate and keys of the page, if there is one."""
+    if configuration.watch is not None:
+        from daemon.onboard.monitoring.monitoring_prerequisites import check_monitoring
+
+        yield from check_monitoring(configuration.watch)
+
+
 CHECKS: Final[Sequence[Check]] = (
+    import_names,
     libraries,
     calibration,
     storage,
@@ -227,15 +236,12 @@ CHECKS: Final[Sequence[Check]] = (
     memory,
     head_network,
     pace,
+    monitoring,
 )
 """Every prerequisite, in the order of the checks."""
-CHECKS_AFTER_RESTART: Final[Sequence[Check]] = (
-    libraries,
-    calibration,
-    storage,
-    memory,
-    head_network,
-)
+CHECKS_AT_START: Final = tuple(check for check in CHECKS if check is not monitoring)
+"""Those of a new flight: the process of the page checks its own when it begins."""
+CHECKS_AFTER_RESTART: Final = tuple(c for c in CHECKS_AT_START if c not in (disk_health, pace))
 """Those of a resumed flight: the disk is not measured, to save time."""
 
 

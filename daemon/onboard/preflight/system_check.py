@@ -12,31 +12,30 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, ClassVar, Final
+from typing import Any, Final
 
 from daemon.configuration.model import Configuration
 from daemon.errors import DaemonError
+from daemon.onboard.capture.device_states import DeviceStates
 from daemon.onboard.capture.devices import bound_problem, device_specs
-from daemon.onboard.flight.flight import Flight, FlightIdentity
+from daemon.onboard.flight.flight import Flight
+from daemon.onboard.flight.flight_identity import FlightIdentity
 from daemon.onboard.flight.ledger import Ledger
 from daemon.onboard.pipeline.pipeline_queue import PipelineQueue
 from daemon.onboard.preflight.check_results import CheckOutcome, CheckResult, failed, passed
 from daemon.onboard.preflight.preflight import Preflight
+from daemon.onboard.service.exposure_sequence import ExposureSequence
 from daemon.onboard.service.flight_line import FlightLine
-from daemon.onboard.service.message_dispatcher import MessageDispatcher
+from daemon.onboard.service.message_dispatcher import Handlers, MessageDispatcher
 from daemon.onboard.service.messages import (
     BeginProcessing,
     BindFailed,
     Bound,
     DeviceSpec,
-    Fire,
     Fired,
-    Pong,
     WorkerBuilt,
-    WorkerReady,
     WorkerRefused,
 )
-from daemon.onboard.service.record_ingest import RecordIngest
 from daemon.onboard.service.startup import capture_process, frame_rings, worker_process
 from daemon.onboard.service.supervisor import Supervisor
 from drivers.contract import (
@@ -71,7 +70,7 @@ ARRIVING_LATER: Final = frozenset({"arming-time", "arming-navigation", "arming-k
 """Prerequisites that are met later without action if nothing else fails."""
 
 
-class SystemCheck(MessageDispatcher):
+class SystemCheck:
     """Starts the processes of a flight and verifies each part.
 
     Args:
@@ -96,15 +95,17 @@ class SystemCheck(MessageDispatcher):
             Ledger(heads=heads),
             1,
         )
-        self._ingest = RecordIngest(flight, lambda _record: None, lambda *_, **__: None)
         self._line = FlightLine(
             configuration, rig, flight, _existing(configuration.mission.root), 0,
             plan=configuration.plan.file,
         )  # fmt: skip
-        self._pipeline = PipelineQueue(1, lambda *_: None, lambda *_, **__: None)
-        self._preflight = Preflight(
-            configuration, rig, flight, self._line, self._ingest, self._pipeline
-        )
+        self._pipeline = PipelineQueue(1)
+        self._sequence = ExposureSequence(flight, self._pipeline, self._supervisor.send, _no_event)
+        devices = DeviceStates(flight, self._sequence.log, _no_event)
+        self._preflight = Preflight(configuration, rig, flight, self._line, devices, self._pipeline)
+        self._dispatcher = MessageDispatcher()
+        for handlers in (self._handlers, devices.handlers, self._sequence.handlers):
+            self._dispatcher.add(handlers)
         self._changed = asyncio.Event()
         self._bound: dict[str, Mapping[str, str]] = {}
         self._unbound: dict[str, str] = {}
@@ -136,14 +137,12 @@ class SystemCheck(MessageDispatcher):
     # While it runs
 
     def _fire_once(self) -> None:
-        order = self._line.order(time.monotonic_ns())
-        self._ingest.orders[order.number] = order
-        self._supervisor.send("capture", Fire(order.number, order.delays_ns))
+        self._sequence.fire(self._line.order(time.monotonic_ns()))
 
     def _dispatch(self, message: object) -> None:
-        self.dispatch(message)
-        dispatchers: tuple[MessageDispatcher, ...] = (self._ingest, self._pipeline)
-        any(dispatcher.dispatch(message) for dispatcher in dispatchers)
+        if (record := self._recorders.get(type(message))) is not None:
+            record(message)
+        self._dispatcher.dispatch(message)
         self._changed.set()
 
     def _on_death(self, name: str) -> None:
@@ -191,21 +190,24 @@ class SystemCheck(MessageDispatcher):
         if fired.pulse is None:
             self._not_fired = fired.sentence
 
-    handlers: ClassVar = {
-        Bound: _on_bound,
-        BindFailed: _on_bind_failed,
-        WorkerBuilt: _on_built,
-        WorkerRefused: _on_refused,
-        NavSample: _on_navigation,
-        EventMark: _on_mark,
-        TemperatureSample: _on_temperature,
-        PpsEdge: _on_pps,
-        Frame: _on_frame,
-        DeviceEvent: _on_device_event,
-        Fired: _on_fired,
-        Pong: lambda *_: None,
-        WorkerReady: lambda *_: None,
-    }
+    @property
+    def _handlers(self) -> Handlers:
+        return {WorkerBuilt: self._on_built, WorkerRefused: self._on_refused}
+
+    @property
+    def _recorders(self) -> Handlers:
+        """What is noted of messages that a flight handles."""
+        return {
+            Bound: self._on_bound,
+            BindFailed: self._on_bind_failed,
+            NavSample: self._on_navigation,
+            EventMark: self._on_mark,
+            TemperatureSample: self._on_temperature,
+            PpsEdge: self._on_pps,
+            Frame: self._on_frame,
+            DeviceEvent: self._on_device_event,
+            Fired: self._on_fired,
+        }
 
     async def _until(self, condition: Callable[[], bool], limit_s: float) -> None:
         deadline = time.monotonic() + limit_s
@@ -327,6 +329,10 @@ async def run_system_check(
         return await SystemCheck(configuration, rig, fire=fire).run()
     except (DaemonError, OSError, ValueError) as error:
         return [failed("service", "layout", str(error), is_blocking=True)]
+
+
+def _no_event(event: str, **content: Any) -> None:
+    """Nothing is reported while the check runs."""
 
 
 def _existing(folder: Path) -> Path:

@@ -9,11 +9,18 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol, TypeGuard
 
-from daemon.mission.log.log_records import Message, lenient_json_bytes
+from daemon.mission.log.log_records import AUDIT_TOPIC, Message, lenient_json_bytes
 from daemon.onboard.flight.arming import MissingPrerequisite
-from daemon.onboard.service.messages import Answer, CommandRefused, InvalidMessages, ServiceCommand
-
-AUDIT_TOPIC = "audit"
+from daemon.onboard.service.command_rules import violation
+from daemon.onboard.service.message_dispatcher import Handlers
+from daemon.onboard.service.messages import (
+    Answer,
+    AppendToLog,
+    CommandRefused,
+    EmitEvent,
+    InvalidMessages,
+    ServiceCommand,
+)
 
 
 class LineControl(Protocol):
@@ -66,6 +73,59 @@ class CommandTarget(Protocol):
     def mirror(self) -> DiskCommands: ...
     def acknowledge(self, fault: str) -> bool: ...
     def land(self, *, new_mission: bool = False) -> None: ...
+
+
+class CommandHandlers:
+    """Executes the commands of the page's process, and records each in flight log and events.
+
+    Args:
+        target: the service that commands act on.
+        answer: sends an answer to the page's process.
+        send: sends a message to a process, by its name.
+        emit: emits an event.
+    """
+
+    def __init__(
+        self,
+        target: CommandTarget,
+        answer: Callable[[Answer], None],
+        send: Callable[[str, object], None],
+        emit: EmitEvent,
+    ) -> None:
+        self._target = target
+        self._answer = answer
+        self._send = send
+        self._emit = emit
+
+    @property
+    def handlers(self) -> Handlers:
+        """The messages about commands."""
+        return {
+            ServiceCommand: self._on_command,
+            CommandRefused: self._on_refused,
+            InvalidMessages: self._on_invalid,
+        }
+
+    def _on_command(self, command: ServiceCommand) -> None:
+        problem = violation(command)
+        if problem is not None:
+            # The page's process rejects these commands: it may be compromised.
+            self._answer(Answer(command.number, False, problem))
+            self._on_refused(refused_command(command, problem))
+            return
+        answer = execute(command, self._target)
+        self._answer(answer)
+        self._record(audit_message(command, answer), command_event(command, answer))
+
+    def _on_refused(self, refused: CommandRefused) -> None:
+        self._record(refusal_message(refused), refusal_event(refused))
+
+    def _on_invalid(self, invalid: InvalidMessages) -> None:
+        self._record(invalid_message(invalid), invalid_event(invalid))
+
+    def _record(self, message: Message, event: Mapping[str, Any]) -> None:
+        self._send("writer", AppendToLog(message, is_durable=True))
+        self._emit(**event)
 
 
 def execute(command: ServiceCommand, flight: CommandTarget) -> Answer:

@@ -11,6 +11,7 @@ from typing import Final, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from daemon.onboard.service.messages import ServiceCommand
+from processing.rig.problem_sentences import findings_of, sentences
 
 Role = Literal["observer", "operator", "administrator"]
 ROLES: Final[tuple[Role, ...]] = ("observer", "operator", "administrator")
@@ -73,6 +74,5 @@ def violation(command: ServiceCommand) -> str | None:
     try:
         CommandBody.model_validate(dict(command.arguments), strict=True)
     except ValidationError as error:
-        found = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
-        return f"arguments of {command.name}: {found[:500]}"
+        return f"arguments of {command.name}: {'. '.join(sentences(findings_of(error)))[:500]}"
     return None

@@ -168,19 +168,6 @@ class FlightLine:
         remaining_s = self._rig.frame_interval_s - (now_ns - self._last_ns) / NS
         return max(0.0, min(PREDICTION_INTERVAL_S, remaining_s))
 
-    def absent(self, active: Callable[[str], bool], *, has_trigger: bool) -> list[str]:
-        """Absent devices and data, as text."""
-        configuration, flight = self._configuration, self._flight
-        absent = [f"head {h.sensor}" for h in configuration.head if not active(h.sensor)]
-        if not has_trigger:
-            absent.append("trigger")
-        if configuration.navigator and flight.track.last is None:
-            absent.append("time and position")
-        if configuration.thermometer:
-            missing = [p for p in self._rig.probes if p not in flight.temperatures]
-            absent += [f"temperature of {probe}" for probe in missing]
-        return absent
-
     def order(self, now_ns: int) -> Order:
         """An exposure that is due: ordered now."""
         nav = self._position()

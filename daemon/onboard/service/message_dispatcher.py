@@ -1,20 +1,37 @@
-"""Base class of the parts of the service that handle messages."""
+"""The table of the service's messages: each type has one handler."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar
+from typing import Any, TypeAlias
+
+Handlers: TypeAlias = Mapping[type, Callable[[Any], None]]
 
 
 class MessageDispatcher:
-    """Dispatches messages of the service's processes to handlers by type."""
+    """Passes each message of the service's processes to the handler of its type."""
 
-    handlers: ClassVar[Mapping[type, Callable[[Any, Any], None]]]
+    def __init__(self) -> None:
+        self._handlers: dict[type, Callable[[Any], None]] = {}
 
-    def dispatch(self, message: object) -> bool:
-        """Handle a message; False if this dispatcher has no handler for it."""
-        handler = self.handlers.get(type(message))
+    def add(self, handlers: Handlers) -> None:
+        """Add handlers of further types.
+
+        Raises:
+            ValueError: a type has a handler already.
+        """
+        if twice := handlers.keys() & self._handlers.keys():
+            names = ", ".join(sorted(kind.__name__ for kind in twice))
+            raise ValueError(f"messages with two handlers: {names}")
+        self._handlers |= handlers
+
+    def dispatch(self, message: object) -> None:
+        """Handle a message.
+
+        Raises:
+            TypeError: its type has no handler.
+        """
+        handler = self._handlers.get(type(message))
         if handler is None:
-            return False
-        handler(self, message)
-        return True
+            raise TypeError(f"a process sent {type(message).__name__}, which has no handler")
+        handler(message)

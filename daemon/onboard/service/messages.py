@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from daemon.configuration.model import PlanSection, ProcessingSection
 from daemon.mission.exposure import CaptureRecord, Exposure, FrameRecord
@@ -17,6 +17,13 @@ from daemon.mission.log.log_records import Message
 from daemon.mission.store.disk_identity import Disk
 from drivers.contract import TriggerPulse
 from processing.radiometry.exposure_control import ExposureSettings
+
+
+class EmitEvent(Protocol):
+    """Emits an event: its kind and its content."""
+
+    def __call__(self, event: str, **content: Any) -> None: ...
+
 
 # To any child
 
@@ -326,8 +333,8 @@ class UseMission:
 class Process:
     """Process this exposure; `slots` by head, or None to read Level-0.
 
-    While it is not sealed, its verdict may be sent, but no product is written; `RecordFinalized`
-    follows.
+    While it is not sealed, its verdict may be sent, but no product is published;
+    `RecordFinalized` follows.
     """
 
     exposure: Exposure
@@ -337,10 +344,13 @@ class Process:
 
 @dataclass(frozen=True)
 class RecordFinalized:
-    """Final record of an exposure that was begun unsealed; None if there is none."""
+    """The record of an exposure that was begun unsealed is final.
+
+    Its products are published if the record is confirmed, and dropped if it is another one or none.
+    """
 
     number: int
-    exposure: Exposure | None
+    is_confirmed: bool
 
 
 # From the worker
@@ -368,6 +378,16 @@ class WorkerReady:
 @dataclass(frozen=True)
 class FramesRead:
     """The frames of this exposure are no longer needed in memory; it is still being processed."""
+
+    number: int
+
+
+@dataclass(frozen=True)
+class ProductsStaged:
+    """The products of an unsealed exposure wait on disk for `RecordFinalized`.
+
+    The processor is free.
+    """
 
     number: int
 

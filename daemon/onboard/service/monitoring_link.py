@@ -55,8 +55,8 @@ class MonitoringLink:
                 self.emit(event)
 
     def emit(self, event: Mapping[str, Any]) -> None:
-        """Send an event. Persistent events (mission, devices, exposure settings) are sent again to
-        a restarted process."""
+        """Send an event. Persistent events (mission, devices, counters, exposure settings) are sent
+        again to a restarted process."""
         key = _persistent_key(event)
         if key is not None:
             self._persistent[key] = event
@@ -94,7 +94,7 @@ _STATES = DELIVERING | UNAVAILABLE | {SEARCHING, FIXED}
 def _persistent_key(event: Mapping[str, Any]) -> str | None:
     """Key of a persistent event, None for others; a later event of the same key replaces it."""
     kind = event.get("event")
-    if kind in ("mission", "exposure-settings"):
+    if kind in ("mission", "exposure-settings", "counters"):
         return str(kind)
     if kind == "bound" or (kind == "device" and event.get("name") in _STATES):
         return f"{kind} {event.get('device')}"

@@ -13,6 +13,7 @@ from typing import Any, Final
 
 import msgpack
 
+from daemon.errors import DaemonError
 from daemon.onboard.service.messages import (
     Answer,
     CommandRefused,
@@ -37,7 +38,7 @@ PAGE_DEVICES: Final = frozenset(
 """What the page's process may report as absent."""
 
 
-class InvalidMessageError(ValueError):
+class InvalidMessageError(DaemonError, ValueError):
     """Bytes that are not a message; the error states the problem without quoting them."""
 
 

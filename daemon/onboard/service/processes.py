@@ -18,6 +18,8 @@ from multiprocessing.connection import Connection
 from multiprocessing.reduction import ForkingPickler
 from typing import Any, ClassVar
 
+from daemon.errors import DaemonError
+
 PR_SET_PDEATHSIG = 1  # linux/prctl.h
 TRY_SEND_MAX_BYTES = 100_000
 """A local socket counts as writable while three quarters of its buffer (208 kB) are free."""
@@ -25,7 +27,7 @@ TRY_SEND_MAX_BYTES = 100_000
 _SPAWN = multiprocessing.get_context("spawn")
 
 
-class ServiceDisconnectedError(Exception):
+class ServiceDisconnectedError(DaemonError):
     """The other end of a child's connection is closed."""
 
 

@@ -1,9 +1,8 @@
-"""The service: one asyncio loop that receives from every process and checks the deadlines.
+"""The service: one asyncio loop that receives from every process and waits for the time-outs.
 
-It contains no logic of matching (`daemon.onboard.flight.flight`), when to expose
-(`daemon.onboard.service.flight_line`), what goes to disk
-(`daemon.onboard.storage.storage_coordinator`) or pixels (`daemon.onboard.pipeline.worker`), and
-imports none of what those need.
+It starts and ends the processes and carries out commands. When to expose is in
+`daemon.onboard.service.flight_line`, what becomes of an exposure in
+`daemon.onboard.service.exposure_sequence`. It imports nothing that handles pixels.
 """
 
 from __future__ import annotations
@@ -15,17 +14,17 @@ import traceback
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 from daemon.configuration.model import Configuration
 from daemon.mission.layout import Mission
-from daemon.mission.log.log_records import LoggedTrigger, Message, message_of
 from daemon.mission.verification import recovery
+from daemon.onboard.capture.device_states import DeviceStates
 from daemon.onboard.capture.devices import bound_problem
 from daemon.onboard.capture.exposure_controller import ExposureController
 from daemon.onboard.flight.arming import FILE as OVERRIDES
 from daemon.onboard.flight.arming import MissingPrerequisite, override_message, overrides_content
-from daemon.onboard.flight.decisions import Decision, tick
+from daemon.onboard.flight.decisions import Decision
 from daemon.onboard.flight.fault_latches import FILE as UNHANDLED
 from daemon.onboard.flight.fault_latches import (
     FaultLatches,
@@ -35,64 +34,46 @@ from daemon.onboard.flight.fault_latches import (
     unhandled_content,
 )
 from daemon.onboard.flight.flight import Flight
+from daemon.onboard.flight.flight_identity import identity
 from daemon.onboard.flight.ledger import Ledger
 from daemon.onboard.flight.recovery_match import seal_from_log
 from daemon.onboard.pipeline.pipeline_queue import PipelineQueue
 from daemon.onboard.preflight.preflight import IMMEDIATE_START, Preflight
 from daemon.onboard.preflight.preparation import Preparation
-from daemon.onboard.service.command_execution import (
-    audit_message,
-    command_event,
-    execute,
-    invalid_event,
-    invalid_message,
-    refusal_event,
-    refusal_message,
-    refused_command,
-)
-from daemon.onboard.service.command_rules import violation
+from daemon.onboard.service.command_execution import CommandHandlers
+from daemon.onboard.service.exposure_sequence import ExposureSequence
 from daemon.onboard.service.flight_line import FlightLine, Order
 from daemon.onboard.service.message_dispatcher import MessageDispatcher
 from daemon.onboard.service.messages import (
-    Answer,
     AppendToLog,
     BeginProcessing,
     Bound,
-    CommandRefused,
-    Fire,
-    InvalidMessages,
-    Pong,
-    ServiceCommand,
     ServiceEvent,
     UseMission,
 )
 from daemon.onboard.service.monitoring_link import NAME as WATCH
 from daemon.onboard.service.monitoring_link import MonitoringLink, status_event
 from daemon.onboard.service.notify import Notifier
-from daemon.onboard.service.record_ingest import RecordIngest
 from daemon.onboard.service.startup import (
     capture_process,
     frame_rings,
-    identity,
     watch_process,
     worker_process,
     writer_process,
 )
 from daemon.onboard.service.supervisor import Supervisor
 from daemon.onboard.storage.mirror import Mirror
-from daemon.onboard.storage.storage_coordinator import StorageCoordinator
-from drivers.contract import Record
 from processing.rig import Rig
 
-TICK_S = 0.05
 PING_S = 1.0
+WAIT_MIN_S = 0.001
 LANDING_TIMEOUT_S = 20.0
 NO_TIMEOUT_S = 1e9
 
 Events = Callable[[Mapping[str, Any]], None]
 
 
-class Service(MessageDispatcher):
+class Service:
     """One run of the onboard service over one mission.
 
     Args:
@@ -116,14 +97,15 @@ class Service(MessageDispatcher):
         self.monitoring = MonitoringLink(self.supervisor, watch_process(configuration))
         self.is_ready = False
         self.is_power_failing = False
-        self.deadline_advance_ns = 0
         self.failure: str | None = None
         self.stopping = asyncio.Event()
         self.changed = asyncio.Event()
         self.continues = False
         self.mission_lock = ExitStack()
         self.preparation = Preparation(configuration, rig, config_path, self._event, self._fail)
-        self.dispatchers: tuple[MessageDispatcher, ...] = (self, self.preparation)
+        self.dispatcher = MessageDispatcher()
+        self.dispatcher.add(self.preparation.handlers)
+        self.dispatcher.add({ServiceEvent: lambda message: self._event(**message.event)})
 
     async def run(self) -> int:
         """Fly until a stop is requested, or until the planned exposures are done.
@@ -134,9 +116,8 @@ class Service(MessageDispatcher):
         """
         loop = asyncio.get_running_loop()
         loop.set_exception_handler(lambda _, context: self._on_internal_error(context))
-        for name in (signal.SIGTERM, signal.SIGINT):
+        for name in (signal.SIGTERM, signal.SIGINT, signal.SIGPWR):
             loop.add_signal_handler(name, self.stopping.set)
-        loop.add_signal_handler(signal.SIGPWR, self._power_fails)
         mission = await self._prepare()
         if mission is None:
             await self.supervisor.end(("worker",))
@@ -144,8 +125,9 @@ class Service(MessageDispatcher):
         with self.mission_lock:
             self.mission_lock.enter_context(mission.held())
             self._start(mission)
+            loop.add_signal_handler(signal.SIGPWR, self._power_fails)
             tasks = [
-                loop.create_task(self._run_deadlines()),
+                loop.create_task(self._run_sequence()),
                 loop.create_task(self._monitor_processes()),
                 loop.create_task(self._fly()),
             ]
@@ -208,7 +190,6 @@ class Service(MessageDispatcher):
             Ledger.resume(report.finalized, heads=heads, sheet=report.ledger_sheet),
             report.next_number,
         )
-        self.ingest = RecordIngest(self.flight, self._log, self._event, self._on_decision)
         flown = len(report.finalized)
         self.line = FlightLine(
             self.configuration, self.rig, self.flight, mission.path, flown,
@@ -217,36 +198,27 @@ class Service(MessageDispatcher):
         self.exposure = ExposureController(
             self.configuration, self.rig, self.flight, send, self._event
         )
-        parallel_exposures = self.configuration.processing.parallel_exposures
-        self.pipeline = PipelineQueue(
-            parallel_exposures,
-            send,
-            self._event,
-            self._on_decision,
-            self.exposure.update_from_histograms,
+        self.pipeline = PipelineQueue(self.configuration.processing.parallel_exposures)
+        self.sequence = ExposureSequence(
+            self.flight, self.pipeline, send, self._event, self.exposure.update_from_histograms
         )
-        self.storage = StorageCoordinator(
-            self.flight, self.pipeline, send, self._event, self._on_decision
-        )
+        self.devices = DeviceStates(self.flight, self.sequence.log, self._event, self._on_bound)
         self.preflight = Preflight(
-            self.configuration, self.rig, self.flight, self.line, self.ingest, self.pipeline
+            self.configuration, self.rig, self.flight, self.line, self.devices, self.pipeline
         )
         self.preflight.on_override = self._record_override
         self._emit_previous_faults(mission)
-        self.dispatchers += (self.ingest, self.storage, self.pipeline, self.mirror)
+        commands = CommandHandlers(self, self.monitoring.answer, send, self._event)
+        for part in (self.devices, self.sequence, self.mirror, commands):
+            self.dispatcher.add(part.handlers)
         if self.mirror.is_on:
             self.mission_lock.close()  # the writer holds each copy, and never waits here for a disk
         self.supervisor.spawn(*writer_process(mission, self.rings, self.mirror.plan))
         send("worker", BeginProcessing(mission.path))
         self.supervisor.spawn(*capture_process(self.configuration, self.rig, self.rings))
-        self._on_decision(
-            Decision(
-                "begin",
-                time.monotonic_ns(),
-                report.next_number,
-                {"software": self.flight.identity.software, "resumed": self.is_resumed},
-            )
-        )
+        identified = {"software": self.flight.identity.software, "resumed": self.is_resumed}
+        begin = Decision("begin", time.monotonic_ns(), report.next_number, identified)
+        send("writer", AppendToLog(begin.message()))
 
     def _use_mission(self, mission: Mission) -> None:
         """Use this folder for products and monitoring: its disk is the leading one."""
@@ -258,8 +230,7 @@ class Service(MessageDispatcher):
     # Messages of the processes
 
     def _dispatch(self, message: object) -> None:
-        if not any(dispatcher.dispatch(message) for dispatcher in self.dispatchers):
-            raise TypeError(f"a process sent {type(message).__name__}, which has no handler")
+        self.dispatcher.dispatch(message)
         self.changed.set()
 
     def _emit_previous_faults(self, mission: Mission) -> None:
@@ -293,72 +264,20 @@ class Service(MessageDispatcher):
             )
 
     def _on_bound(self, bound: Bound) -> None:
-        self.ingest.dispatch(bound)
         problem = bound_problem(self.rig, bound.kind, bound.name, bound.found)
         if problem is not None:
             self._fail(problem)
 
-    def _on_service_event(self, message: ServiceEvent) -> None:
-        """Events of the watch process and the writer."""
-        self._event(**message.event)
-
-    def _on_command(self, command: ServiceCommand) -> None:
-        problem = violation(command)
-        if problem is not None:
-            # The page's process rejects these commands: it may be compromised.
-            self.monitoring.answer(Answer(command.number, False, problem))
-            self._on_command_refused(refused_command(command, problem))
-            return
-        answer = execute(command, self)
-        self.monitoring.answer(answer)
-        self._audit(audit_message(command, answer), command_event(command, answer))
-
-    def _on_invalid_messages(self, invalid: InvalidMessages) -> None:
-        self._audit(invalid_message(invalid), invalid_event(invalid))
-
-    def _on_command_refused(self, refused: CommandRefused) -> None:
-        self._audit(refusal_message(refused), refusal_event(refused))
-
-    def _audit(self, message: Message, event: Mapping[str, Any]) -> None:
-        self.supervisor.send("writer", AppendToLog(message, is_durable=True))
-        self._event(**event)
-
-    def _on_pong(self, pong: Pong) -> None:
-        if pong.statistics:
-            self.statistics = pong.statistics
-
-    handlers: ClassVar = {
-        Bound: _on_bound,
-        Pong: _on_pong,
-        ServiceEvent: _on_service_event,
-        ServiceCommand: _on_command,
-        CommandRefused: _on_command_refused,
-        InvalidMessages: _on_invalid_messages,
-    }
-
     # In flight
 
-    async def _run_deadlines(self) -> None:
+    async def _run_sequence(self) -> None:
+        """Carry out what is due after every message, and when a time-out expires."""
         while True:
-            now_ns = time.monotonic_ns() + self.deadline_advance_ns
-            due = tick(self.flight, now_ns, may_seal=self.storage.may_seal(now_ns))
-            if (detail := due.detail) is not None:
-                self._on_decision(Decision("tick", now_ns, detail=detail))
-            for waiting in due.to_store:
-                self.storage.store(waiting)
-            for number, cause in due.given_up:
-                self._event("lost", number=number, cause=cause)
-            for head, slot in self.flight.idle_slots:
-                self.pipeline.recycle({head: slot})
-            self.flight.idle_slots.clear()
+            next_ns = self.sequence.advance()
             if self.exposure.apply():
                 self.line.set_exposure_times(self.exposure.times_ns)
-            self.ingest.emit_time_events(now_ns - self.deadline_advance_ns)
-            if due.provisional is not None:
-                self.pipeline.provisional(due.provisional)
-            if due.to_seal is not None:
-                self.storage.seal(due.to_seal)
-            await asyncio.sleep(TICK_S)
+            wait_s = PING_S if next_ns is None else (next_ns - time.monotonic_ns()) * 1e-9
+            await self._wait(min(max(wait_s, WAIT_MIN_S), PING_S))
 
     async def _monitor_processes(self) -> None:
         while True:
@@ -377,6 +296,8 @@ class Service(MessageDispatcher):
                 self._event("disk", fault=True, sentence=warning)
             self.monitoring.emit(status := self._status())
             self.latches.apply(status)
+            if (counters := self.devices.changed_counters()) is not None:
+                self.monitoring.emit(counters)
             await self._save_unhandled()
             await asyncio.sleep(PING_S)
 
@@ -402,9 +323,7 @@ class Service(MessageDispatcher):
 
     def absent(self) -> list[str]:
         """Absent devices and data, as text."""
-        return self.line.absent(
-            self.ingest.active.__contains__, has_trigger=self.ingest.has_trigger
-        )
+        return self.preflight.absent()
 
     def acknowledge(self, fault: str) -> bool:
         """Acknowledge a fault."""
@@ -453,12 +372,9 @@ class Service(MessageDispatcher):
                 await self.mirror.save(UNHANDLED, unhandled_content(unhandled))
 
     def _fire(self, order: Order) -> None:
-        self.ingest.orders[order.number] = order
-        order_details = self.flight.order_details(order.number)
-        self._on_decision(Decision("order", order.mono_ns, order.number, order_details))
-        self.supervisor.send("capture", Fire(order.number, order.delays_ns))
-        self.exposure.ordered(order.number, order_details["line_id"])
-        self._event("triggered", number=order.number)
+        self.sequence.fire(order)
+        self.exposure.ordered(order.number, self.flight.order_details(order.number)["line_id"])
+        self.changed.set()
 
     def _disk_full(self, sentence: str) -> None:
         self._event("disk", fault=True, sentence=sentence)
@@ -470,12 +386,16 @@ class Service(MessageDispatcher):
             remaining_s = deadline - time.monotonic()
             if remaining_s <= 0:
                 return False
-            self.changed.clear()
-            # `wait_for` of Python 3.11 loses a cancellation that comes with the event.
-            with suppress(TimeoutError):
-                async with asyncio.timeout(min(remaining_s, PING_S)):
-                    await self.changed.wait()
+            await self._wait(min(remaining_s, PING_S))
         return True
+
+    async def _wait(self, limit_s: float) -> None:
+        """Wait for a message, or until the time-out."""
+        self.changed.clear()
+        # `wait_for` of Python 3.11 loses a cancellation that comes with the event.
+        with suppress(TimeoutError):
+            async with asyncio.timeout(limit_s):
+                await self.changed.wait()
 
     # After the flight
 
@@ -483,7 +403,7 @@ class Service(MessageDispatcher):
         tasks[-1].cancel()  # no more exposures
         if self.is_power_failing:
             limit_s = self.configuration.limits.power_fail_s
-            await self._until(lambda: not self._has_unsealed(), limit_s)
+            await self._until(lambda: not self.flight.open_numbers, limit_s)
         elif self.failure is None:
             await self._until(lambda: not self._is_unfinished(), LANDING_TIMEOUT_S)
         for task in tasks:
@@ -499,24 +419,20 @@ class Service(MessageDispatcher):
         """
         limits = self.configuration.limits
         self.is_power_failing = True
-        asyncio.get_running_loop().call_later(limits.power_fail_s / 2, self._advance_deadlines)
+        loop = asyncio.get_running_loop()
+        loop.call_later(limits.power_fail_s / 2, self._expire_timeouts)
         sentence = (
             f"power fails; what is open is stored and sealed within {limits.power_fail_s:g} s"
         )
         self._event("power", fault=True, sentence=sentence)
         self.stopping.set()
 
-    def _advance_deadlines(self) -> None:
-        limits = self.configuration.limits
-        self.deadline_advance_ns = round(
-            (limits.frame_timeout_s + limits.mark_timeout_s + 1.0) * 1e9
-        )
-
-    def _has_unsealed(self) -> bool:
-        return self.storage.is_sealing or bool(self.flight.open_numbers)
+    def _expire_timeouts(self) -> None:
+        self.sequence.expire_timeouts()
+        self.changed.set()
 
     def _is_unfinished(self) -> bool:
-        return self._has_unsealed() or bool(self.pipeline)
+        return bool(self.flight.open_numbers) or bool(self.pipeline)
 
     def _task_ended(self, task: asyncio.Task[None]) -> None:
         error = None if task.cancelled() else task.exception()
@@ -532,12 +448,6 @@ class Service(MessageDispatcher):
         self._fail(f"the service itself failed ({message}); report this. {self.notifier.restart}")
 
     # Output
-
-    def _log(self, record: Record | LoggedTrigger) -> None:
-        self.supervisor.send("writer", AppendToLog(message_of(record)))
-
-    def _on_decision(self, decision: Decision) -> None:
-        self.supervisor.send("writer", AppendToLog(decision.message()))
 
     def _event(self, event: str, **content: Any) -> None:
         message = {"event": event, "mono_ns": str(time.monotonic_ns()), **content}

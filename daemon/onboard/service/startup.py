@@ -1,25 +1,22 @@
-"""Startup of a flight: its mission folder, its identity, and its processes.
+"""Startup of a flight: its mission folder and its processes.
 
 These functions only describe; `daemon.onboard.service.service` starts the processes.
 """
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping
 from datetime import UTC, datetime
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from daemon.configuration.model import Configuration
 from daemon.mission.layout import Mission
-from daemon.mission.mirror.mirror_startup import FoundDisks, find_disks
 from daemon.onboard.capture.devices import device_specs, frame_nbytes
 from daemon.onboard.capture.frame_ring import FrameRing
-from daemon.onboard.flight.flight import FlightIdentity
 from daemon.onboard.service.messages import WorkerSettings
-from daemon.onboard.storage.storage import MirrorPlan
+from daemon.onboard.storage.writer import MirrorPlan
+from daemon.products.processing_threads import thread_counts
 from processing.rig import Rig, shipped_rigs
 
 
@@ -30,32 +27,6 @@ class ProcessPlan(NamedTuple):
     target: str
     arguments: tuple[Any, ...]
     environment: Mapping[str, str]
-
-
-def disks_of(configuration: Configuration) -> FoundDisks | None:
-    """The disks of a mirrored configuration, and the mission being flown on them; else None.
-
-    Raises:
-        OSError, MissionError: no disk can be used.
-    """
-    mission = configuration.mission
-    if mission.mirror is None:
-        return None
-    return find_disks({"root": mission.root, "mirror": mission.mirror})
-
-
-def interrupted_mission(configuration: Configuration) -> Mission | None:
-    """The mission that was being flown when the service ended; None after an orderly end.
-
-    Raises:
-        MissionError: the marker of the mission being flown is damaged.
-        OSError: no disk of a mirrored configuration can be used.
-    """
-    found = disks_of(configuration)
-    if found is not None:
-        return found.mission
-    root = configuration.mission.root
-    return Mission.current(root) if root.is_dir() else None
 
 
 def create_mission(
@@ -75,19 +46,6 @@ def create_mission(
         service_toml=config_path.read_bytes(),
         plan=None if plan_file is None else (plan_file.suffix.lower(), plan_file.read_bytes()),
         started_utc=datetime.now(UTC),
-        simulated=configuration.mission.simulated,
-    )
-
-
-def identity(configuration: Configuration, rig: Rig, mission: Mission) -> FlightIdentity:
-    """Values that every record of this flight contains."""
-    return FlightIdentity(
-        boot_id=Path("/proc/sys/kernel/random/boot_id").read_text().strip(),
-        line_id=configuration.plan.line,
-        calibration_id=rig.calibration_id,
-        calibration_sha256=_sha256(mission.rig_path),
-        configuration_sha256=_sha256(mission.service_path),
-        software=f"syntopic {version('syntopic')}",
         simulated=configuration.mission.simulated,
     )
 
@@ -150,17 +108,3 @@ def watch_process(configuration: Configuration) -> ProcessPlan | None:
         (configuration.watch, configuration.plan),
         one,
     )
-
-
-def thread_counts(threads: int) -> dict[str, str]:
-    """Environment variables of a process that limit its threads.
-
-    Compiled kernels use several cores, small matrices one; waiting threads do not spin.
-    """
-    names = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS")
-    fixed = {"OPENBLAS_NUM_THREADS": "1", "OMP_WAIT_POLICY": "passive"}
-    return dict.fromkeys(names, str(threads)) | fixed
-
-
-def _sha256(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 from daemon.configuration.model import Configuration
 from daemon.mission.exposure import CaptureRecord, Exposure
@@ -24,18 +24,18 @@ from daemon.mission.store.disk_space import needed_nbytes
 from daemon.mission.store.health import DiskHealth, read_health
 from daemon.mission.verification.recovery import Complete
 from daemon.onboard.preflight.prerequisites import exposure_nbytes
-from daemon.onboard.service.message_dispatcher import MessageDispatcher
+from daemon.onboard.service.message_dispatcher import Handlers
 from daemon.onboard.service.messages import (
     AcceptDisk,
     DiskChanged,
     DiskStatus,
     DropDisk,
+    EmitEvent,
     EndMission,
     ReleaseDisk,
     WriteSmallFile,
 )
-from daemon.onboard.service.record_ingest import EmitEvent
-from daemon.onboard.storage.storage import MirrorPlan
+from daemon.onboard.storage.writer import MirrorPlan
 from processing.quality.report import Flag
 from processing.rig import Rig
 
@@ -44,7 +44,7 @@ SPARE_EXPOSURES = 10
 """Space that a returning disk must have, in exposures."""
 
 
-class Mirror(MessageDispatcher):
+class Mirror:
     """Follows the disks of a mission.
 
     Args:
@@ -267,7 +267,10 @@ class Mirror(MessageDispatcher):
     def _on_status(self, status: DiskStatus) -> None:
         self._status = status.disks
 
-    handlers: ClassVar = {DiskChanged: _on_changed, DiskStatus: _on_status}
+    @property
+    def handlers(self) -> Handlers:
+        """The messages about disks."""
+        return {DiskChanged: self._on_changed, DiskStatus: self._on_status}
 
 
 def _free_nbytes(root: Path) -> int | None:

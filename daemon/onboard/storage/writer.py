@@ -1,6 +1,7 @@
 """The writer process: Level-0 frames, records, catalog and flight log go to disk here.
 
 It answers *stored* only after the disk has the pixels, and never waits for anything but the disk.
+A mission is on one disk, or on several with the same content (`daemon.mission.mirror.mirrored`).
 """
 
 from __future__ import annotations
@@ -9,12 +10,22 @@ import os
 import time
 from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
 
 from daemon.errors import DaemonError
-from daemon.mission.exposure import Exposure
+from daemon.mission.exposure import CaptureRecord, Exposure, FrameRecord
 from daemon.mission.layout import Mission
+from daemon.mission.log.flight_log import FlightLog
+from daemon.mission.log.log_seals import close_run, seal_logs
+from daemon.mission.mirror.disk_rejoin import RejoinSettings
 from daemon.mission.mirror.mirrored import DiskEvent, MirroredStorage
+from daemon.mission.store.disk_identity import Disk
+from daemon.mission.store.store import Level0Writer
 from daemon.onboard.capture.frame_ring import FrameRing
 from daemon.onboard.service.messages import (
     AcceptDisk,
@@ -37,7 +48,6 @@ from daemon.onboard.service.messages import (
     WriteSmallFile,
 )
 from daemon.onboard.service.processes import ServiceConnection
-from daemon.onboard.storage.storage import MirrorPlan, OneDisk, Storage, mirrored
 
 CHECKS_PER_STALL = 8
 """Checks of a disk within the time after which it is dropped."""
@@ -45,6 +55,36 @@ CHECKS_PER_STALL = 8
 LOG_SYNC_INTERVAL_S = 1.0
 """The flight log is on disk at most this much later than it was handed over (and the writer's
 current frame, which may take as long as the disk does)."""
+
+
+@dataclass(frozen=True)
+class MirrorPlan:
+    """The disks of a mirrored mission, the leading one first.
+
+    `stall_s` is how long a disk may make no progress before it is dropped, `required_nbytes` what a
+    disk needs free to be taken into use.
+    """
+
+    disks: tuple[Disk, ...]
+    stall_s: float
+    required_nbytes: int = 0
+    poll_s: float = 5.0
+
+
+class Storage(Protocol):
+    """Where exposures and the flight log go."""
+
+    @property
+    def log(self) -> FlightLog: ...
+    @property
+    def unindexed(self) -> int: ...
+    def write(
+        self, capture: CaptureRecord, pixels: Mapping[str, NDArray[np.uint16]]
+    ) -> tuple[tuple[FrameRecord, ...], tuple[str, ...]]: ...
+    def seal(self, exposure: Exposure) -> str: ...
+    def note_products(self, number: int, files: Mapping[str, int], verdict: str | None) -> None: ...
+    def tick(self) -> None: ...
+    def close(self) -> None: ...
 
 
 def main(
@@ -59,7 +99,14 @@ def main(
     if mirror is None:
         _Writer(link, OneDisk(mission), memory).run(LOG_SYNC_INTERVAL_S)
         return
-    storage = mirrored(mission, mirror, lambda event: link.send(_changed(event)))
+    storage = MirroredStorage(
+        mission.id,
+        mirror.disks,
+        stall_s=mirror.stall_s,
+        rejoin=RejoinSettings(poll_s=mirror.poll_s, required_nbytes=mirror.required_nbytes),
+        emit=lambda event: link.send(_changed(event)),
+        simulated=mission.is_simulated,
+    )
     _MirroredWriter(link, storage, memory).run(mirror.stall_s / CHECKS_PER_STALL)
     if storage.is_hanging:
         os._exit(0)  # the interpreter would wait for a thread that hangs in the kernel
@@ -171,3 +218,48 @@ def _seal(storage: Storage, exposure: Exposure) -> Sealed | WriteFailed:
     except (OSError, DaemonError) as error:
         sentence = f"exposure {exposure.number} is not sealed: {error}; check the disk"
         return WriteFailed(exposure.number, sentence, is_transient=isinstance(error, OSError))
+
+
+class OneDisk:
+    """A mission on one disk, written in the calling thread."""
+
+    def __init__(self, mission: Mission) -> None:
+        self._mission = mission
+        self._chain = mission.open_chain()
+        self._writer = Level0Writer(mission, chain=self._chain)
+        self._seal_logs()  # those of earlier runs; ours is not there yet
+        self.log = FlightLog.create(mission.log_dir, simulated=mission.is_simulated)
+        with suppress(OSError):  # recovery notes it if the disk refuses
+            self._chain.log_begun(self.log.path.name)
+
+    @property
+    def unindexed(self) -> int:
+        return self._writer.unindexed
+
+    def write(
+        self, capture: CaptureRecord, pixels: Mapping[str, NDArray[np.uint16]]
+    ) -> tuple[tuple[FrameRecord, ...], tuple[str, ...]]:
+        return self._writer.write(capture, pixels), ()
+
+    def seal(self, exposure: Exposure) -> str:
+        return self._writer.seal(exposure)
+
+    def note_products(self, number: int, files: Mapping[str, int], verdict: str | None) -> None:
+        self._writer.note_products(number, files, verdict)
+
+    def tick(self) -> None:
+        """Nothing to do: a single disk is awaited without a time-out."""
+
+    def close(self) -> None:
+        self.log.close()
+        self._seal_logs()
+        if not self._writer.unindexed:
+            with suppress(OSError):  # `syntopic repair` closes it if the disk refuses
+                close_run(self._mission, self._chain, "landing")
+        self._writer.close()
+        self._chain.close()
+
+    def _seal_logs(self) -> None:
+        # A disk that refuses costs only that a later damage is not seen; the next start seals them.
+        with suppress(OSError):
+            seal_logs(self._mission, self._chain)

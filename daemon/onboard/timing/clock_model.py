@@ -4,7 +4,8 @@ The clock that is read is an oscillator whose rate wanders. The amount of wander
 the stated sigmas, are estimated from the pairs. The model is independent of the source of the
 pairs.
 
-Source: docs/mathematics/time.md#clock-model; Rasmussen and Williams (2006), section 2.7.
+Source: docs/explanation/mathematics/time.md#clock-model; Rasmussen and Williams (2006), section
+2.7.
 """
 
 from __future__ import annotations

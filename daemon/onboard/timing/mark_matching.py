@@ -4,7 +4,7 @@ A mark is given to a pulse only where its time fits that pulse and no other, and
 count nor its arrival speaks for another. An ambiguous mark stays pending, and is evaluated again
 whenever something new is known; what belongs nowhere in the end is spurious.
 
-Source: docs/mathematics/time.md#which-mark-belongs-to-which-pulse.
+Source: docs/explanation/mathematics/time.md#which-mark-belongs-to-which-pulse.
 """
 
 from __future__ import annotations
@@ -154,6 +154,11 @@ class MarkMatcher:
     def is_corroborated(self, number: int) -> bool:
         """Whether more than its own mark speaks for a pulse's mark."""
         return number in self._corroborated
+
+    @property
+    def oldest_pending_ns(self) -> int | None:
+        """Arrival of the oldest mark that has no pulse; None without one."""
+        return min((pending.mark.mono_ns for pending in self._pending), default=None)
 
     def has_ambiguous(self, number: int) -> bool:
         """Whether a held mark may be this pulse's, among others."""

@@ -14,17 +14,14 @@ from pathlib import Path
 from daemon.errors import DaemonError
 from daemon.mission.foreign_files import ForeignFileError, read_regular_file
 from daemon.mission.store.durable import new_file
+from processing.rig.problem_sentences import ProblemList
 
 _MAX_BYTES = 2_000_000_000
 _MAX_PROBLEMS = 30
 
 
-class ProjectError(DaemonError, ValueError):
+class ProjectError(ProblemList, DaemonError, ValueError):
     """A project that cannot be read; `problems` holds one message for each mistake found."""
-
-    def __init__(self, problems: Sequence[str]) -> None:
-        self.problems = tuple(problems)
-        super().__init__("\n".join(problems))
 
 
 @dataclass

@@ -9,10 +9,10 @@ from typing import Any
 import jinja2
 import numpy as np
 
+from daemon.postflight.adjustment.adjustment_plots import ResidualPanel, block_svg, pattern_svg
 from daemon.postflight.adjustment.project import CheckPoints
 from daemon.terminal.console import visible_value
 from processing.bundle.adjust import Adjustment
-from processing.bundle.adjustment_plots import ResidualPanel, block_svg, pattern_svg
 from processing.bundle.adjustment_results import (
     check_point_differences,
     control_residuals,

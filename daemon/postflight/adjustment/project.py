@@ -1,7 +1,7 @@
 """Reading an adjustment project: `project.toml` and its tables become a network.
 
-The format is described in docs/formats.md. Coordinates without a value are NaN in the network and
-found by `processing.bundle.initial_values`.
+The format is described in docs/reference/formats.md. Coordinates without a value are NaN in the
+network and found by `processing.bundle.initial_values`.
 """
 
 from __future__ import annotations
@@ -375,9 +375,7 @@ def _head(section: AdjustmentHeadSection) -> HeadMounting:
 
 
 def _rotation(angles_deg: Array) -> Array:
-    if not np.isfinite(angles_deg).all():
-        return np.full((3, 3), np.nan)
-    return rotation_matrix(*(math.radians(float(a)) for a in angles_deg))
+    return rotation_matrix(*np.radians(angles_deg))
 
 
 def _optional(

@@ -1,15 +1,16 @@
-"""Schema of project.toml of an adjustment; docs/formats.md describes it."""
+"""Schema of project.toml of an adjustment; docs/reference/formats.md describes it."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from daemon.mission.foreign_files import ForeignFileError, read_regular_file
 from daemon.postflight.adjustment.csv_tables import ProjectError
 from processing.bundle.self_calibration import SetName
+from processing.rig.problem_sentences import findings_of, line_finder, sentences
 from processing.rig.toml_text import TomlError, parse_toml
 
 PROJECT_FILE_MAX_BYTES = 4_000_000
@@ -32,13 +33,6 @@ class AdjustSection(_ProjectSection):
     earth_radius_m: float | None = Field(default=None, gt=1e6)
     refraction: bool = False
     ground_m: float = 0.0
-
-    @model_validator(mode="before")
-    @classmethod
-    def _refuse_old_key(cls, content: Any) -> Any:
-        if isinstance(content, dict) and "most_iterations" in content:
-            raise ValueError("most_iterations is now named max_iterations; rename it")
-        return content
 
 
 class FilesSection(_ProjectSection):
@@ -124,7 +118,8 @@ def read_project_file(path: Path) -> ProjectFile:
         ProjectError: with a sentence per mistake.
     """
     try:
-        content = parse_toml(read_regular_file(path, PROJECT_FILE_MAX_BYTES))
+        data = read_regular_file(path, PROJECT_FILE_MAX_BYTES)
+        content = parse_toml(data)
     except ForeignFileError as error:
         raise ProjectError([f"{error}; give the path of a project.toml"]) from error
     except TomlError as error:
@@ -132,10 +127,5 @@ def read_project_file(path: Path) -> ProjectFile:
     try:
         return ProjectFile.model_validate(content)
     except ValidationError as error:
-        raise ProjectError(
-            [
-                f"{path.name}: {'.'.join(str(part) for part in detail['loc'])}: "
-                f"{detail['msg'].removeprefix('Value error, ')}"
-                for detail in error.errors()
-            ]
-        ) from error
+        findings = findings_of(error, {"adjust.most_iterations": "max_iterations"})
+        raise ProjectError(sentences(findings, path.name, line_finder(data))) from error

@@ -20,8 +20,8 @@ from daemon.postflight.adjustment.project_file import ProjectFile
 from processing.bundle.adjust import Adjustment
 from processing.bundle.adjustment_results import exposures_of, image_residuals_mm
 from processing.bundle.network import INTERIOR, Network
-from processing.bundle.rotations import omega_phi_kappa
 from processing.bundle.unknowns import ParameterValues, initial_values
+from processing.geometry.rotation import omega_phi_kappa
 
 Array = NDArray[np.float64]
 

@@ -20,9 +20,9 @@ from daemon.errors import DaemonError
 from daemon.mission.exposure import Exposure
 from daemon.mission.layout import Mission
 from daemon.orientation.exterior_orientation import sealed_exposures
+from daemon.orientation.geodesy import metres_per_degree
 from daemon.orientation.georeference import Georeference
 from daemon.orientation.local_frame import FRAME_FILE, LocalFrame
-from daemon.orientation.navigation import metres_per_degree
 from daemon.orientation.orientation_inputs import trajectory_of
 from daemon.orientation.trajectory import Trajectory
 from daemon.postflight.adjustment.csv_tables import read_table
@@ -35,10 +35,9 @@ from daemon.postflight.calibration.calibration_report import (
     ReportTable,
     changes_between,
 )
-from daemon.postflight.calibration.plots import Curve, chart_svg
+from daemon.postflight.plots import Curve, chart_svg
 from processing.bundle.adjust import Adjustment
 from processing.bundle.network import Network, no_gnss, no_measured_attitudes
-from processing.bundle.rotations import vectors_from_rotations
 from processing.calibration.boresight import (
     PARAMETERS,
     BoresightCalibration,
@@ -48,9 +47,9 @@ from processing.calibration.boresight import (
     angle_covariance,
     calibrate_boresight,
     mounting_of,
-    roll_pitch_heading,
 )
-from processing.geometry.orientation import ENU_FROM_NED, grid_from_enu, level_from_body
+from processing.geometry.orientation import ENU_FROM_NED, grid_from_enu
+from processing.geometry.rotation import level_from_body, roll_pitch_heading, vectors_from_rotations
 
 Array = NDArray[np.float64]
 
@@ -428,5 +427,5 @@ def _at_mark(
         )
         / span_s
     )
-    rate = vectors_from_rotations((level[0].T @ level[2])[None])[0] / span_s
+    rate = vectors_from_rotations(level[0].T @ level[2]) / span_s
     return position, grid @ velocity, grid @ ENU_FROM_NED @ level[1], rate

@@ -25,9 +25,9 @@ from daemon.postflight.calibration.calibration_report import (
     changes_between,
     serial_warnings,
 )
-from daemon.postflight.calibration.plots import Curve, chart_svg
 from daemon.postflight.calibration.rig_writer import rig_toml
 from daemon.postflight.calibration.thermal_calibration import stitching_of
+from daemon.postflight.plots import Curve, chart_svg
 from processing.calibration.platform import (
     MIN_EXPOSURES,
     CalibratedConeMounting,

@@ -23,13 +23,13 @@ from daemon.postflight.calibration.calibration_report import (
     changes_between,
     serial_warnings,
 )
-from daemon.postflight.calibration.plots import Curve, chart_svg
 from daemon.postflight.calibration.rig_writer import rig_toml
+from daemon.postflight.plots import Curve, chart_svg
 from processing.bundle.adjust import Adjustment
 from processing.bundle.adjustment_results import parameters_of
 from processing.bundle.network import INTERIOR
 from processing.calibration.relative_orientation import RelativeOrientations
-from processing.geometry.orientation import omega_phi_kappa
+from processing.geometry.rotation import omega_phi_kappa
 from processing.rig import Rig
 
 GRAD = 200.0 / math.pi
@@ -69,10 +69,12 @@ def calibrated_rig(
     calibrated = []
     for cone in rig.cones:
         if cone.name in heads:
-            angles = omega_phi_kappa(heads[cone.name].rotation)
+            omega, phi, kappa = omega_phi_kappa(heads[cone.name].rotation).tolist()
             sigma = found.sigma_rad([h.head for h in found.heads].index(cone.name))
             spread = math.sqrt(float(np.mean(sigma**2))) * 1e6
-            cone = replace(cone, rotation_rad=angles, rotation_sigma_urad=round(spread, 3))
+            cone = replace(
+                cone, rotation_rad=(omega, phi, kappa), rotation_sigma_urad=round(spread, 3)
+            )
         if cone.name in cameras:
             camera = result.network.cameras[cameras[cone.name]]
             if camera.model != "australis" or camera.terms or len(cone.sensors) != 1:

@@ -21,10 +21,9 @@ from daemon.mission.exposure import Exposure
 from daemon.mission.exposure_batch import ExposureFailure, for_each_exposure
 from daemon.mission.layout import Mission
 from daemon.mission.log.flight_log import logs_of, read
-from daemon.mission.log.log_records import record_of
+from daemon.mission.log.log_records import AUDIT_TOPIC, record_of
 from daemon.mission.store import durable
 from daemon.mission.store.level2 import read_report
-from daemon.onboard.service.command_execution import AUDIT_TOPIC
 from daemon.orientation.exterior_orientation import sealed_exposure
 from drivers.contract import DeviceEvent, NavSample
 from drivers.timescales.leap_seconds import leap_seconds_at

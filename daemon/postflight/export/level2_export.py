@@ -29,6 +29,7 @@ from daemon.orientation.orientation_inputs import read_orientation_inputs
 from daemon.postflight.export.exif import PictureMetadata, metadata_texts, with_metadata
 from drivers.base.extras import require
 from processing.geometry.orientation import BODY_FROM_CAMERA, ENU_FROM_NED, on_level_ground
+from processing.geometry.rotation import roll_pitch_heading
 from processing.rig import Rig
 
 KINDS = ("cog", "jpeg")
@@ -153,9 +154,8 @@ def _pictures(
 def _shot(rig: Rig, picture: Level2Image, crs: str, *, simulated: bool) -> PictureMetadata:
     eo = picture.eo
     body = ENU_FROM_NED.T @ eo.enu_from_camera @ BODY_FROM_CAMERA.T
-    yaw = math.degrees(math.atan2(body[1, 0], body[0, 0])) % 360.0
-    pitch = math.degrees(math.asin(max(-1.0, min(1.0, -float(body[2, 0])))))
-    roll = math.degrees(math.atan2(body[2, 1], body[2, 2]))
+    roll, pitch, yaw = (math.degrees(angle) for angle in roll_pitch_heading(body))
+    yaw %= 360.0
     east, north, height = (float(v) for v in eo.centre_m)
     return PictureMetadata(
         camera=rig.title or rig.name,

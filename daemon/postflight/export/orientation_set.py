@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from daemon.configuration.model import MountSection
 from daemon.errors import DaemonError
@@ -43,6 +42,7 @@ from daemon.orientation.orientation_files import (
 from daemon.orientation.orientation_inputs import OrientationError, read_orientation_inputs
 from daemon.orientation.terrain_footprints import rings_on_terrain
 from daemon.orientation.trajectory import flown_trajectory
+from processing.geometry.rotation import vectors_from_rotations
 from processing.rig import Rig
 
 
@@ -223,12 +223,5 @@ def _change(
     if not both:
         return None, None
     moved = [float(np.linalg.norm(b.centre_m - a.centre_m)) for a, b in both]
-    angles_deg = [_angle_deg(a.rotation.T @ b.rotation) for a, b in both]
-    return max(moved), max(angles_deg)
-
-
-def _angle_deg(rotation: NDArray[np.float64]) -> float:
-    # From the skew part: the trace is insensitive to small angles.
-    skew = rotation - rotation.T
-    sine = float(np.linalg.norm([skew[2, 1], skew[0, 2], skew[1, 0]])) / 2
-    return float(np.degrees(np.arctan2(sine, (np.trace(rotation) - 1) / 2)))
+    turned = vectors_from_rotations(np.array([a.rotation.T @ b.rotation for a, b in both]))
+    return max(moved), float(np.degrees(np.linalg.norm(turned, axis=1).max()))

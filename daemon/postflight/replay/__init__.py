@@ -1,4 +1,4 @@
 """A recorded flight through the same code again: codecs, matching, ledger, pipeline.
 
-How-to: docs/replay.md.
+How-to: docs/how-to/processing/replay.md.
 """

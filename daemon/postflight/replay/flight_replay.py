@@ -28,11 +28,11 @@ from daemon.mission.log.log_records import (
 from daemon.mission.store.level0_folder import hash_file
 from daemon.mission.verification.recovery import LEDGER_TOPIC
 from daemon.onboard.capture.devices import device_specs
-from daemon.onboard.flight.decisions import Decision, decision_of, tick
-from daemon.onboard.flight.flight import Flight, FlightIdentity
+from daemon.onboard.flight.decisions import Decision, decision_of
+from daemon.onboard.flight.flight import Flight
+from daemon.onboard.flight.flight_identity import FlightIdentity
 from daemon.onboard.flight.ledger import Ledger
 from daemon.onboard.flight.recovery_match import pulse_of
-from daemon.onboard.service.record_ingest import RecordIngest
 from daemon.postflight.replay.codecs import Decoded, codec_for, decode_all, has_first_bytes
 from drivers.contract import (
     ClockReading,
@@ -140,9 +140,7 @@ class _Run:
         self._flight = flight
         self._mission = mission
         self._out = out
-        self._ingest = RecordIngest(flight, lambda _record: None, lambda event, **_content: None)
         self._captures: dict[int, CaptureRecord] = {}
-        self._sealing: Exposure | None = None
         self.sheet: Mapping[str, Any] | None = None
         self._current_sheet: Mapping[str, Any] = {}
 
@@ -163,7 +161,7 @@ class _Run:
         if isinstance(record, LoggedTrigger):
             self._flight.fired(pulse_of(record))
         elif record is not None:
-            self._ingest.dispatch(record)
+            self._flight.take(record)
 
     def compare_ledger(self) -> None:
         """The sheet after the last seal, against the one that was logged then."""
@@ -186,17 +184,10 @@ class _Run:
     def _not_fired(self, decision: Decision) -> None:
         self._flight.not_fired(decision.number, str(decision.detail.get("sentence", "")))
 
-    def _tick(self, decision: Decision) -> None:
-        may_seal = bool(decision.detail.get("asked_to_seal"))
-        allow_provisional = decision.detail.get("foreseen") is not None
-        due = tick(
-            self._flight, decision.mono_ns, may_seal=may_seal, allow_provisional=allow_provisional
-        )
-        self._flight.resolved_marks.clear()
-        self._flight.idle_slots.clear()
-        self._captures |= {one.capture.number: one.capture for one in due.to_store}
-        self._sealing = due.to_seal or self._sealing
-        found = due.detail or {}
+    def _advance(self, decision: Decision) -> None:
+        due = self._flight.advance(decision.mono_ns)
+        self._captures |= {one.capture.number: one.capture for one in due.store}
+        found = {} if due.decision is None else due.decision.detail
         for key, what in _COMPARED.items():
             original = decision.detail.get(key)
             sentence = f"{what}: {found.get(key)} fell due where the flight had {original}"
@@ -218,32 +209,41 @@ class _Run:
         self._flight.not_stored(decision.number, str(decision.detail.get("sentence", "")))
 
     def _sealed(self, decision: Decision) -> None:
-        exposure, self._sealing = self._sealing, None
-        if exposure is None or exposure.number != decision.number:
+        if not self._is_sealing(decision):
             sentence = f"exposure {decision.number} was sealed in flight and is not in the replay"
             self._out.compare("seals", agrees=False, sentence=sentence)
             return
-        self._flight.sealed(exposure.number, exposure.state)
-        self._out.records.append(exposure)
+        self._out.records.append(self._flight.sealed(decision.number))
 
     def _not_sealed(self, decision: Decision) -> None:
-        exposure, self._sealing = self._sealing, None
-        if exposure is not None:
-            self._flight.not_sealed(exposure.number, exposure.state)
+        if self._is_sealing(decision):
+            self._flight.not_sealed(decision.number)
+
+    def _seal_refused(self, decision: Decision) -> None:
+        self._flight.seal_refused(decision.mono_ns)
+
+    def _timeouts_expired(self, _decision: Decision) -> None:
+        self._flight.expire_timeouts()
+
+    def _is_sealing(self, decision: Decision) -> bool:
+        sealing = self._flight.sealing
+        return sealing is not None and sealing.number == decision.number
 
     def _process(self, decision: Decision) -> None:
         self._out.deferred[decision.number] = bool(decision.detail.get("deferred"))
 
 
-_COMPARED = {"store": "stores", "given_up": "given up", "seal": "seals", "foreseen": "provisional"}
+_COMPARED = {"store": "stores", "lost": "lost", "seal": "seals", "provisional": "provisional"}
 _HANDLERS: Mapping[str, Callable[[_Run, Decision], None]] = {
     "order": _Run._order,
     "not-fired": _Run._not_fired,
-    "tick": _Run._tick,
+    "advance": _Run._advance,
     "stored": _Run._stored,
     "not-stored": _Run._not_stored,
     "sealed": _Run._sealed,
     "not-sealed": _Run._not_sealed,
+    "seal-refused": _Run._seal_refused,
+    "timeouts-expired": _Run._timeouts_expired,
     "process": _Run._process,
 }
 

@@ -19,21 +19,21 @@ from typing import Any
 import numpy as np
 import tifffile
 
+from daemon.configuration.model import PlanSection, ProcessingSection
 from daemon.errors import DaemonError
 from daemon.mission.canonical_json import RecordError, canonical_bytes, parse_record, sha256_hex
 from daemon.mission.exposure import Exposure, exposure_bytes
 from daemon.mission.layout import Mission
 from daemon.mission.store.level0 import refuse_decompression_bomb, tiff_errors
 from daemon.mission.store.level0_folder import EXPOSURE_FILE, load_level0
-from daemon.onboard.pipeline.pipeline_pool import PipelinePool
-from daemon.onboard.pipeline.worker import configure_threads
-from daemon.onboard.service.messages import WorkerSettings
 from daemon.orientation.exterior_orientation import mount_of
 from daemon.orientation.ground_model import ground_of
-from daemon.planning.overlaps import Overlaps
+from daemon.planning.overlaps import overlaps_of
 from daemon.postflight.replay.flight_replay import ReplayResult
-from daemon.products.exposure_conditions import conditions_of
-from daemon.products.processor import Processor, make_products, processor_for
+from daemon.products.exposure_products import FlightGeometry, make_products
+from daemon.products.pipeline_pool import PipelinePool
+from daemon.products.processing_threads import configure_threads
+from daemon.products.processor import Processor, processor_for
 from processing.quality.report import Flag
 from processing.rig import Rig
 
@@ -67,20 +67,30 @@ def compare_records(mission: Mission, out: ReplayResult) -> None:
 def compare_products(
     mission: Mission,
     rig: Rig,
-    settings: WorkerSettings,
+    processing: ProcessingSection,
+    plan: PlanSection,
     out: ReplayResult,
     *,
+    radiometry: Path | None,
     parallel: int,
     only: Sequence[int] = (),
     progress: Progress = lambda _done: None,
 ) -> None:
-    """The images of every exposure that has some, made again with so many exposures in work."""
+    """The images of every exposure that has some, made again with so many exposures in work.
+
+    Args:
+        processing, plan: as flown.
+        out: records replayed before; takes in the comparison.
+        radiometry: folder of radiometric calibrations; None takes those of the mission.
+        parallel: exposures processed at a time.
+        only: numbers of the exposures that are compared; empty takes all.
+    """
     configure_threads()
-    processor = processor_for(rig, mission, settings.processing, settings.radiometry)
+    processor = processor_for(rig, mission, processing, radiometry)
     processor.warm_up()
     mount, _ = mount_of(mission)
-    ground = ground_of(rig, mount, settings.plan)
-    overlaps = _overlaps(mission, rig, out.records)
+    geometry = FlightGeometry(mount, plan, ground_of(rig, mount, plan))
+    overlaps = overlaps_of(mission, rig, out.records)
     chosen = [
         exposure
         for exposure in out.records
@@ -90,12 +100,11 @@ def compare_products(
     def again(exposure: Exposure, free: Processor) -> dict[str, str]:
         frames, _ = load_level0(mission.level0(exposure.number), rig)
         flags = Flag.PROCESSING_BEHIND if out.deferred.get(exposure.number) else Flag(0)
-        overlap_shares = overlaps.of(exposure.number)
-        conditions = conditions_of(
-            exposure, rig, settings.plan, flags, overlap_shares, ground=ground
+        products = make_products(
+            free, geometry, exposure, frames, flags, overlaps.of(exposure.number)
         )
-        _, contents = make_products(free, mount, settings.plan, exposure, frames, conditions)
-        return {name: content_hash(name, b"".join(parts)) for name, parts in contents.items()}
+        files = products.contents.items()
+        return {name: content_hash(name, b"".join(parts)) for name, parts in files}
 
     working = PipelinePool[Processor](processor, parallel)
     results = [working.submit(partial(again, exposure)) for exposure in chosen]
@@ -152,14 +161,6 @@ def _hashes_on_disk(folder: Path) -> dict[str, str]:
         except faults:
             found[path.name] = "unreadable"
     return found
-
-
-def _overlaps(mission: Mission, rig: Rig, records: Sequence[Exposure]) -> Overlaps:
-    mount, plan = mount_of(mission)
-    overlaps = Overlaps(rig, mount, plan.ground_height_m)
-    for exposure in records:
-        overlaps.add(exposure)
-    return overlaps
 
 
 def _differing(flown: Mapping[str, Any], again: Mapping[str, Any]) -> list[str]:

@@ -32,7 +32,8 @@ from processing.bundle.adjustment_results import (
     image_residuals_mm,
     systematic_residuals,
 )
-from processing.geometry.orientation import grid_from_enu, omega_phi_kappa
+from processing.geometry.orientation import grid_from_enu
+from processing.geometry.rotation import omega_phi_kappa
 from processing.matching.block_matching import BlockTiePoints, match_counts_by_line
 
 Array = NDArray[np.float64]

@@ -1,7 +1,7 @@
 """Aerial triangulation of a mission: matched, adjusted with direct georeferencing as start.
 
-The result is an adjustment project like any other (docs/formats.md), with all its tables, and the
-orientations in the requested coordinate system. Matching is in
+The result is an adjustment project like any other (docs/reference/formats.md), with all its tables,
+and the orientations in the requested coordinate system. Matching is in
 `processing.matching.block_matching`.
 """
 

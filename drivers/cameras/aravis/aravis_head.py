@@ -35,6 +35,7 @@ from drivers.contract import (
     LifeCycle,
     Sink,
 )
+from drivers.errors import DriverError
 from drivers.timescales.clock import Clock
 
 POP_TIMEOUT_S: Final = 0.1
@@ -50,7 +51,7 @@ NOT_FRAMES: Final = ("aborted", "cleared", "filling", "unknown")
 """Status of buffers that are returned empty when a stream ends."""
 
 
-class AravisHeadLostError(Exception):
+class AravisHeadLostError(DriverError):
     """The head is lost; internal."""
 
 
@@ -74,7 +75,7 @@ class AravisHead(AravisSettings, HeadDevice):
     not the configured one. A frame that arrives while all slots are in use is lost in Aravis and
     counted as an underrun.
 
-    Source: GenICam SFNC 2.7; GigE Vision 2.0. Quirks: docs/drivers/aravis.md.
+    Source: GenICam SFNC 2.7; GigE Vision 2.0. Quirks: docs/reference/drivers/aravis.md.
     """
 
     kind: ClassVar = "head"

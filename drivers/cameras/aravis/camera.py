@@ -7,7 +7,6 @@ Frames are in `drivers.cameras.aravis.stream`; opening, loss and reconnection ar
 from __future__ import annotations
 
 import contextlib
-import functools
 import gc
 import time
 from collections import deque
@@ -16,12 +15,15 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from drivers.cameras.aravis.camera_access import local_interface, open_camera
+from drivers.cameras.aravis.feature_access import FeatureError, Features
+from drivers.cameras.aravis.feature_value import FeatureValue
 from drivers.cameras.aravis.formats import packing_of, packing_problem
 from drivers.cameras.aravis.gvcp import GVCP_PORT, is_ip_address
+from drivers.cameras.aravis.head_configuration import HeadConfiguration
 from drivers.cameras.aravis.library import aravis, aravis_error, message_of
 from drivers.cameras.aravis.packet_filter import ControlSocketFilter, SocketCapture
 from drivers.cameras.aravis.settings import AravisSettings
-from drivers.cameras.pixels import Packing
+from drivers.cameras.pixels import Packing, packed_nbytes
 from drivers.contract import DeviceError
 
 LATCH_ATTEMPTS: Final = 3
@@ -29,7 +31,13 @@ NS_PER_S: Final = 1_000_000_000
 SETTINGS_HISTORY_LENGTH: Final = 4
 EXPOSURE_TIME_TOLERANCE: Final = 0.01
 """Relative tolerance between a frame's exposure time and the configured one; heads round it."""
-CHUNKS: Final = ("Timestamp", "ExposureTime", "CounterValue", "Gain", "Temperature", "FrameID")
+CLOCKS: Final = (
+    ("TimestampLatch", "TimestampLatchValue", True),
+    ("TimestampLatch", "Timestamp", True),
+    ("GevTimestampControlLatch", "GevTimestampValue", False),
+)
+TEMPERATURES: Final = ("DeviceTemperature", "TemperatureAbs")
+TEMPERATURE_PLACES: Final = ("Sensor", "Sensorboard", "SensorBoard", "Mainboard", "Coreboard")
 
 
 @dataclass(frozen=True)
@@ -71,6 +79,7 @@ class AravisCamera:
     def __init__(self, head: str, settings: AravisSettings) -> None:
         self._who = f"{head} at {settings.address}"
         self.chunk_parser: Any = None
+        self.chunks: list[str] = []
         self._control: ControlSocketFilter | None = None
         try:
             self._open_and_configure(settings)
@@ -101,14 +110,16 @@ class AravisCamera:
             raise ControlDeniedError(
                 f"{self._who}: another program controls the head; end that program"
             )
+        self._features = Features(self._camera.get_device())
+        self._configuration = HeadConfiguration(self._features, settings)
         self.identity = self._identity(settings)
         refusals = self._configure(settings)
         if refusals:
             raise DeviceError("\n".join(f"{self._who}: {refusal}" for refusal in refusals))
         self._tick_hz = self._read_tick_frequency()
         self._latch_features = self._find_latch()
-        self._has_temperature = self._has("DeviceTemperature")
-        self.exposure_time_us = float(self._camera.get_exposure_time())
+        self._temperature_feature = self._find_temperature()
+        self.exposure_time_us = self._configuration.exposure_time_us()
         self.frame_settings = self._frame_settings()
         self._earlier: deque[Mapping[str, float | int | str]] = deque(
             maxlen=SETTINGS_HISTORY_LENGTH
@@ -131,13 +142,20 @@ class AravisCamera:
         camera = self._camera
         return bool(camera.is_gv_device() and not camera.get_device().is_controller())
 
+    @property
+    def written(self) -> Mapping[str, FeatureValue]:
+        """Every feature the driver wrote or switched off, with the value the head holds."""
+        return self._configuration.written
+
     def start(self) -> None:
+        self._configuration.lock(True)
         self._camera.start_acquisition()
 
     def stop(self) -> None:
         """Stop acquisition; errors of a lost head are ignored."""
         with contextlib.suppress(aravis_error()):
             self._camera.stop_acquisition()
+            self._configuration.lock(False)
 
     def release(self) -> None:
         """Release the head: dropping the last reference releases control."""
@@ -174,20 +192,15 @@ class AravisCamera:
         Raises:
             DeviceError: it refuses one.
         """
-        camera = self._camera
         try:
-            if gain_db != 0 or self._has("Gain"):
-                camera.set_float("Gain", gain_db)
-            if tdi_shifts != 0 or self._has("TdiShifts"):
-                camera.set_integer("TdiShifts", tdi_shifts)
-            camera.set_exposure_time(exposure_time_us)
+            self._configuration.adjust(exposure_time_us, gain_db, tdi_shifts)
             self._earlier.append(self.frame_settings)
-            self.exposure_time_us = float(camera.get_exposure_time())
+            self.exposure_time_us = self._configuration.exposure_time_us()
             self.frame_settings = self._frame_settings()
-        except aravis_error() as error:
+        except FeatureError as error:
             raise DeviceError(
                 f"{self._who}: {exposure_time_us:g} us, {gain_db:g} dB, {tdi_shifts} TDI shifts "
-                f"are refused ({message_of(error)}); choose settings within the head's bounds"
+                f"are refused ({error}); choose settings within the head's bounds"
             ) from None
 
     def settings_of(self, exposure_us: float | None) -> Mapping[str, float | int | str]:
@@ -223,25 +236,24 @@ class AravisCamera:
         return best
 
     def temperature_c(self) -> float | None:
-        """DeviceTemperature; None if the head has none."""
-        return float(self._camera.get_float("DeviceTemperature")) if self._has_temperature else None
+        """The head's temperature in degrees Celsius; None if the head has none."""
+        name = self._temperature_feature
+        return None if name is None else self._features.number(name)
 
     def check_alive(self) -> None:
         """Read a feature that is not cached; raises the error of Aravis."""
-        self._camera.get_exposure_time()
+        name = self._configuration.exposure_feature
+        device = self._camera.get_device()
+        if self._features.kind(name) == "integer":
+            device.get_integer_feature_value(name)
+        else:
+            device.get_float_feature_value(name)
 
     def ns_from_ticks(self, ticks: int) -> int:
         """Device clock in ns; exact also for a tick frequency that is no power of ten."""
         return ticks * NS_PER_S // self._tick_hz
 
     # Reading and writing features
-
-    def _has(self, feature: str) -> bool:
-        failed = aravis_error()
-        try:
-            return bool(self._camera.is_feature_available(feature))
-        except failed:
-            return False
 
     def _identity(self, settings: AravisSettings) -> dict[str, str]:
         camera, failed = self._camera, aravis_error()
@@ -255,7 +267,7 @@ class AravisCamera:
         for key, ask in identity_features.items():
             try:
                 identity[key] = str(ask() or "")
-            except failed:
+            except (failed, UnicodeDecodeError):
                 identity[key] = ""
         if settings.serial and identity["serial"] != settings.serial:
             raise DeviceError(
@@ -266,184 +278,64 @@ class AravisCamera:
 
     def _configure(self, settings: AravisSettings) -> list[str]:
         """Write every setting; returns one sentence per refusal."""
-        library, failed = aravis(), aravis_error()
-        camera = self._camera
-        refusals: list[str] = []
+        configuration = self._configuration
+        configuration.write()
+        if settings.trigger_source == "action" and not self._camera.is_gv_device():
+            configuration.refusals.append(
+                'trigger_source is "action"; only GigE Vision heads accept actions'
+            )
+        if self._camera.is_gv_device():
+            self._write_packets(settings, configuration.refusals)
+        if configuration.refusals:
+            return configuration.refusals
+        self.chunks = configuration.switch_on_chunks() if settings.chunks else []
+        if self.chunks:
+            self.chunk_parser = self._camera.create_chunk_parser()
+        return self._read_geometry(settings)
 
-        def write(key: str, value: object, action: Callable[[], object], hint: str) -> None:
-            try:
-                action()
-            except failed as error:
-                refusals.append(f"{key} = {value!r} is refused ({message_of(error)}); {hint}")
-
-        # A head that still acquires for a killed controller would refuse the other settings.
-        write("acquisition", "stop", camera.stop_acquisition, "switch the head off and on")
-        self._write_format(settings, write, refusals)
-        self._write_exposure(settings, write, refusals)
-        write(
-            "acquisition",
-            "continuous",
-            lambda: camera.set_acquisition_mode(library.AcquisitionMode.CONTINUOUS),
-            "this head cannot be used",
-        )
-        key, source = {
-            "software": ("trigger_source", "Software"),
-            "line": ("trigger_line", settings.trigger_line),
-            "action": ("trigger_action", settings.trigger_action),
-        }[settings.trigger_source]
+    def _read_geometry(self, settings: AravisSettings) -> list[str]:
+        """Read size and format of a frame; one sentence per reason why they cannot be used."""
+        features = self._features
         try:
-            sources = camera.dup_available_trigger_sources()
-        except failed:
-            sources = []
-        write(
-            key,
-            source,
-            lambda: camera.set_trigger(source),
-            "the head has " + (", ".join(sources) or "no trigger"),
-        )
-        if settings.trigger_source == "action":
-            self._write_action(settings, write, refusals)
-        if camera.is_gv_device():
-            self._write_packets(settings, write)
-        if refusals:
-            return refusals
-        if settings.chunks and self._switch_on_chunks():
-            self.chunk_parser = camera.create_chunk_parser()
-        _, _, width, height = (int(n) for n in _region(camera))
-        packing = packing_of(str(camera.get_pixel_format_as_string()))
-        assert packing is not None, "the settings allow no other format"
+            pixel_format = str(features.get("PixelFormat"))
+            code = int(self._camera.get_pixel_format())
+            width, height = (int(features.get(name)) for name in ("Width", "Height"))
+            payload_nbytes = int(self._camera.get_payload())
+        except (FeatureError, aravis_error()) as error:
+            return [f"the size of its frames cannot be read ({message_of(error)})"]
+        packing = packing_of(pixel_format)
+        assert packing is not None, "the configuration allows no other format"
+        if packing is Packing.WORDS and settings.byte_order == "big":
+            packing = Packing.WORDS_BIG_ENDIAN
         self.geometry = FrameGeometry(
             width_px=width,
             height_px=height,
-            pixel_format=str(camera.get_pixel_format_as_string()),
-            pixel_format_code=int(camera.get_pixel_format()),
+            pixel_format=pixel_format,
+            pixel_format_code=code,
             packing=packing,
-            payload_nbytes=int(camera.get_payload()),
+            payload_nbytes=payload_nbytes,
         )
-        wrong = packing_problem(packing, width)
-        return [wrong] if wrong else []
+        wrong = [packing_problem(packing, width)]
+        needed_nbytes = packed_nbytes(packing, width * height) if wrong == [None] else 0
+        if payload_nbytes < needed_nbytes:
+            wrong.append(
+                f"the head announces {payload_nbytes} bytes for a frame of {width} x {height} "
+                f"{pixel_format}, which has {needed_nbytes}"
+            )
+        return [problem for problem in wrong if problem]
 
-    def _write_action(
-        self, settings: AravisSettings, write: Callable[..., None], refusals: list[str]
-    ) -> None:
-        """Write keys and mask of action commands; a head may have several action signals."""
-        camera = self._camera
-        if not camera.is_gv_device():
-            refusals.append('trigger_source is "action"; only GigE Vision heads accept actions')
-            return
-        number = "".join(c for c in settings.trigger_action if c.isdigit())
-        if self._has("ActionSelector") and number:
-            write(
-                "trigger_action",
-                settings.trigger_action,
-                lambda: camera.set_integer("ActionSelector", int(number)),
-                "choose an action signal the head has",
-            )
-        for key, feature in (
-            ("action_device_key", "ActionDeviceKey"),
-            ("action_group_key", "ActionGroupKey"),
-            ("action_group_mask", "ActionGroupMask"),
-        ):
-            value = getattr(settings, key)
-            write(
-                key,
-                value,
-                functools.partial(camera.set_integer, feature, value),
-                "the head accepts no action commands",
-            )
-
-    def _write_format(
-        self, settings: AravisSettings, write: Callable[..., None], refusals: list[str]
-    ) -> None:
-        camera, failed = self._camera, aravis_error()
-        try:
-            formats = list(camera.dup_available_pixel_formats_as_strings())
-        except failed:
-            formats = []
-        if formats and settings.pixel_format not in formats:
-            refusals.append(
-                f"pixel_format is {settings.pixel_format!r}; the head has {', '.join(formats)}"
-            )
-        else:
-            write(
-                "pixel_format",
-                settings.pixel_format,
-                lambda: camera.set_pixel_format_from_string(settings.pixel_format),
-                "choose one that the head has",
-            )
-        if settings.width_px:
-            width, height = settings.width_px, settings.height_px
-            if tuple(_region(camera))[2:] != (width, height):
-                write(
-                    "width_px, height_px",
-                    (width, height),
-                    lambda: camera.set_region(0, 0, width, height),
-                    "give the size of the sensor",
-                )
-                if not refusals and tuple(_region(camera))[2:] != (width, height):
-                    found = " x ".join(str(n) for n in tuple(_region(camera))[2:])
-                    refusals.append(
-                        f"width_px x height_px is {width} x {height}; the head gives {found}"
-                    )
-
-    def _write_exposure(
-        self, settings: AravisSettings, write: Callable[..., None], refusals: list[str]
-    ) -> None:
-        camera, failed = self._camera, aravis_error()
-        try:
-            low_us, high_us = camera.get_exposure_time_bounds()
-        except failed:
-            low_us, high_us = 0.0, float("inf")
-        if not low_us <= settings.exposure_time_us <= high_us:
-            refusals.append(
-                f"exposure_time_us is {settings.exposure_time_us:g}; the head takes {low_us:g} to "
-                f"{high_us:g}"
-            )
-        else:
-            write(
-                "exposure_time_us",
-                settings.exposure_time_us,
-                lambda: camera.set_exposure_time(settings.exposure_time_us),
-                "the head cannot set its exposure time",
-            )
-        if self._has("Gain"):
-            write(
-                "gain_db",
-                settings.gain_db,
-                lambda: camera.set_float("Gain", settings.gain_db),
-                "choose a gain within the head's bounds",
-            )
-        elif settings.gain_db != 0:
-            refusals.append(
-                f"gain_db is {settings.gain_db:g}; the head has no feature Gain in dB, set 0"
-            )
-        if self._has("TdiShifts"):
-            write(
-                "tdi_shifts",
-                settings.tdi_shifts,
-                lambda: camera.set_integer("TdiShifts", settings.tdi_shifts),
-                "choose a number within the head's bounds",
-            )
-        elif settings.tdi_shifts != 0:
-            refusals.append(
-                f"tdi_shifts is {settings.tdi_shifts}; the head has no feature TdiShifts, set 0"
-            )
-
-    def _write_packets(self, settings: AravisSettings, write: Callable[..., None]) -> None:
+    def _write_packets(self, settings: AravisSettings, refusals: list[str]) -> None:
         library, camera = aravis(), self._camera
-
-        def set_size() -> None:
+        try:
             size = settings.packet_size
             if size == 0:
                 size = min(int(camera.gv_auto_packet_size()), settings.packet_size_limit)
             camera.gv_set_packet_size(size)
-
-        write(
-            "packet_size",
-            settings.packet_size,
-            set_size,
-            "set 0, or a size that the network transports",
-        )
+        except aravis_error() as error:
+            refusals.append(
+                f"packet_size = {settings.packet_size} is refused ({message_of(error)}); set 0, or "
+                "a size that the network transports"
+            )
         # The size is final; otherwise Aravis would negotiate again when the stream is created.
         camera.gv_set_packet_size_adjustment(library.GvPacketSizeAdjustment.NEVER)
         options = library.GvStreamOption
@@ -451,53 +343,47 @@ class AravisCamera:
             options.NONE if settings.packet_socket else options.PACKET_SOCKET_DISABLED
         )
 
-    def _switch_on_chunks(self) -> bool:
-        camera, failed = self._camera, aravis_error()
-        try:
-            if not camera.are_chunks_available():
-                return False
-            camera.set_chunk_mode(True)
-            if self._has("ChunkSelector"):
-                offered = camera.dup_available_enumerations_as_strings("ChunkSelector")
-                for chunk in CHUNKS:
-                    if chunk in offered:
-                        camera.set_chunk_state(chunk, True)
-        except failed:
-            return False
-        return True
-
     def _read_tick_frequency(self) -> int:
         if not self._camera.is_gv_device():
             return NS_PER_S
         return int(self._camera.get_device().get_timestamp_tick_frequency()) or NS_PER_S
 
     def _find_latch(self) -> tuple[str, str, bool] | None:
-        """Command and value features of the clock, and whether the value is in ns (SFNC 2)."""
-        for command, value, is_ns in (
-            ("TimestampLatch", "TimestampLatchValue", True),
-            ("GevTimestampControlLatch", "GevTimestampValue", False),
-        ):
-            if self._has(command) and self._has(value):
-                return command, value, is_ns
+        """Command and value features of the clock, and whether the value is in ns (SFNC 2).
+
+        Some heads list a latch that they refuse to execute; they have no clock.
+        """
+        for command, value, is_ns in CLOCKS:
+            if self._features.kind(command) == "command" and self._features.is_available(value):
+                with contextlib.suppress(FeatureError):
+                    self._features.execute(command)
+                    return command, value, is_ns
         return None
 
+    def _find_temperature(self) -> str | None:
+        """The feature of the head's temperature; the sensor's where there are several."""
+        features = self._features
+        for selector in ("DeviceTemperatureSelector", "TemperatureSelector"):
+            place = features.first_entry(selector, TEMPERATURE_PLACES)
+            if place is not None:
+                with contextlib.suppress(FeatureError):
+                    features.set(selector, place)
+        return features.first_available(TEMPERATURES)
+
     def _frame_settings(self) -> Mapping[str, float | int | str]:
-        camera = self._camera
+        features = self._features
         found: dict[str, float | int | str] = {
             "ExposureTime": self.exposure_time_us,
             "PixelFormat": self.geometry.pixel_format,
         }
-        if self._has("Gain"):
-            found["Gain"] = float(camera.get_float("Gain"))
-        elif self._has("GainRaw"):
-            found["GainRaw"] = int(camera.get_integer("GainRaw"))
-        if self._has("TdiShifts"):
-            found["TdiShifts"] = int(camera.get_integer("TdiShifts"))
-        if camera.is_gv_device():
-            found["GevSCPSPacketSize"] = int(camera.gv_get_packet_size())
+        gain = features.number(self._configuration.gain_feature or "Gain")
+        if gain is not None and self._configuration.gain_feature == "GainRaw":
+            found["GainRaw"] = int(gain)
+        elif gain is not None:
+            found["Gain"] = gain
+        shifts = features.number("TdiShifts")
+        if shifts is not None:
+            found["TdiShifts"] = int(shifts)
+        if self._camera.is_gv_device():
+            found["GevSCPSPacketSize"] = int(self._camera.gv_get_packet_size())
         return found
-
-
-def _region(camera: Any) -> tuple[int, int, int, int]:
-    region = camera.get_region()
-    return tuple(region)

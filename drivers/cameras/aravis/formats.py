@@ -6,6 +6,7 @@ Source: PFNC 2.4; GigE Vision 2.0, table 26-1 for the formats that end in Packed
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from typing import Final
 
 from drivers.cameras.pixels import Packing, pixels_in_a_group
@@ -33,6 +34,22 @@ def packing_of(pixel_format: str) -> Packing | None:
     """
     found = _NAME.fullmatch(pixel_format)
     return _PACKINGS.get(found[1]) if found else None
+
+
+def widest_format(offered: Iterable[str]) -> str | None:
+    """The format with the most bits per pixel; unpacked words before packed ones.
+
+    Example:
+        >>> widest_format(["Mono8", "Mono12Packed", "Mono12", "RGB8"])
+        'Mono12'
+    """
+    known = [(name, packing_of(name)) for name in offered]
+    ranked = [
+        (int(re.sub(r"\D.*", "", re.sub(r"^\D+", "", name))), packing is Packing.WORDS, name)
+        for name, packing in known
+        if packing is not None
+    ]
+    return max(ranked)[2] if ranked else None
 
 
 def packing_problem(packing: Packing, width_px: int) -> str | None:

@@ -6,7 +6,9 @@ from collections.abc import Mapping
 from typing import Any
 
 from drivers.base.settings import Configured, Setting
+from drivers.cameras.aravis.feature_value import FeatureValue
 from drivers.cameras.aravis.formats import packing_of
+from drivers.cameras.aravis.presets import preset_names
 
 
 class AravisSettings(Configured):
@@ -16,9 +18,21 @@ class AravisSettings(Configured):
         "", required=True, help="IP address of the head, or its name as printed by arv-tool"
     )
     serial = Setting("", help="serial number the head must have; empty takes any")
+    preset = Setting("", help="features of a family of heads, see the presets below; empty: none")
+    features = Setting(
+        dict[str, FeatureValue](),
+        help="further features by GenICam name and value, written in this order",
+    )
     width_px = Setting(0, minimum=0, help="columns; 0 takes what the head is set to")
     height_px = Setting(0, minimum=0, help="rows; 0 takes what the head is set to")
-    pixel_format = Setting("Mono16", help="GenICam name of the pixel format")
+    pixel_format = Setting(
+        "", help="GenICam name of the pixel format; empty takes the one with the most bits"
+    )
+    byte_order = Setting(
+        "little",
+        choices=("little", "big"),
+        help="byte order of pixels of more than 8 bits, unpacked; some heads send big-endian",
+    )
     exposure_time_us = Setting(1000.0, minimum=1, maximum=60e6, help="exposure time, us")
     gain_db = Setting(0.0, minimum=-20, maximum=60, help="gain, dB")
     tdi_shifts = Setting(0, minimum=0, maximum=1000, help="TDI shifts; 0 for a head without TDI")
@@ -26,6 +40,20 @@ class AravisSettings(Configured):
         "line", choices=("line", "software", "action"), help="what starts an exposure"
     )
     trigger_line = Setting("Line1", help="GenICam name of the head's trigger input")
+    trigger_activation = Setting(
+        "RisingEdge",
+        choices=("RisingEdge", "FallingEdge", "AnyEdge", "LevelHigh", "LevelLow"),
+        help="edge of the trigger input that starts an exposure",
+    )
+    trigger_delay_us = Setting(
+        0.0, minimum=0, maximum=1e6, help="time between trigger and exposure, us"
+    )
+    debounce_us = Setting(
+        0.0, minimum=0, maximum=1e6, help="shortest trigger pulse, us; 0 leaves the head's value"
+    )
+    strobe_line = Setting(
+        "", help="GenICam name of an output that is active during the exposure; empty: none"
+    )
     trigger_action = Setting("Action1", help="GenICam name of the head's action signal")
     action_device_key = Setting(
         0x5359_4E54, minimum=0, maximum=0xFFFF_FFFF, help="device key of action commands"
@@ -73,7 +101,9 @@ class AravisSettings(Configured):
                 f"width_px is {values['width_px']} and height_px is {values['height_px']}; "
                 "give both or neither"
             )
-        if packing_of(values["pixel_format"]) is None:
+        if values["preset"] and values["preset"] not in preset_names():
+            found.append(f"preset is {values['preset']!r}; there are " + ", ".join(preset_names()))
+        if values["pixel_format"] and packing_of(values["pixel_format"]) is None:
             found.append(
                 f"pixel_format is {values['pixel_format']!r}; a GenICam name of 8 to 16 bits, "
                 "monochrome or Bayer, such as Mono12p or BayerRG12"

@@ -40,7 +40,7 @@ class FolderHead(HeadDevice):
     ours, `device_ns`, exposure time, temperature and settings are those of the capture; the
     recorded head's clock has no latch on this host, so `device_clock_ns` is None.
 
-    Source: docs/formats.md, Level-0 frames.
+    Source: docs/reference/formats.md, Level-0 frames.
     """
 
     kind: ClassVar = "head"

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from drivers.cameras.tiff_layout import layout_problem
+from drivers.errors import DriverError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -24,7 +25,7 @@ MAX_DESCRIPTION: Final = 1 << 20
 _DIGITS: Final = re.compile(r"(\d+)")
 
 
-class FrameFileError(Exception):
+class FrameFileError(DriverError):
     """A file is no frame; the message contains the reason. Internal to this driver."""
 
 

@@ -19,6 +19,7 @@ from drivers.cameras.v4l2.node import FilledBuffer
 from drivers.cameras.v4l2.sequence import SequenceCounter
 from drivers.cameras.v4l2.settings import V4l2Settings
 from drivers.contract import DeviceError, Frame, FrameStatus, LifeCycle, Sink
+from drivers.errors import DriverError
 
 WAIT_STEP_S: Final = 0.1
 TRIGGER_TIMEOUT_S: Final = 1.0
@@ -29,7 +30,7 @@ QUEUE_ATTEMPTS: Final = 20
 """A buffer refused so often in a row means that the stream is broken."""
 
 
-class V4l2HeadLostError(Exception):
+class V4l2HeadLostError(DriverError):
     """The head is lost or its stream failed; internal."""
 
 
@@ -54,7 +55,7 @@ class V4l2Head(V4l2Settings, HeadDevice):
     the start of exposure on CLOCK_MONOTONIC, None where the kernel's stamp is of another clock or
     makes no sense.
 
-    Source: Documentation/userspace-api/media/v4l. Quirks: docs/drivers/v4l2.md.
+    Source: Documentation/userspace-api/media/v4l. Quirks: docs/reference/drivers/v4l2.md.
     """
 
     kind: ClassVar = "head"

@@ -14,6 +14,12 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from drivers.contract import POSITION_FIXES, EventMark, NavSample
+from drivers.receivers.attitude import (
+    Quaternion,
+    angles_of,
+    interpolated_quaternion,
+    quaternion_of,
+)
 from drivers.receivers.mavlink.boot_clock import MS_NS, BootClock
 from drivers.receivers.mavlink.library import MavlinkParser
 from drivers.receivers.message_decoder import MessageDecoder, Nav
@@ -30,7 +36,6 @@ ATTITUDE_GAP_MS: Final = 500
 """Between attitudes further apart nothing is interpolated."""
 COUNT_BITS: Final = 32
 
-Quaternion = tuple[float, float, float, float]
 Sigmas = tuple[float | None, float | None, float | None]
 
 
@@ -329,48 +334,3 @@ class MavlinkDecoder(MessageDecoder):
                 mono_ns=mono_ns,
             )
         ]
-
-
-def interpolated_quaternion(first: Quaternion, second: Quaternion, fraction: float) -> Quaternion:
-    """The rotation that share of the way from the first to the second, along the shorter arc."""
-    cosine = sum(a * b for a, b in zip(first, second, strict=True))
-    sign = -1.0 if cosine < 0 else 1.0
-    angle = math.acos(min(1.0, abs(cosine)))
-    if angle < 1e-9:
-        return first
-    one = math.sin((1 - fraction) * angle) / math.sin(angle)
-    other = sign * math.sin(fraction * angle) / math.sin(angle)
-    w, x, y, z = (one * a + other * b for a, b in zip(first, second, strict=True))
-    return w, x, y, z
-
-
-def quaternion_of(roll: float, pitch: float, heading: float) -> Quaternion:
-    """The rotation from body to north, east, down of roll, pitch and heading, rad.
-
-    Example:
-        >>> quaternion_of(0.0, 0.0, 0.0)
-        (1.0, 0.0, 0.0, 0.0)
-    """
-    (cr, sr), (cp, sp), (ch, sh) = (
-        (math.cos(angle / 2), math.sin(angle / 2)) for angle in (roll, pitch, heading)
-    )
-    return (
-        cr * cp * ch + sr * sp * sh,
-        sr * cp * ch - cr * sp * sh,
-        cr * sp * ch + sr * cp * sh,
-        cr * cp * sh - sr * sp * ch,
-    )
-
-
-def angles_of(q: Quaternion) -> tuple[float, float, float]:
-    """Roll, pitch and heading (0 to 2 pi), rad, of the rotation from body to north, east, down.
-
-    Example:
-        >>> [round(angle, 6) for angle in angles_of((1.0, 0.0, 0.0, 0.0))]
-        [0.0, 0.0, 0.0]
-    """
-    w, x, y, z = q
-    roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    pitch = math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x))))
-    heading = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-    return roll, pitch, heading % math.tau

@@ -12,6 +12,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
+from drivers.errors import DriverError
+
 MAX_PATTERN: Final = 400
 MAX_STEPS: Final = 800
 """Maximum number of steps, with counted repeats expanded."""
@@ -28,7 +30,7 @@ def _compiled(text: str) -> re.Pattern[str]:
         return re.compile(text, re.ASCII | re.DOTALL)
 
 
-class PatternError(ValueError):
+class PatternError(DriverError, ValueError):
     """A pattern cannot be used; the message contains the reason."""
 
 

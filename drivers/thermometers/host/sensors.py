@@ -12,13 +12,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from drivers.errors import DriverError
+
 MAX_TEXT: Final = 128
 _INPUT: Final = re.compile(r"temp\d+_input")
 _IIO: Final = re.compile(r"in_(temp\w*?)_(input|raw)")
 _NUMBER: Final = re.compile(r"[-+]?\d{1,12}(\.\d{1,12})?")
 
 
-class SensorLostError(Exception):
+class SensorLostError(DriverError):
     """The sensor's files cannot be read or contain no number; internal."""
 
 

@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 
 from daemon.cli import app, command_table, interrupt_messages
 from daemon.cli.command_table import RENAMED, TABLE
+from daemon.cli.exit_status import ExitStatus
 
 
 def commands(command: Any, name: str) -> Iterator[tuple[str, Any]]:
@@ -56,6 +57,7 @@ def test_the_help_page_imports_no_command_and_no_heavy_library() -> None:
     assert ast.literal_eval(ours) == [
         "daemon.cli",
         "daemon.cli.command_table",
+        "daemon.cli.exit_status",
         "daemon.cli.interrupt_messages",
     ]
     assert all(f" {name} " in done.stdout for name in TABLE)
@@ -88,5 +90,5 @@ def test_an_interruption_while_a_command_is_imported_ends_in_one_sentence(
 
     monkeypatch.setattr(command_table, "load", interrupted)
     done = CliRunner().invoke(app, ["verify", "MISSION"])
-    assert done.exit_code == interrupt_messages.STATUS
+    assert done.exit_code == ExitStatus.INTERRUPTED
     assert done.output.strip() == interrupt_messages.NOTHING_BEGUN

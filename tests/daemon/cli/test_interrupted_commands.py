@@ -17,6 +17,7 @@ import pytest
 
 from daemon import cli
 from daemon.cli import interrupt_messages
+from daemon.cli.exit_status import ExitStatus
 from daemon.mission.log.flight_log import read
 from daemon.mission.store import durable
 from tests.crash.kill_at_call import run_to_call
@@ -168,7 +169,7 @@ def test_an_interrupted_command_leaves_complete_files_and_states_how_to_continue
     for last in range(1, count, max(1, count // case.positions)):
         run_case(last, signal.SIGINT)
         answer = json.loads(output_file.read_text())
-        assert answer["status"] == interrupt_messages.STATUS, (last, answer)
+        assert answer["status"] == ExitStatus.INTERRUPTED, (last, answer)
         lines = [line for line in answer["errors"].splitlines() if line.strip()]
         assert lines[-1] == interrupt_messages.sentence_of(case.name), (last, answer)
         assert "Traceback" not in answer["errors"]

@@ -9,7 +9,8 @@ from typing import Any
 
 import pytest
 
-from daemon.configuration.model import ConfigurationError, from_mapping, load
+from daemon.configuration.model import ConfigurationError
+from daemon.configuration.service_file import from_mapping, load
 
 GOOD: dict[str, Any] = {
     "mission": {"root": "missions", "rig": "ultracam-x-mini"},
@@ -103,6 +104,57 @@ def test_a_former_key_is_refused_with_the_present_one(
     assert old in sentence and f"is now named {new}; rename it" in sentence
 
 
+def test_a_former_key_hides_no_other_mistake_of_its_section() -> None:
+    content = copy.deepcopy(GOOD)
+    content["exposure"] = {"gain_most_db": 12.0, "tdi_most": 32, "smear_px": 0, "target": "high"}
+    assert problems_of(content) == (
+        "service.toml: exposure.target is 'high'; a finite number is needed",
+        "service.toml: exposure.smear_px is 0; it is more than 0",
+        "service.toml: exposure.gain_most_db is now named gain_max_db; rename it",
+        "service.toml: exposure.tdi_most is now named tdi_shifts_max; rename it",
+    )
+
+
+@pytest.mark.parametrize(
+    ("section", "key", "value", "hint"),
+    [
+        ("watch", "port", "8470", "a whole number is needed"),
+        ("watch", "anonymous_read", 1, "true or false is needed"),
+        ("limits", "exposures_in_memory", 3.5, "a whole number is needed"),
+        ("limits", "frame_timeout_s", True, "a finite number is needed"),
+        ("limits", "frame_timeout_s", float("inf"), "a finite number is needed"),
+        ("mission", "root", 5, "a path is needed"),
+        ("mount", "antenna_m", "here", "a list is needed"),
+        ("plan", "line", ["a"], "a text is needed"),
+        ("exposure", "lock", "lines", "it is one of line, never"),
+        ("watch", "hosts", ["a"] * 17, "it has 16 entries at most"),
+    ],
+)
+def test_a_value_is_not_converted_to_the_type_of_its_key(
+    section: str, key: str, value: Any, hint: str
+) -> None:
+    content = copy.deepcopy(GOOD)
+    content.setdefault(section, {})[key] = value
+    (sentence,) = problems_of(content)
+    assert sentence.startswith(f"service.toml: {section}.{key} is ") and sentence.endswith(hint)
+
+
+def test_sentences_name_the_lines_of_keys_in_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "service.toml"
+    path.write_text(
+        '[mission]\nroot = "m"\nrig = "ultracam-x-mini"\n\n[trigger]\ndriver = "software"\n'
+        "# A list over several lines, and a table that is not there.\n"
+        'interval_s = -1\n[[head]]\nsensor = "SU00"\ndriver = "folder"\nfolder = "f"\n'
+        "[mount]\nantenna_m = [\n  0.0,\n  1.0,\n]\n[[navigator]]\nname = 'n'\n"
+    )
+    with pytest.raises(ConfigurationError) as refused:
+        load(path)
+    starts = [problem.split(" is ")[0] for problem in refused.value.problems]
+    assert "service.toml:8: trigger.interval_s" in starts
+    assert "service.toml:14: mount.antenna_m[2]" in starts
+    assert "service.toml:18: navigator[0].driver" in starts
+
+
 def test_a_former_threshold_is_refused_with_the_present_one() -> None:
     content = copy.deepcopy(GOOD)
     content["processing"] = {"thresholds": {"burnt_overlap_fraction": 0.1}}
@@ -155,7 +207,9 @@ def test_a_plan_to_follow_has_to_be_there_and_readable(tmp_path: Path) -> None:
     for text, why in ((None, "cannot be read"), ("<kml/>", "holds no line")):
         if text is not None:
             (tmp_path / "block.kml").write_text(text)
-        with pytest.raises(ConfigurationError, match=rf"plan\.file: .*block\.kml: {why}"):
+        with pytest.raises(
+            ConfigurationError, match=rf"plan\.file cannot be used: .*block\.kml: {why}"
+        ):
             from_mapping(content, tmp_path / "service.toml")
 
 

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from daemon.configuration.model import Configuration, ConfigurationError, load
+from daemon.configuration.model import Configuration, ConfigurationError
+from daemon.configuration.service_file import load
 from daemon.onboard.preflight.check_results import CheckOutcome
 from daemon.onboard.preflight.prerequisites import storage
 from processing.rig import Rig

@@ -158,7 +158,7 @@ PRODUCT_DAMAGES = {
     "report of wrong types": (
         "L2/{}/quality.json",
         text('{"verdict": "good", "figures": {"dc_k": [1]}, "findings": [3]}'),
-        "a list of objects is needed",
+        "a table is needed",
     ),
     "folder instead of a report": ("L2/{}/quality.json", as_folder, "Is a directory"),
     "record is not JSON": ("L0/{}/exposure.json", text("{"), "not a JSON record"),

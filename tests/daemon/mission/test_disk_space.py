@@ -93,8 +93,8 @@ def test_what_is_ordered_on_a_low_disk_is_flagged_and_nothing_else_is() -> None:
         flown.disk_is_low = is_low
         number = flown.order(0)
         flown.not_fired(number, "no pulse")
-        record = flown.due_to_seal(0)
+        record = flown.advance(0).seal
         assert record is not None
         flags.append(Flag(record.flags))
-        flown.sealed(number, record.state)
+        flown.sealed(number)
     assert [bool(f & Flag.DISK_LOW) for f in flags] == [False, True, False]

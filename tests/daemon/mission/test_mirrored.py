@@ -30,8 +30,9 @@ from tests.daemon.small_camera import (
     new_mission,
     pixels_of,
 )
+from tests.stopwatch import Stopwatch
 
-pytestmark = pytest.mark.trust
+pytestmark = [pytest.mark.realtime, pytest.mark.trust]
 
 STALL_S = 0.6
 POLL_S = 0.05
@@ -132,6 +133,8 @@ def test_a_disk_that_refuses_a_frame_is_dropped_and_the_exposure_is_stored_on_th
     (left,) = set(flown.roots) - {failing}
     with refusing(flown.roots[failing], code):
         disks = flown.expose(2)
+        # As soon as it refuses no more, the disk is brought up to date.
+        assert not flown.copy(failing).level0(2).exists()
     assert disks == (give_disk_id(flown.roots[left]),)
     dropped = [event for event in flown.events if event.name == "disk-dropped"]
     assert [event.disk.label for event in dropped] == [failing]
@@ -140,7 +143,6 @@ def test_a_disk_that_refuses_a_frame_is_dropped_and_the_exposure_is_stored_on_th
     assert verify(flown.copy(left)).problems == ()
     # Before the exposure was called stored, the disk that has it recorded that it is single.
     assert read_generations(flown.copy(left).path)[-1].disks == disks
-    assert not flown.copy(failing).level0(2).exists()
 
 
 @pytest.mark.parametrize("stalled", ["root", "mirror"])
@@ -155,9 +157,9 @@ def test_a_disk_that_makes_no_progress_is_dropped_in_time_and_does_not_block_the
         took_s = time.monotonic() - begun_s
         assert disks == (give_disk_id(flown.roots[left]),)
         assert took_s >= STALL_S
-        begun_s = time.monotonic()
+        watch = Stopwatch()
         flown.expose(3)
-        assert time.monotonic() - begun_s < took_s, "a disk that was dropped is waited for"
+        assert watch.is_within(took_s), "a disk that was dropped is waited for"
     # What the stalled thread was about to write never gets its name.
     flown.joined()
     assert verify(flown.copy(stalled)).problems == ()

@@ -124,7 +124,10 @@ def test_frames_and_pixels_that_do_not_fit_are_refused_before_anything_is_writte
 def test_every_byte_and_name_is_synced_in_order_before_stored_is_reported(
     mission, writer, monkeypatch
 ):
-    """The order is: files, folder, rename, parent, commit (docs/durability.md)."""
+    """The order is: files, folder, rename, parent, commit.
+
+    docs/reference/results/durability.md states why.
+    """
     trace = []
     real = {"fsync": os.fsync, "rename": Path.rename, "add": Catalog.add_stored}
 

@@ -144,8 +144,13 @@ def test_the_unit_and_its_companions_are_valid(tmp_path: Path) -> None:
     template = contents(COMMAND, CONFIGURATION, None)[UNIT]
     unit = tmp_path / "syntopic.service"
     unit.write_text(template.replace(str(COMMAND), str(command)))
+    # The unit is valid whether or not the manual pages it names are installed.
     verified = subprocess.run(
-        [program, "verify", str(unit)], capture_output=True, text=True, timeout=60, check=False
+        [program, "verify", "--man=no", str(unit)],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
     )
     assert verified.returncode == 0, verified.stderr
     assert "syntopic" not in verified.stderr

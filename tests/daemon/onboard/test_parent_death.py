@@ -18,6 +18,9 @@ from daemon.mission.layout import Mission
 from daemon.mission.store.level0_folder import read_sealed
 from daemon.mission.verification.verification import verify
 
+pytestmark = pytest.mark.realtime
+
+
 ROOT = Path(__file__).parents[3]
 ENDED_WITHIN_S = 60.0
 STARTER = """

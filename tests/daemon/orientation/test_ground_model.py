@@ -7,9 +7,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pyproj
 import pytest
 
-from daemon.configuration.model import ConfigurationError, MountSection, PlanSection, load
+from daemon.configuration.model import ConfigurationError, MountSection, PlanSection
+from daemon.configuration.service_file import load
 from daemon.mission.exposure import Exposure, NavigationRecord
 from daemon.orientation.ground_model import GroundModel, ground_of
 from daemon.products.exposure_conditions import conditions_of
@@ -19,8 +21,6 @@ from processing.geometry.virtual_camera import ground_plane
 from processing.quality.report import Flag
 from processing.rig import Rig, find_rig
 from sim_hw.world.true_camera import BODY_FROM_CAMERA, true_camera
-
-pyproj = pytest.importorskip("pyproj", reason="pip install 'syntopic[geodesy]'")
 
 CRS = "EPSG:32633"
 LATITUDE, LONGITUDE, HEIGHT_M = 47.07, 15.44, 1395.0
@@ -43,8 +43,19 @@ def model(tmp_path: Path) -> Path:
 
 def flown(**changed: object) -> NavigationRecord:
     there = NavigationRecord(
-        *("gnss", 0, "interpolated", 0, "fixed", 20, LATITUDE, LONGITUDE, HEIGHT_M),
-        *(0.02, 0.03, (60.0, 0.0, 0.0), 0.01, 0.0, 0.0, 0.0),
+        receiver="gnss",
+        gps_ns=0,
+        method="interpolated",
+        latitude_deg=LATITUDE,
+        longitude_deg=LONGITUDE,
+        height_m=HEIGHT_M,
+        horizontal_sigma_m=0.02,
+        vertical_sigma_m=0.03,
+        velocity_ned_mps=(60.0, 0.0, 0.0),
+        speed_sigma_mps=0.01,
+        roll_rad=0.0,
+        pitch_rad=0.0,
+        heading_rad=0.0,
     )
     return replace(there, **changed)
 

@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("pyproj", reason="needs the extra geodesy")
 rasterio = pytest.importorskip("rasterio", reason="needs the extra geotiff")
 
 from daemon.mission.foreign_files import is_on_local_disk  # noqa: E402

@@ -11,6 +11,7 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import numpy as np
+import pyproj
 import pytest
 import tifffile
 from typer.testing import CliRunner
@@ -49,7 +50,6 @@ from sim_hw.processes.exposures import EPOCH_GPS_NS, FIRST_AFTER_S, write_exposu
 from sim_hw.world import true_camera
 from sim_hw.world.world import World, WorldSettings
 
-pyproj = pytest.importorskip("pyproj", reason="pip install 'syntopic[geodesy]'")
 RUN = CliRunner()
 EXPOSURES, LINES = 2, 2
 CRS = "EPSG:32633"
@@ -125,9 +125,19 @@ def test_the_onboard_worker_makes_every_head_and_its_orientation_as_exposures_co
     latitude, longitude, height = flight.geodetic(pose.position_enu_m)
     east, north, up = pose.velocity_enu_mps
     navigation = NavigationRecord(
-        *("gnss", exposure.mark_gps_ns, "interpolated", 0, "fixed", 20),
-        *(latitude, longitude, height, 0.02, 0.03, (north, east, -up), 0.01),
-        *(pose.roll_rad, pose.pitch_rad, pose.heading_rad),
+        receiver="gnss",
+        gps_ns=exposure.mark_gps_ns,
+        method="interpolated",
+        latitude_deg=latitude,
+        longitude_deg=longitude,
+        height_m=height,
+        horizontal_sigma_m=0.02,
+        vertical_sigma_m=0.03,
+        velocity_ned_mps=(north, east, -up),
+        speed_sigma_mps=0.01,
+        roll_rad=pose.roll_rad,
+        pitch_rad=pose.pitch_rad,
+        heading_rad=pose.heading_rad,
     )
     exposure = replace(exposure, navigation=navigation)
     plan = PlanSection(ground_height_m=395.0)
@@ -177,8 +187,19 @@ def test_a_flight_over_a_height_model_is_replayed_with_the_model_from_elsewhere(
     _, exposure = store.load_level0(mission.level0(2), load_rig(mission.rig_path))
     here = world.flight.geodetic(np.zeros(3))
     navigation = NavigationRecord(
-        *("gnss", exposure.mark_gps_ns, "interpolated", 0, "fixed", 20),
-        *(here[0], here[1], here[2] + 1000.0, 0.02, 0.03, (60.0, 0.0, 0.0), 0.01, 0.0, 0.0, 0.0),
+        receiver="gnss",
+        gps_ns=exposure.mark_gps_ns,
+        method="interpolated",
+        latitude_deg=here[0],
+        longitude_deg=here[1],
+        height_m=here[2] + 1000.0,
+        horizontal_sigma_m=0.02,
+        vertical_sigma_m=0.03,
+        velocity_ned_mps=(60.0, 0.0, 0.0),
+        speed_sigma_mps=0.01,
+        roll_rad=0.0,
+        pitch_rad=0.0,
+        heading_rad=0.0,
     )
     exposure = replace(exposure, navigation=navigation)
     (mission.level0(2) / "exposure.json").write_bytes(exposure_bytes(exposure))

@@ -13,6 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pyproj
 import pytest
 
 from daemon.configuration.model import MountSection
@@ -25,7 +26,8 @@ from daemon.orientation.exterior_orientation import (
     orient,
     sealed_exposures,
 )
-from daemon.orientation.georeference import Georeference, GeoreferenceError, utm_of
+from daemon.orientation.geodesy import utm_of
+from daemon.orientation.georeference import Georeference, GeoreferenceError
 from daemon.orientation.orientation_inputs import OrientationError
 from daemon.orientation.trajectory import TrajectoryError, flown_trajectory, read_trajectory
 from daemon.postflight.export.orientation_set import export_orientation
@@ -34,8 +36,6 @@ from processing.geometry.rotation import rotation_matrix as r
 from processing.rig import load_rig, shipped_rigs
 from sim_hw.world.flight import FlightPlan, SimulatedFlight, enu_from_body
 from sim_hw.world.true_camera import BODY_FROM_CAMERA, projection_centre_m
-
-pyproj = pytest.importorskip("pyproj", reason="pip install 'syntopic[geodesy]'")
 
 EPOCH_NS = 1_479_300_000_000_000_000
 STEP_NS = 100_000_000

@@ -7,6 +7,7 @@ import shutil
 from pathlib import Path
 
 import numpy as np
+import pyproj
 import pytest
 from typer.testing import CliRunner
 
@@ -25,7 +26,6 @@ from sim_hw.world.scene import open_scene
 from sim_hw.world.surveyed_points import write_surveyed
 from sim_hw.world.world import World, WorldSettings
 
-pyproj = pytest.importorskip("pyproj", reason="pip install 'syntopic[geodesy]'")
 RUN = CliRunner()
 EACH, LINES = 4, 2
 

@@ -51,8 +51,17 @@ def test_without_a_figure_the_tilt_is_that_of_roll_and_pitch() -> None:
     def tilted(roll_deg: float | None, pitch_deg: float | None) -> NavigationRecord:
         roll, pitch = (None if a is None else math.radians(a) for a in (roll_deg, pitch_deg))
         return NavigationRecord(
-            *("gnss", 0, "interpolated", 0, "3d", 12, 47.0, 15.0, 3000.0),
-            *(0.1, 0.1, (60.0, 0.0, 0.0), 0.1, roll, pitch, 0.0),
+            receiver="gnss",
+            gps_ns=0,
+            method="interpolated",
+            fix="3d",
+            latitude_deg=47.0,
+            longitude_deg=15.0,
+            height_m=3000.0,
+            velocity_ned_mps=(60.0, 0.0, 0.0),
+            roll_rad=roll,
+            pitch_rad=pitch,
+            heading_rad=0.0,
         )
 
     assert objections({}, navigation=tilted(3.0, 4.1)) == ["tilted by 5.1 deg"]

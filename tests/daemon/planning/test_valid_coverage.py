@@ -145,9 +145,20 @@ def record(shot: Shot) -> Exposure:
     place = PLANE.place(shot.east_m, shot.north_m)
     roll, pitch, heading = (math.radians(a) for a in shot.attitude_deg)
     there = NavigationRecord(
-        *("gnss", 1_479_300_000_000_000_000, "interpolated", 0, "3d", 12),
-        *(place.latitude_deg, place.longitude_deg, HEIGHT_M + GROUND_M),
-        *(0.1, 0.1, (60.0, 0.0, 0.0), 0.1, roll, pitch, heading),
+        receiver="gnss",
+        gps_ns=1_479_300_000_000_000_000,
+        method="interpolated",
+        fix="3d",
+        latitude_deg=place.latitude_deg,
+        longitude_deg=place.longitude_deg,
+        height_m=HEIGHT_M + GROUND_M,
+        horizontal_sigma_m=0.1,
+        vertical_sigma_m=0.1,
+        velocity_ned_mps=(60.0, 0.0, 0.0),
+        speed_sigma_mps=0.1,
+        roll_rad=roll,
+        pitch_rad=pitch,
+        heading_rad=heading,
     )
     return Exposure(
         number=shot.number,

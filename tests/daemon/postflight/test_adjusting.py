@@ -31,8 +31,7 @@ from processing.bundle.initial_values import completed
 from processing.bundle.network import Distances, HeadMounting, MeasuredAttitudes
 from tests.processing.bundle.simulated_networks import aerial, rotation_of
 
-HERE = Path(__file__).parents[2] / "processing" / "bundle" / "data" / "dbat-camcal"
-SHARED = Path(__file__).parents[4] / "shared" / "data" / "dbat-camcal"
+FOLDER = Path(__file__).parents[2] / "processing" / "bundle" / "data" / "dbat-camcal"
 
 PUBLISHED = {
     # report.txt of the example: value and deviation as printed.
@@ -48,18 +47,9 @@ PUBLISHED = {
 }
 
 
-@pytest.fixture(scope="module", params=["copy", "shared"])
-def folder(request) -> Path:
-    if request.param == "copy":
-        return HERE
-    if not SHARED.is_dir():
-        pytest.skip(f"{SHARED} is not here; only the copy with the tests is used")
-    return SHARED
-
-
 @pytest.fixture(scope="module")
-def calibrated(folder) -> Adjustment:
-    return adjust(completed(import_dbat(folder / "camcaldemo.xml").network))
+def calibrated() -> Adjustment:
+    return adjust(completed(import_dbat(FOLDER / "camcaldemo.xml").network))
 
 
 def published_terms(result: Adjustment) -> dict[str, tuple[float, float]]:
@@ -98,9 +88,9 @@ def test_the_published_calibration_is_repeated_to_the_printed_digits(calibrated)
 
 
 def test_the_published_calibration_is_repeated_far_below_its_standard_deviations(
-    calibrated, folder
+    calibrated,
 ) -> None:
-    camera = ElementTree.fromstring((folder / "result" / "c4040z.xml").read_text()).find(
+    camera = ElementTree.fromstring((FOLDER / "result" / "c4040z.xml").read_text()).find(
         "cameras/camera"
     )
     values = {
@@ -118,8 +108,8 @@ def test_the_published_calibration_is_repeated_far_below_its_standard_deviations
             assert abs(value - published[name]) < 1e-4 * sigma, name
 
 
-def test_every_station_is_that_of_the_published_result(calibrated, folder) -> None:
-    lines = (folder / "result" / "camera_stations.txt").read_text().splitlines()
+def test_every_station_is_that_of_the_published_result(calibrated) -> None:
+    lines = (FOLDER / "result" / "camera_stations.txt").read_text().splitlines()
     rows = [re.split(r",\s*", line) for line in lines if not line.startswith("#")]
     adjusted = exposures_of(calibrated)
     assert len(rows) == len(adjusted) == 21
@@ -132,8 +122,8 @@ def test_every_station_is_that_of_the_published_result(calibrated, folder) -> No
         assert np.degrees(own.angles_sigma_rad) == pytest.approx(numbers[9:12], rel=2e-5)
 
 
-def test_weighted_control_points_are_read_too(folder, tmp_path) -> None:
-    shutil.copytree(folder, tmp_path / "copy", copy_function=shutil.copyfile)
+def test_weighted_control_points_are_read_too(tmp_path) -> None:
+    shutil.copytree(FOLDER, tmp_path / "copy", copy_function=shutil.copyfile)
     script = tmp_path / "copy" / "camcaldemo.xml"
     text = script.read_text().replace(
         '<file format="id,label,x,y,z">reference/camcal-fixed.txt',
@@ -151,7 +141,7 @@ def test_the_command_imports_and_adjusts(tmp_path) -> None:
     runner = CliRunner()
     project, out = tmp_path / "camcal", tmp_path / "adjusted"
     imported = runner.invoke(
-        app, ["import", "dbat", str(HERE / "camcaldemo.xml"), "--out", str(project)]
+        app, ["import", "dbat", str(FOLDER / "camcaldemo.xml"), "--out", str(project)]
     )
     assert imported.exit_code == 0, imported.output
     run_result = runner.invoke(app, ["adjust", str(project), "--out", str(out), "--json"])
@@ -298,7 +288,7 @@ def test_the_old_name_of_a_key_is_refused_with_the_new_name(tmp_path) -> None:
     with pytest.raises(ProjectError) as caught:
         read_project(tmp_path / "project.toml")
     assert caught.value.problems == (
-        "project.toml: adjust: most_iterations is now named max_iterations; rename it",
+        "project.toml:4: adjust.most_iterations is now named max_iterations; rename it",
     )
 
 

@@ -18,7 +18,7 @@ import tifffile
 from hypothesis import given
 from hypothesis import strategies as st
 
-from daemon.configuration.model import from_mapping
+from daemon.configuration.service_file import from_mapping
 from daemon.mission.layout import Mission
 from daemon.mission.log.flight_log import FlightLog
 from daemon.mission.log.log_records import Message, message_of
@@ -183,9 +183,9 @@ def test_a_device_whose_bytes_are_not_logged_has_no_codec() -> None:
 
 
 def test_a_decision_survives_the_log_and_damage_is_none() -> None:
-    decision = Decision("tick", 12, 0, {"store": [3], "seal": None})
+    decision = Decision("advance", 12, 0, {"store": [3], "seal": None})
     assert decision_of(decision.message()) == decision
-    for payload in (b"", b"{}", b'{"kind": 3}', b'{"kind": "tick", "number": "x"}'):
+    for payload in (b"", b"{}", b'{"kind": 3}', b'{"kind": "advance", "number": "x"}'):
         assert decision_of(Message("decision", 1, payload)) is None
 
 

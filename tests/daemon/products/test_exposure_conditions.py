@@ -11,10 +11,11 @@ import pytest
 from daemon.configuration.model import PlanSection
 from daemon.mission.canonical_json import RecordError
 from daemon.mission.exposure import Exposure, FrameRecord, from_json
-from daemon.onboard.pipeline.worker import report_unprocessed
 from daemon.postflight.calibration.rig_writer import rig_toml
 from daemon.products.exposure_conditions import conditions_of
+from daemon.products.exposure_products import report_unprocessed
 from processing.quality.evaluation import evaluate
+from processing.quality.figures import QualityFigures
 from processing.quality.report import Flag, Verdict
 from processing.rig import RigError, find_rig
 from processing.rig.rig_file import rig_from_mapping
@@ -52,7 +53,7 @@ def test_a_flight_before_the_calibration_or_without_time_is_not_flagged() -> Non
 
 
 def test_an_expired_calibration_makes_an_exposure_usable_and_states_what_to_do() -> None:
-    report = evaluate({}, capture_flags=Flag.CALIBRATION_EXPIRED)
+    report = evaluate(QualityFigures(), capture_flags=Flag.CALIBRATION_EXPIRED)
     (finding,) = report.findings
     assert report.verdict is Verdict.USABLE
     assert "have the camera calibrated" in finding.sentence

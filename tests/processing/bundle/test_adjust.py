@@ -16,7 +16,7 @@ from processing.bundle.network import (
     Network,
     NetworkError,
 )
-from processing.bundle.rotations import vectors_from_rotations
+from processing.geometry.rotation import vectors_from_rotations
 from tests.processing.bundle.simulated_networks import (
     SimulatedNetwork,
     aerial,

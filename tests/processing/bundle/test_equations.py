@@ -10,15 +10,15 @@ import pytest
 from processing.bundle.camera_model import ideal_mm
 from processing.bundle.equations import GROUPS, BehindCameraError, equations
 from processing.bundle.network import CameraModel
-from processing.bundle.rotations import (
+from processing.bundle.unknowns import apply_corrections, initial_values, layout_of
+from processing.geometry.lens import ideal_from_measured
+from processing.geometry.rotation import (
     angles_by_rotation_vector,
     omega_phi_kappa,
+    rotation_matrix,
     rotations_from_vectors,
     vectors_from_rotations,
 )
-from processing.bundle.unknowns import apply_corrections, initial_values, layout_of
-from processing.geometry.lens import ideal_from_measured
-from processing.geometry.rotation import rotation_matrix
 from processing.rig import find_rig
 from tests.processing.bundle.simulated_networks import aerial, rotation_of, with_everything
 
@@ -113,7 +113,9 @@ def test_angles_of_many_rotations_are_those_of_one() -> None:
         small = rotations_from_vectors(np.tile(np.eye(3)[axis] * step, (20, 1)))
         there, back = rotations @ small, rotations @ np.swapaxes(small, 1, 2)
         numeric = (omega_phi_kappa(there) - omega_phi_kappa(back)) / (2 * step)
-        assert np.abs(numeric - angles_by_rotation_vector(rotations)[:, :, axis]).max() < 1e-8
+        assert (
+            np.abs(numeric - angles_by_rotation_vector("XYZ", rotations)[:, :, axis]).max() < 1e-8
+        )
 
 
 def test_points_behind_a_camera_are_reported() -> None:

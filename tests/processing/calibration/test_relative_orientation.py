@@ -9,8 +9,8 @@ from scipy.stats import chi2
 from benchmarks.midas_block import network_of
 from benchmarks.rig_calibration import EVERY, error_of, evaluate
 from processing.bundle.adjust import adjust
-from processing.bundle.rotations import rotations_from_vectors
 from processing.calibration.relative_orientation import average_rotations, relative_orientations
+from processing.geometry.rotation import rotations_from_vectors
 from sim_hw.blocks.oblique import NADIR, TABLE_2_GRAD, simulate_oblique_block
 
 GRAD = 200.0 / np.pi

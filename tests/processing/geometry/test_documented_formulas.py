@@ -1,4 +1,4 @@
-"""The formulas of docs/formats.md, written down again from the page alone, against the code."""
+"""The formulas of docs/reference/formats.md, written again from the page alone, against the code."""
 
 import math
 import re
@@ -12,7 +12,7 @@ import pytest
 from processing.geometry.placement import nominal_placements, vip_mm_from_raw, vip_px_from_mm
 from processing.rig import ThermalDrift, VirtualImage, load_rig, shipped_rigs
 
-PAGE = Path(__file__).parents[3] / "docs/formats.md"
+PAGE = Path(__file__).parents[3] / "docs/reference/formats.md"
 DC_K, CONE_DC_K = 8.0, 10.0
 PIXEL, SHIFTS = (300.0, 200.0), 13
 

@@ -21,6 +21,8 @@ from processing.mosaic.model import placement_at
 from processing.mosaic.mounting import check_platform, platform_figures, verified_mosaic
 from processing.mosaic.pan_only import pan_only_mosaic
 from processing.quality.evaluation import evaluate
+from processing.quality.figures import QualityFigures
+from processing.quality.figures.stitching import PlatformFigures
 from processing.quality.report import Flag
 from processing.rig import Rig, find_rig
 from tests.processing.synthetic import Truth, make_truth, tie_points_of
@@ -159,7 +161,7 @@ def test_a_platform_as_calibrated_has_not_expired_and_a_rotated_head_has(rig: Ri
         points = tie_points_of(healthy, rng, without_kind=PAN_TO_COLOUR)
         check = check_platform(rig, free_mosaic(rig, healthy.start, points), points, {})
         assert check is not None and check.degrees_of_freedom == 9 and not check.is_expired
-        assert not evaluate(platform_figures(check)).flags
+        assert not evaluate(QualityFigures(*platform_figures(check))).flags
     rotations = np.zeros((4, 3))
     rotations[1, 1] = 200e-6
     moved = with_rotated_heads(rig, rotations)
@@ -167,8 +169,9 @@ def test_a_platform_as_calibrated_has_not_expired_and_a_rotated_head_has(rig: Ri
     check = check_platform(rig, free_mosaic(rig, moved.start, points), points, {})
     assert check is not None and check.is_expired and check.farthest.cone == "2"
     # 200 urad at 120 mm are 2 px; a quarter of it goes into the mean of the four.
-    assert platform_figures(check)["platform_shift_px"] == pytest.approx(1.5, abs=0.08)
-    report = evaluate(platform_figures(check))
+    figures = QualityFigures(*platform_figures(check))
+    assert figures.of(PlatformFigures).platform_shift_px == pytest.approx(1.5, abs=0.08)
+    report = evaluate(figures)
     assert report.flags == Flag.CALIBRATION_EXPIRED and "Head 2" in report.findings[0].sentence
 
 

@@ -27,6 +27,7 @@ from processing.image.band_registration import (
     register_to_reference,
 )
 from processing.pipelines.bands import SATURATED, SIGNAL_UNIT, VALID, BandPipeline
+from processing.quality.figures.image import SaturationFigures
 from processing.quality.report import Flag
 from processing.rig import find_rig
 from tests.processing.textures import Texture
@@ -124,7 +125,7 @@ def test_signal_saturation_and_the_verdict_of_heads_without_absolute_calibration
     clear = product.masks["red"][middle] == VALID
     assert np.nanpercentile(difference[clear], 95) < 6.0
     share = 40 * 60 / (WIDTH * HEIGHT)
-    assert product.report.figures["saturated_fraction"] == pytest.approx(share)
+    assert product.report.figures.of(SaturationFigures).saturated_fraction == pytest.approx(share)
     assert np.mean(product.masks["red"] & SATURATED != 0) == pytest.approx(share, rel=0.1)
     assert {Flag.OVEREXPOSED, Flag.FRAME_MISSING} <= set(Flag(product.report.flags))
 

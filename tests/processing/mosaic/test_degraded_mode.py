@@ -10,6 +10,8 @@ import pytest
 
 from processing.matching.tie_points import TiePointSettings
 from processing.pipelines.stitched import Pipeline, PipelineSettings, Product
+from processing.quality.figures.circumstances import EstimatedDcFigures
+from processing.quality.figures.stitching import AdjustmentFigures, MethodFigures
 from processing.quality.nominal_area import nominal_area
 from processing.quality.report import Flag, Verdict, as_json
 from processing.rig import Rig, find_rig
@@ -42,7 +44,7 @@ def complete_product(pipeline: Pipeline, exposure: Exposure) -> Product:
 
 
 def number(product: Product, figure: str) -> float:
-    value = product.report.figures[figure]
+    value = product.report.figures.as_json()[figure]
     assert isinstance(value, float | int)
     return float(value)
 
@@ -79,7 +81,7 @@ def test_what_is_missing_leaves_an_image_that_reports_it(
     json.dumps(as_json(product_copy.report), allow_nan=False)
 
     assert product_copy.report.flags & Flag.FRAME_MISSING
-    assert figures["missing_sensors"] == ", ".join(missing)
+    assert figures.of(MethodFigures).missing_sensors == missing
     expected = Verdict.REFLY if missing == MASTER else Verdict.USABLE
     assert product_copy.report.verdict is expected
     assert not product_copy.report.flags & (
@@ -193,7 +195,7 @@ def pixel_shares(product_copy: Product) -> dict[str, float]:
 
 
 def _held(product_copy: Product) -> list[str]:
-    return str(product_copy.report.figures["undetermined"]).split(", ")
+    return list(product_copy.report.figures.of(AdjustmentFigures).undetermined)
 
 
 def test_a_stuck_probe_is_reported_by_the_stitching(pipeline: Pipeline, exposure: Exposure) -> None:
@@ -205,7 +207,7 @@ def test_a_stuck_probe_is_reported_by_the_stitching(pipeline: Pipeline, exposure
         product_copy.report.flags & Flag.DC_DISAGREEMENT
         and product_copy.report.verdict is Verdict.USABLE
     )
-    assert product_copy.report.figures["dc_disagreement"] == "1"
+    assert product_copy.report.figures.of(EstimatedDcFigures).dc_disagreement == ("1",)
     estimated, sigma = (
         number(product_copy, "dc_estimated_k"),
         number(product_copy, "dc_estimated_sigma_k"),

@@ -9,6 +9,9 @@ import pytest
 
 from benchmarks import rendered
 from processing.pipelines.stitched import Conditions, Pipeline
+from processing.quality.figures.circumstances import ProjectionFigures
+from processing.quality.figures.image import ValidFigures
+from processing.quality.figures.stitching import GreenFigures, PlatformFigures, TiePointFigures
 from processing.quality.report import Flag, Verdict
 from processing.rig import Rig
 from sim_hw.world.snapshots import RigElectronics
@@ -44,12 +47,14 @@ def test_the_virtual_image_is_within_the_accuracy_limits(flown: Flown) -> None:
     inner = rendered.errors_of(product.geometry["free"], flown.exposure.snapshot)
     assert inner["inner_rms_px"] < 0.05 and inner["inner_max_px"] < 0.15
     assert product.report.verdict is Verdict.GOOD and not product.report.flags
-    assert figures["valid_fraction"] == 1.0
-    assert figures["projection_height_m"] == 3000.0 and product.ground is not None
+    assert figures.of(ValidFigures).valid_fraction == 1.0
+    assert figures.of(ProjectionFigures).projection_height_m == 3000.0
+    assert product.ground is not None
     assert product.platform is not None and not product.platform.is_expired
-    assert isinstance(figures["tie_points_pp"], int) and figures["tie_points_pp"] > 800
+    assert (figures.of(TiePointFigures).tie_points_pp or 0) > 800
     assert all(band.registered for band in product.bands)
-    assert isinstance(figures["green_rms_px"], float) and figures["green_rms_px"] < 0.2
+    green_rms_px = figures.of(GreenFigures).green_rms_px
+    assert green_rms_px is not None and green_rms_px < 0.2
     assert set(product.colour) == {"red", "green", "blue", "nir"}
     assert all(band.shape == (380, 700) for band in product.colour.values())
     assert product.balance.spread < 0.01
@@ -62,7 +67,7 @@ def test_a_platform_that_has_rotated_is_reported_as_expired_and_corrected(flown:
     product = pipeline.process(flown.frames, flown.conditions)
     assert product.report.flags == Flag.CALIBRATION_EXPIRED
     assert product.report.verdict is Verdict.USABLE
-    assert product.report.figures["platform_shift_head"] == "3"
+    assert product.report.figures.of(PlatformFigures).platform_shift_head == "3"
     inner = rendered.errors_of(product.geometry["free"], flown.exposure.snapshot)
     assert inner["inner_rms_px"] < 0.05 and inner["inner_max_px"] < 0.15
 
@@ -71,7 +76,7 @@ def test_without_one_head_three_quarters_of_the_image_remain(flown: Flown) -> No
     frames = {name: frame for name, frame in flown.frames.items() if name != "P3"}
     product = flown.pipeline.process(frames, flown.conditions)
     assert Flag.FRAME_MISSING in product.report.flags
-    valid = product.report.figures["valid_fraction"]
+    valid = product.report.figures.of(ValidFigures).valid_fraction
     assert isinstance(valid, float) and 0.7 < valid < 0.85
     assert not (product.valid[-100:, :100]).any()
     inner = rendered.errors_of(product.geometry["free"], flown.exposure.snapshot)

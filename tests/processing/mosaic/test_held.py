@@ -91,8 +91,8 @@ def test_residuals_say_which_head_has_another_scale_and_by_how_much(
     expected = [-f_ppm * 1e-6 * (cone == head) for cone in found.cones]
     np.testing.assert_allclose(found.scales, expected, atol=25e-6)
     figures = scale_figures(found)
-    assert figures["platform_scale_head"] == head
-    assert figures["platform_scale_ppm"] == pytest.approx(f_ppm, abs=25.0)
+    assert figures.platform_scale_head == head
+    assert figures.platform_scale_ppm == pytest.approx(f_ppm, abs=25.0)
     part = scaled_part(found, least=50e-6)
     assert part is not None
     for name, error in apart_px(wrong).items():
@@ -111,8 +111,8 @@ def test_a_scale_within_its_own_sigma_is_no_finding() -> None:
     loud = dataclasses.replace(found, scales=np.array([0.0, 9e-4, 0.0, 0.0]))
     assert scaled_part(loud, least=50e-6) is not None
     unsure = dataclasses.replace(loud, scale_sigmas=np.full(4, 3e-4))
-    assert scaled_part(unsure, least=50e-6) is None and scale_figures(unsure) == {}
-    assert scale_figures(loud)["platform_scale_head"] == "2"
+    assert scaled_part(unsure, least=50e-6) is None and scale_figures(unsure) is None
+    assert scale_figures(loud).platform_scale_head == "2"
 
 
 def test_rigs_with_a_master_hold_nothing() -> None:

@@ -14,6 +14,7 @@ from processing.geometry.rotation import rotation_matrix
 from processing.geometry.similarity import fit_similarity
 from processing.mosaic.free_mosaic import Mosaic
 from processing.mosaic.layers import LayerChange, LayerCheck, check_layers, layer_figures
+from processing.quality.figures import QualityFigures
 from processing.rig import Cone, Rig
 from tests.processing.mosaic.test_precision import mosaic_of
 
@@ -205,7 +206,7 @@ def check_of(
 
 
 def test_figures_of_the_check_are_of_the_layer_that_moved_farthest() -> None:
-    assert layer_figures(check_of(("2", "1"), ("0",), 20.0)) == {
+    assert QualityFigures(*layer_figures(check_of(("2", "1"), ("0",), 20.0))).as_json() == {
         "platform_test": 2.5,
         "platform_shift_px": 0.7,
         "platform_shift_head": "2",
@@ -217,7 +218,7 @@ def test_figures_of_the_check_are_of_the_layer_that_moved_farthest() -> None:
     }
     healthy = check_of((), (), 8.0)
     assert not healthy.changed and check_of((), (), 8.01).changed
-    figures = layer_figures(healthy)
+    figures = QualityFigures(*layer_figures(healthy)).as_json()
     assert figures["platform_causes"] is None and figures["platform_alternatives"] is None
     assert figures["platform_master_changed"] == 0
-    assert layer_figures(None) == {}
+    assert layer_figures(None) == ()

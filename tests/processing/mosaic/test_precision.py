@@ -311,7 +311,7 @@ def test_figures_are_root_mean_squares_over_middle_and_corners_of_present_sensor
         np.mean(placed_sigma_px(rig, mosaic, s, np.array(at, float), NO_READING, found) ** 2)
         for s in ("SU00", "SU10")
     ]
-    assert figures["stitched_sigma_px"] == pytest.approx(np.sqrt(np.mean(mean)))
-    assert figures["stitched_sigma_worst_px"] == pytest.approx(np.sqrt(mean[1]))
-    assert figures["stitched_sigma_worst_sensor"] == "SU10"
-    assert precision_figures(rig, mosaic, (), NO_READING) == {}
+    assert figures.stitched_sigma_px == pytest.approx(np.sqrt(np.mean(mean)))
+    assert figures.stitched_sigma_worst_px == pytest.approx(np.sqrt(mean[1]))
+    assert figures.stitched_sigma_worst_sensor == "SU10"
+    assert precision_figures(rig, mosaic, (), NO_READING) is None

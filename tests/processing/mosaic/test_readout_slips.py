@@ -234,7 +234,7 @@ def test_columns_are_measured_by_the_width_of_the_frame() -> None:
 
 def test_figures_name_the_first_slip_and_all_frames() -> None:
     other = Slip("SU10", "columns", 0, 9, 0.1, 0.0, 0.1, 20.0, 30)
-    assert slip_figures(MINI, (SLIP, other)) == {
+    assert slip_figures(MINI, (SLIP, other)).as_json() == {
         "slip_sensor": "SU00",
         "slip_cone": "0",
         "slip_px": 2.5,
@@ -244,7 +244,7 @@ def test_figures_name_the_first_slip_and_all_frames() -> None:
         "slip_alternatives": None,
         "slip_sensors": "SU00, SU10",
     }
-    assert set(slip_figures(MINI, ()).values()) == {None}
+    assert set(slip_figures(MINI, ()).as_json().values()) == {None}
 
 
 def test_residuals_are_as_sure_as_their_class_and_their_own_match() -> None:

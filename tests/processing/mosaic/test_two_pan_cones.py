@@ -22,6 +22,7 @@ from processing.geometry.projective import apply_projective
 from processing.mosaic.free_mosaic import free_mosaic
 from processing.mosaic.pan_only import pan_only_mosaic
 from processing.pipelines.stitched import Pipeline, PipelineSettings, Product
+from processing.quality.figures.stitching import DisplacedSensorFigures, PrecisionFigures
 from processing.quality.report import Flag, Verdict
 from processing.rig import Rig, find_rig
 from tests.processing.emulated_exposure import EmulatedExposure, after_similarity, expose, rms
@@ -69,7 +70,7 @@ def test_nothing_is_stated_of_a_displacement_that_cannot_be_seen(flown: Flown) -
     validity = flown.product.validity
     assert validity is not None and validity.displaced is None and not validity.relative
     assert set(validity.observability.values()) == {"unobservable"}
-    assert flown.product.report.figures["displaced_sensor"] is None
+    assert flown.product.report.figures.of(DisplacedSensorFigures).displaced_sensor is None
 
 
 def test_the_bayer_heads_colours_share_greens_place_and_nir_comes_to_it(flown: Flown) -> None:
@@ -168,5 +169,5 @@ def test_a_missing_frame_leaves_an_image_of_what_is_there(
     assert rms(inner) < bar
     assert (product.valid > 0).mean() == pytest.approx(pan, abs=0.06)
     assert Flag.FRAME_MISSING in product.report.flags
-    stated = product.report.figures["stitched_sigma_px"]
+    stated = product.report.figures.of(PrecisionFigures).stitched_sigma_px
     assert isinstance(stated, float) and rms(errors) < np.sqrt(2.0) * stated

@@ -1,4 +1,4 @@
-"""Thresholds have the defaults that docs/formats.md states, and are named there."""
+"""Thresholds have the defaults that docs/reference/formats.md states, and are named there."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 
 from processing.quality.report import Thresholds
 
-DOCUMENT = Path(__file__).parents[3] / "docs" / "formats.md"
+DOCUMENT = Path(__file__).parents[3] / "docs/reference/formats.md"
 
 
 def documented() -> dict[str, float]:

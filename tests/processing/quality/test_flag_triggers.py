@@ -1,7 +1,8 @@
 """Each flag is raised by what it is there for, at twice its threshold, and by nothing else.
 
 The faults are in the light, the true camera, the probes or the instruments of a rendered exposure;
-flags of capture are provoked in tests/faults. Rates over many exposures: docs/accuracy.md.
+flags of capture are provoked in tests/faults. Rates over many exposures:
+docs/reference/results/accuracy.md.
 """
 
 from __future__ import annotations

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Mapping
+from typing import Any
 
 import pytest
 
 from processing.quality.evaluation import evaluate
-from processing.quality.report import NO_FLAGS, Flag, Thresholds, Verdict, as_json
+from processing.quality.figures import QualityFigures
+from processing.quality.report import NO_FLAGS, Flag, QualityReport, Thresholds, Verdict, as_json
 
 GOOD = {
     "sigma0_px": 0.05,
@@ -28,16 +31,21 @@ GOOD = {
 }
 
 
+def evaluated(figures: Mapping[str, Any], **known: Any) -> QualityReport:
+    """The verdict on figures by their documented names."""
+    return evaluate(QualityFigures.from_json(figures), **known)
+
+
 def test_good_figures_make_a_good_exposure() -> None:
-    report = evaluate(GOOD)
+    report = evaluated(GOOD)
     assert report.verdict is Verdict.GOOD
     assert report.flags == NO_FLAGS and report.findings == ()
 
 
 def test_what_is_not_known_is_not_evaluated() -> None:
-    assert evaluate({}).verdict is Verdict.GOOD
-    assert evaluate(dict.fromkeys(GOOD)).verdict is Verdict.GOOD
-    assert evaluate(dict.fromkeys(GOOD, math.nan)).verdict is Verdict.GOOD
+    assert evaluated({}).verdict is Verdict.GOOD
+    assert evaluated(dict.fromkeys(GOOD)).verdict is Verdict.GOOD
+    assert evaluated(dict.fromkeys(GOOD, math.nan)).verdict is Verdict.GOOD
 
 
 @pytest.mark.parametrize(
@@ -66,7 +74,7 @@ def test_what_is_not_known_is_not_evaluated() -> None:
 def test_each_figure_beyond_its_threshold_raises_its_flag(
     name: str, value: float, flag: Flag, verdict: Verdict
 ) -> None:
-    report = evaluate(GOOD | {name: value})
+    report = evaluated(GOOD | {name: value})
     assert report.flags == flag
     assert report.verdict is verdict
     (finding,) = report.findings
@@ -75,18 +83,18 @@ def test_each_figure_beyond_its_threshold_raises_its_flag(
 
 
 def test_an_exposure_without_tie_points_is_flown_again() -> None:
-    report = evaluate(GOOD | {"tie_points_pp": 3, "tie_points_min_overlap": 0})
+    report = evaluated(GOOD | {"tie_points_pp": 3, "tie_points_min_overlap": 0})
     assert report.verdict is Verdict.REFLY
 
 
 def test_a_missing_frame_makes_the_exposure_usable_at_most() -> None:
-    report = evaluate(GOOD, missing_sensors=["SU10"])
+    report = evaluated(GOOD, missing_sensors=["SU10"])
     assert report.verdict is Verdict.USABLE and report.flags == Flag.FRAME_MISSING
     assert "SU10" in report.findings[0].sentence
 
 
 def test_a_displaced_sensor_that_was_handled_is_no_reason_to_fly_again() -> None:
-    report = evaluate(
+    report = evaluated(
         GOOD | {"displaced_sensor": "SU01", "displacement_x_px": 0.6, "displacement_y_px": -0.8}
     )
     assert report.verdict is Verdict.USABLE and report.flags == Flag.DISPLACED_SENSOR
@@ -94,7 +102,7 @@ def test_a_displaced_sensor_that_was_handled_is_no_reason_to_fly_again() -> None
 
 
 def test_probes_are_named_and_their_flags_distinguished() -> None:
-    report = evaluate(GOOD, missing_probes=["1", "G"], probes_out_of_range=["2"])
+    report = evaluated(GOOD, missing_probes=["1", "G"], probes_out_of_range=["2"])
     assert report.flags == Flag.TEMPERATURE_MISSING | Flag.TEMPERATURE_RANGE
     assert "probe 1, G" in report.findings[0].sentence
 
@@ -117,26 +125,26 @@ def test_every_flag_capture_may_raise_states_what_to_do() -> None:
     for flag in Flag:
         if flag & figures_only:
             continue
-        report = evaluate(GOOD, capture_flags=flag)
+        report = evaluated(GOOD, capture_flags=flag)
         assert report.flags == flag
         assert [finding.flag for finding in report.findings] == [flag]
 
 
 def test_a_capture_flag_without_figures_is_retained() -> None:
-    assert evaluate(GOOD, capture_flags=Flag.TIME_SIGMA).flags == Flag.TIME_SIGMA
+    assert evaluated(GOOD, capture_flags=Flag.TIME_SIGMA).flags == Flag.TIME_SIGMA
 
 
 def test_simulation_is_reported_and_does_not_spoil_the_verdict() -> None:
-    report = evaluate(GOOD, capture_flags=Flag.SIMULATED)
+    report = evaluated(GOOD, capture_flags=Flag.SIMULATED)
     assert report.verdict is Verdict.GOOD and report.flags == Flag.SIMULATED
 
 
 def test_thresholds_are_the_configurations_to_change() -> None:
-    assert evaluate(GOOD, thresholds=Thresholds(sigma0_px=0.01)).flags == Flag.SIGMA0
+    assert evaluated(GOOD, thresholds=Thresholds(sigma0_px=0.01)).flags == Flag.SIGMA0
 
 
 def test_json_has_no_nan_and_names_its_flags() -> None:
-    report = evaluate(
+    report = evaluated(
         GOOD | {"sigma0_px": math.nan, "sharpness": math.inf, "sigma0_um": -math.inf},
         capture_flags=Flag.MARK_MISSING,
         missing_sensors=["G"],
@@ -166,22 +174,22 @@ def test_bits_keep_their_places_for_ever() -> None:
 
 def test_two_displaced_sensors_are_reported_as_ambiguous() -> None:
     moved = {"displaced_sensor": "SU01", "displacement_x_px": 0.6, "displacement_y_px": -0.8}
-    report = evaluate(GOOD | moved | {"displaced_several": 1})
+    report = evaluated(GOOD | moved | {"displaced_several": 1})
     assert report.flags == Flag.DISPLACED_SENSOR
     assert "More than one sensor" in report.findings[0].sentence
     assert "cannot be determined" in report.findings[0].sentence
-    unsure = evaluate(GOOD | moved | {"displaced_alternatives": "SU00, SU03"})
+    unsure = evaluated(GOOD | moved | {"displaced_alternatives": "SU00, SU03"})
     assert "unless it is SU00, SU03" in unsure.findings[0].sentence
 
 
 def test_a_probe_that_explains_it_is_named_instead_of_a_sensor_or_in_addition_to_it() -> None:
     misread = {"misread_probe": "0", "misread_k": 3.96, "misread_sigma_k": 0.2}
-    report = evaluate(GOOD | misread | {"dc_disagreement": "0"})
+    report = evaluated(GOOD | misread | {"dc_disagreement": "0"})
     assert report.flags == Flag.DC_DISAGREEMENT and report.verdict is Verdict.USABLE
     (finding,) = report.findings
     assert "probe 0 reads 4.0 K too high" in finding.sentence
     moved = {"displaced_sensor": "SU01", "displacement_x_px": 0.6, "displacement_y_px": -0.8}
-    report = evaluate(GOOD | misread | moved | {"misread_k": -2.0})
+    report = evaluated(GOOD | misread | moved | {"misread_k": -2.0})
     assert report.flags == Flag.DC_DISAGREEMENT | Flag.DISPLACED_SENSOR
     for finding in report.findings:
         assert "probe 0 reads 2.0 K too low" in finding.sentence and "SU01" in finding.sentence
@@ -190,7 +198,7 @@ def test_a_probe_that_explains_it_is_named_instead_of_a_sensor_or_in_addition_to
 
 def test_an_overlap_without_tie_points_because_it_is_saturated_reports_it() -> None:
     few = {"tie_points_min_overlap": 3, "tie_points_min_overlap_name": "SU03-SU11"}
-    saturated_report = evaluate(
+    saturated_report = evaluated(
         GOOD | few | {"tie_points_min_overlap_burnt": 0.83, "saturated_fraction": 0.06}
     )
     assert saturated_report.flags == Flag.TIE_POINTS | Flag.OVEREXPOSED
@@ -201,12 +209,12 @@ def test_an_overlap_without_tie_points_because_it_is_saturated_reports_it() -> N
         "SU03-SU11 because it is saturated: 83%" in sentence_of_overlap
         and "water" not in sentence_of_overlap
     )
-    lake = evaluate(GOOD | few | {"tie_points_min_overlap_burnt": 0.1, "saturated_fraction": 0.06})
+    lake = evaluated(GOOD | few | {"tie_points_min_overlap_burnt": 0.1, "saturated_fraction": 0.06})
     sentence_of_overlap = next(f.sentence for f in lake.findings if f.flag == Flag.TIE_POINTS)
     assert "water" in sentence_of_overlap
 
 
 def test_sensors_that_rest_on_calibration_are_reported() -> None:
-    report = evaluate(GOOD | {"resting_on_calibration": "SU00, SU10"})
+    report = evaluated(GOOD | {"resting_on_calibration": "SU00, SU10"})
     assert report.flags == Flag.TIE_POINTS and report.verdict is Verdict.USABLE
     assert "Too little detail to place SU00, SU10" in report.findings[0].sentence

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from processing.quality.evaluation import evaluate
-from processing.quality.report import Figure, Flag, Verdict
+from processing.quality.figures import Figure
+from processing.quality.report import Flag, Verdict
 from processing.quality.requirements import QualityRequirements
-from tests.processing.quality.test_report import GOOD
+from tests.processing.quality.test_report import GOOD, evaluated
 
 REQUIREMENTS = QualityRequirements(
     forward_overlap=0.5,
@@ -30,7 +30,7 @@ CONFORMING: dict[str, Figure] = {
 
 
 def test_an_exposure_that_keeps_everything_is_good() -> None:
-    assert evaluate(GOOD | CONFORMING, requirements=REQUIREMENTS).verdict is Verdict.GOOD
+    assert evaluated(GOOD | CONFORMING, requirements=REQUIREMENTS).verdict is Verdict.GOOD
 
 
 @pytest.mark.parametrize(
@@ -49,16 +49,16 @@ def test_what_breaks_it_is_flown_again_and_states_by_how_much(
     name: str, value: float, flag: Flag, phrase: str
 ) -> None:
     figures = GOOD | CONFORMING | {name: value}
-    report = evaluate(figures, requirements=REQUIREMENTS)
+    report = evaluated(figures, requirements=REQUIREMENTS)
     assert report.verdict is Verdict.REFLY
     assert report.flags == flag
     (finding,) = report.findings
     assert phrase in finding.sentence
     assert "again" in finding.sentence
     assert finding.value == value
-    assert evaluate(figures).verdict is not Verdict.REFLY
+    assert evaluated(figures).verdict is not Verdict.REFLY
 
 
 def test_what_is_not_known_is_not_evaluated() -> None:
     unknown = dict.fromkeys(CONFORMING)
-    assert evaluate({**GOOD, **unknown}, requirements=REQUIREMENTS).verdict is Verdict.GOOD
+    assert evaluated({**GOOD, **unknown}, requirements=REQUIREMENTS).verdict is Verdict.GOOD

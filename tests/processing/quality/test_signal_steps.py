@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from processing.image.line_means import line_means
 from processing.quality.frame_blocks import _has_run, _texture
 from processing.quality.signal_steps import (
     SignalStep,
     _largest,
     _medians,
     _signs,
-    line_means_of,
     signal_steps,
     step_figures,
 )
@@ -139,30 +139,32 @@ def frames(count: int, level: int = 4000) -> dict[str, NDArray[np.uint16]]:
     return line_values
 
 
-ROWS = {s.name: (FIRST, FIRST + SIDE - 1) for s in SENSORS}
+def steps_of(line_values: dict[str, NDArray[np.uint16]]) -> tuple[SignalStep, ...]:
+    rows = (FIRST, FIRST + SIDE - 1)
+    return signal_steps(SENSORS, {n: line_means(f, rows) for n, f in line_values.items()})
 
 
 def test_steps_of_frames_are_named_the_largest_first() -> None:
     line_values = frames(2)
     a, b = line_values
-    assert signal_steps(SENSORS, line_means_of(SENSORS, line_values, ROWS)) == ()
+    assert steps_of(line_values) == ()
     line_values[a][:, 300:] = 4400
     line_values[a][:FIRST], line_values[a][FIRST + SIDE :] = 0, 0
     line_values[b][FIRST + SIDE - 1] = 2000
-    found = signal_steps(SENSORS, line_means_of(SENSORS, line_values, ROWS))
+    found = steps_of(line_values)
     assert [(s.sensor, s.axis, s.at, s.lines) for s in found] == [
         (b, "rows", FIRST + SIDE - 2, 1),
         (a, "columns", 299, 1),
     ]
     assert [s.relative for s in found] == pytest.approx([-2000 / 3000, 400 / 4200])
-    assert step_figures(found) == {
+    assert step_figures(found).as_json() == {
         "signal_step": pytest.approx(-2 / 3),
         "signal_step_sensor": b,
         "signal_step_axis": "rows",
         "signal_step_at": FIRST + SIDE - 2,
         "signal_step_lines": 1,
     }
-    assert set(step_figures(()).values()) == {None}
+    assert set(step_figures(()).as_json().values()) == {None}
 
 
 @pytest.mark.parametrize(("count", "found"), [(2, 2), (3, 0)])
@@ -170,7 +172,7 @@ def test_steps_in_three_frames_are_the_ground_s(count: int, found: int) -> None:
     line_values = frames(4)
     for frame in list(line_values.values())[:count]:
         frame[FIRST + 100 : FIRST + SIDE] = 4400
-    assert len(signal_steps(SENSORS, line_means_of(SENSORS, line_values, ROWS))) == found
+    assert len(steps_of(line_values)) == found
 
 
 @pytest.mark.parametrize(("step_dn", "found"), [(5.75, 0), (6.25, 1)])
@@ -179,7 +181,7 @@ def test_six_dn_of_a_sensor_are_the_least_step(step_dn: float, found: int) -> No
     line_values = frames(1, level=400)
     frame = line_values[SENSORS[0].name]
     frame[FIRST + 100 : FIRST + SIDE] = 400 + round(8 * step_dn)
-    assert len(signal_steps(SENSORS, line_means_of(SENSORS, line_values, ROWS))) == found
+    assert len(steps_of(line_values)) == found
 
 
 @pytest.mark.parametrize("bundles", [16, 21])

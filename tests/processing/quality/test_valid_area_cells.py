@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from processing.quality.evaluation import evaluate
 from processing.quality.report import Flag
 from processing.quality.valid_area import _coarser, _smoothed, boxes_of, from_json
+from tests.processing.quality.test_report import evaluated
 
 
 @pytest.mark.parametrize(("count", "saturated"), [(12, False), (13, True)])
@@ -78,5 +78,5 @@ def test_a_layer_that_a_slip_explains_is_no_expired_calibration(
         "platform_shift_head": "2",
         "slip_cone": slipped,
     }
-    report = evaluate(figures)
+    report = evaluated(figures)
     assert (Flag.CALIBRATION_EXPIRED in report.flags) == raised

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from processing.quality.figures.image import WordFormatFigures
 from processing.quality.word_format import word_format_figures, wrong_format
 from processing.rig import find_rig
 
@@ -79,9 +80,8 @@ def test_values_of_sixteen_bits_may_be_any() -> None:
 
 def test_figures_name_formats_and_sensors() -> None:
     good, wrong = frame(), frame().byteswap()
-    assert word_format_figures(MINI, {"SU00": good, "SU01": good}) == {}
+    assert word_format_figures(MINI, {"SU00": good, "SU01": good}) is None
     raw = {"SU00": wrong, "SU01": good, "SU02": wrong, "SU03": good << 4}
-    assert word_format_figures(MINI, raw) == {
-        "word_format": "byte-swapped, left-justified",
-        "word_format_sensors": "SU00, SU02, SU03",
-    }
+    assert word_format_figures(MINI, raw) == WordFormatFigures(
+        ("byte-swapped", "left-justified"), ("SU00", "SU02", "SU03")
+    )

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from processing.image.line_means import line_means
 from processing.radiometry.calibration import RadiometricCalibration, neutral_radiometry
 from processing.radiometry.level1 import (
     LEVEL1_FLOOR,
@@ -16,6 +17,7 @@ from processing.radiometry.level1 import (
     exposed_rows,
     level1_counts_per_dn,
     level1_from_level0,
+    unread_fraction,
 )
 from processing.rig import Sensor, find_rig
 
@@ -187,6 +189,40 @@ def test_the_result_does_not_depend_on_the_number_of_threads(
         numba.set_num_threads(before)
     assert np.array_equal(results[0][0], results[1][0])
     assert results[0][1] == results[1][1]
+
+
+@pytest.mark.parametrize(("sign", "shifts"), [(1, 0), (1, 9), (-1, 9), (1, 70)])
+@pytest.mark.parametrize("flat", [True, False])
+def test_lines_and_unread_words_are_those_of_the_finished_frame(
+    sensor: Sensor, calibration: RadiometricCalibration, flat: bool, sign: int, shifts: int
+) -> None:
+    random = np.random.default_rng(4)
+    sensor = replace(sensor, tdi_row_sign=sign)
+    raw = random.integers(100, 4096, SHAPE).astype(np.uint16)
+    raw[:12] = 0
+    raw[-7:-3] = 0
+    defect = (random.uniform(size=SHAPE) < 0.02).astype(np.uint8)
+    defect[:, 33] = 1
+    made = replace(neutral_radiometry(sensor) if flat else calibration, defect=defect)
+    out = np.full(SHAPE, 77, np.uint16)
+    seen = level1_from_level0(
+        corrector_for(sensor, made),
+        raw,
+        temperature_c=25.0,
+        exposure_time_s=0.01,
+        tdi_shifts=shifts,
+        out=out,
+        measure_lines=True,
+    )
+    assert seen.unread_fraction == unread_fraction(sensor, raw) == 16 / SHAPE[0]
+    expected = line_means(out, exposed_rows(sensor, shifts))
+    if not expected.by_column.size:
+        assert seen.lines is None
+        return
+    assert seen.lines is not None and expected.by_row.any() and expected.by_column.any()
+    assert seen.lines.first_row == expected.first_row
+    assert np.array_equal(seen.lines.by_row, expected.by_row)
+    assert np.array_equal(seen.lines.by_column, expected.by_column)
 
 
 def test_signal_below_black_is_held_above_no_data(sensor: Sensor) -> None:

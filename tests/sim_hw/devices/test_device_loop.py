@@ -14,6 +14,9 @@ from sim_hw.devices.device_loop import LineDevice
 from sim_hw.devices.network_line import TcpLine, UdpLine
 from sim_hw.devices.pseudo_terminal import PseudoTerminal
 
+pytestmark = pytest.mark.realtime
+
+
 WITHIN_S = 10.0
 
 

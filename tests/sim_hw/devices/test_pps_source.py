@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import threading
 
+import pytest
+
 from drivers.contract import DeviceEvent, PpsEdge
 from drivers.triggers.pps.device import PpsDevice
 from sim_hw.devices.pps_source import PpsSource
 from sim_hw.world.world_clock import NS_PER_S, WorldClock
+
+pytestmark = pytest.mark.realtime
 
 
 def test_edges_are_full_seconds_of_gps_time_and_a_pulled_cable_is_reported() -> None:

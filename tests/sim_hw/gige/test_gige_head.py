@@ -28,6 +28,9 @@ from sim_hw.gige.gige_head import (
 from sim_hw.gige.registers import RegisterMemory
 from sim_hw.world.world_clock import FreeRunningClock
 
+pytestmark = pytest.mark.realtime
+
+
 SIZE = FrameSize(320, 200)
 IDENTITY = HeadIdentity("127.77.1.1", "T-0001", "Head", "Maker", "SU00")
 ADDRESS_OF = RegisterMemory(IDENTITY, SIZE).address_of

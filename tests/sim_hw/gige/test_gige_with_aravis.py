@@ -25,7 +25,7 @@ from sim_hw.gige.gige_head import (
 )
 from sim_hw.world.world_clock import FreeRunningClock
 
-pytestmark = pytest.mark.peer
+pytestmark = [pytest.mark.realtime, pytest.mark.peer]
 
 SIZE = FrameSize(1248, 832)
 PATTERN = np.random.default_rng(7).integers(0, 4096, (832, 1248), dtype=np.uint16)

@@ -25,6 +25,9 @@ from sim_hw.receivers.mavlink_messages import (
 from sim_hw.world.world_clock import WorldClock
 from tests.sim_hw.receiver_state import NS, START_GPS_NS, STATE, state_at
 
+pytestmark = pytest.mark.realtime
+
+
 dialect = pytest.importorskip(
     "pymavlink.dialects.v20.ardupilotmega", reason="pymavlink is absent; pip install it"
 )

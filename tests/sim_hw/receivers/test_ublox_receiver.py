@@ -30,6 +30,10 @@ from sim_hw.receivers.ublox_receiver import (
 )
 from sim_hw.world.world_clock import WorldClock
 from tests.sim_hw.receiver_state import NS, START_GPS_NS, STATE, WEEK_NS, state_at
+from tests.stopwatch import Stopwatch
+
+pytestmark = pytest.mark.realtime
+
 
 GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC)
 
@@ -286,7 +290,9 @@ def test_live_bytes_arrive_30_to_80_ms_after_their_epoch_and_marks_with_them() -
     try:
         mark_ns = clock.gps_ns(time.monotonic_ns()) + 300_000_000
         receiver.mark(mark_ns)
+        watch = Stopwatch()
         pieces = host.read_for(1.5)
+        withheld_ms = 1e3 * watch.withheld_s
     finally:
         receiver.close()
         host.close()
@@ -297,7 +303,9 @@ def test_live_bytes_arrive_30_to_80_ms_after_their_epoch_and_marks_with_them() -
             delays_ms.append((arrived_mono_ns - clock.mono_ns(gps_ns_of(pvt))) / 1e6)
     assert len(delays_ms) >= 5
     assert min(delays_ms) >= LATENCY_NS[0] / 1e6
-    assert sorted(delays_ms)[len(delays_ms) // 2] <= LATENCY_NS[1] / 1e6 + 20
+    # Half of the epochs cannot have waited longer for a core than all of them together.
+    margin_ms = 20 + withheld_ms / (len(delays_ms) // 2)
+    assert sorted(delays_ms)[len(delays_ms) // 2] <= LATENCY_NS[1] / 1e6 + margin_ms
     (mark,) = marks_of(parse(b"".join(data for _, data in pieces)))
     assert mark.wnR * WEEK_NS + mark.towMsR * 1_000_000 + mark.towSubMsR == mark_ns
 
@@ -377,7 +385,8 @@ def test_gpsd_reports_the_position_and_the_time() -> None:
         stderr=subprocess.DEVNULL,
     )
     try:
-        report = gpsd_position(port, timeout_s=20.0)
+        watch = Stopwatch()
+        report = gpsd_position(port, timeout_s=60.0)
         now_ns = clock.gps_ns(time.monotonic_ns())
     finally:
         gpsd.terminate()
@@ -389,7 +398,7 @@ def test_gpsd_reports_the_position_and_the_time() -> None:
     assert report["speed"] == pytest.approx(62.466, abs=0.01)
     reported = datetime.fromisoformat(report["time"])
     age_s = now_ns / NS - 18 - (reported - GPS_EPOCH).total_seconds()
-    assert 0.0 < age_s < 2.0
+    assert 0.0 < age_s < 2.0 + watch.withheld_s
 
 
 def gpsd_position(port: int, timeout_s: float) -> dict[str, Any]:

@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from daemon.errors import DaemonError
 from daemon.onboard.monitoring.access.roles import COMMAND_ROLES, Principal, missing_role
 from daemon.onboard.monitoring.web.refusal_limiter import SUMMARY_EVERY_S, RefusalLimiter
 from daemon.onboard.service.messages import Answer, CommandRefused, ServiceCommand
@@ -20,11 +21,11 @@ from daemon.onboard.service.messages import Answer, CommandRefused, ServiceComma
 ANSWER_TIMEOUT_S = 5.0
 
 
-class AnswerTimeoutError(RuntimeError):
+class AnswerTimeoutError(DaemonError):
     """The service did not answer in time."""
 
 
-class NotPermittedError(RuntimeError):
+class NotPermittedError(DaemonError):
     """The sender does not have the required role."""
 
 

@@ -36,6 +36,7 @@ from daemon.onboard.monitoring.access.roles import Principal, Role
 from daemon.onboard.monitoring.flight_state import FlightState
 from daemon.onboard.monitoring.web.api import CommandName
 from daemon.onboard.service.command_rules import CommandBody
+from processing.rig.problem_sentences import findings_of, sentences
 
 SO_PEERGROUPS: Final = 59
 """Of Linux 4.13, <asm-generic/socket.h>; Python has no name for it."""
@@ -262,10 +263,7 @@ def _request(line: bytes) -> tuple[str, dict[str, Any]] | str:
         body = CommandBody.model_validate(arguments)
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         if isinstance(error, ValidationError):
-            details = "; ".join(
-                f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors()
-            )
-            return f"arguments: {details}"
+            return f"arguments: {'. '.join(sentences(findings_of(error)))}"
         return 'not understood; a line is {"command": NAME, "arguments": {...}}'
     if name not in get_args(CommandName):
         return f"there is no command {str(name)[:40]!r}; one of {', '.join(get_args(CommandName))}"

@@ -34,6 +34,7 @@ from daemon.onboard.monitoring.mavlink.requests import (
 from daemon.onboard.monitoring.mavlink.senders import Address, Senders
 from daemon.onboard.monitoring.mavlink.signatures import Signatures, read_key
 from drivers.base.extras import require
+from drivers.receivers.attitude import quaternion_of
 from drivers.receivers.mavlink.library import MavlinkParser
 from drivers.timescales.leap_seconds import leap_seconds_at
 from processing.rig import Rig
@@ -471,18 +472,10 @@ def _scaled(value: float | None, scale: float) -> int:
 
 def _quaternion(place: Mapping[str, Any]) -> tuple[float, ...]:
     """Camera attitude as quaternion w, x, y, z relative to north, east, down."""
-    angles = [place.get(f"{name}_rad") for name in _ANGLES]
-    if any(angle is None for angle in angles):
+    roll, pitch, heading = (place.get(f"{name}_rad") for name in _ANGLES)
+    if roll is None or pitch is None or heading is None:
         return UNKNOWN_ANGLE
-    (cr, sr), (cp, sp), (ch, sh) = (
-        (math.cos(a / 2), math.sin(a / 2)) for a in angles if a is not None
-    )
-    return (
-        cr * cp * ch + sr * sp * sh,
-        sr * cp * ch - cr * sp * sh,
-        cr * sp * ch + sr * cp * sh,
-        cr * cp * sh - sr * sp * ch,
-    )
+    return quaternion_of(roll, pitch, heading)
 
 
 def _disk_mb(path: str | None) -> tuple[float, float, float]:

@@ -2,7 +2,7 @@
 
 Nothing is acknowledged. The brief state, faults and the latest exposure are sent first and most
 often. The remaining budget repeats earlier exposures, so that a client that lost datagrams or
-connected late obtains the same state. Format in docs/telemetry.md.
+connected late obtains the same state. Format in docs/reference/flight/telemetry.md.
 """
 
 from __future__ import annotations

@@ -249,8 +249,8 @@ def _add_state(app: FastAPI, state: FlightState, access: _AccessControl) -> None
 
     @app.get("/api/v1/devices", dependencies=[watcher], tags=["state"])
     async def devices() -> list[dict[str, Any]]:
-        """Every device, whether it delivers, and what helps if not."""
-        return state.changed("devices", 0)
+        """Every device, whether it delivers, what helps if not, and its counters."""
+        return state.devices()
 
     @app.get("/api/v1/faults", dependencies=[watcher], tags=["state"])
     async def faults() -> list[dict[str, Any]]:
@@ -366,7 +366,10 @@ def _add_telemetry(app: FastAPI, state: FlightState, access: _AccessControl) -> 
         form: Literal["json", "msgpack"] = "msgpack",
         bytes_per_s: float = math.inf,
     ) -> None:
-        """Records as in docs/telemetry.md, beginning with the complete state, until the client disconnects."""
+        """Records as in docs/reference/flight/telemetry.md, until the client disconnects.
+
+        The first record holds the complete state.
+        """
         if "token" in socket.query_params:
             await socket.close(1008, "a token belongs into a header, not into the address")
             return

@@ -5,12 +5,13 @@ from __future__ import annotations
 import asyncio
 import json
 from collections.abc import AsyncIterator
-from typing import Any
 
 from fastapi import HTTPException, Request
 from pydantic import ValidationError
 
+from daemon.mission.canonical_json import parse_record
 from daemon.onboard.service.command_rules import CommandBody
+from processing.rig.problem_sentences import findings_of, sentences
 
 BODY_MAX_BYTES = 16_384
 BODY_MAX_S = 5.0
@@ -50,21 +51,13 @@ def parse_command_body(body: bytes) -> CommandBody:
     Raises:
         ValueError: it is not strict JSON, nested too deeply, or no valid command body.
     """
-    try:
-        found = json.loads(
-            body.decode("utf-8"), object_pairs_hook=_unique_keys, parse_constant=_refuse_constant
-        )
-    except RecursionError:
-        raise ValueError("the body is nested too deeply") from None
-    except ValueError as error:
-        raise ValueError(f"the body is not JSON: {error}") from error
-    if found is None:
+    if body.strip() == b"null":
         return CommandBody()
+    found = parse_record(body, "the body")
     try:
         return CommandBody.model_validate_json(json.dumps(found))
     except ValidationError as error:
-        sentences = [f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors()]
-        raise ValueError("; ".join(sentences)) from error
+        raise ValueError(". ".join(sentences(findings_of(error)))) from error
 
 
 async def _read(pieces: AsyncIterator[bytes]) -> bytes:
@@ -80,14 +73,3 @@ async def _read(pieces: AsyncIterator[bytes]) -> bytes:
             408, f"the body did not come within {BODY_MAX_S:.0f} s", {"Connection": "close"}
         ) from None
     return bytes(read)
-
-
-def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) != len(pairs):
-        raise ValueError("a key is given twice")
-    return found
-
-
-def _refuse_constant(text: str) -> Any:
-    raise ValueError(f"{text} is not a number")

@@ -3,7 +3,7 @@
 Every CCD's shift, rotation, scale and perspective skew, every cone's lens and its rotation against
 the master cone, in one bundle adjustment. Datum: principal distance and principal point of the
 cones stay as they are, and the first CCD of each cone is not turned. Sources:
-Ladstädter et al. (2010), laboratory calibration; docs/calibration.md.
+Ladstädter et al. (2010), laboratory calibration; docs/how-to/processing/calibration.md.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from daemon.postflight.calibration.laboratory.laboratory_series import SeriesErr
 from processing.bundle.adjust import Adjustment, AdjustmentSettings, adjust
 from processing.bundle.network import INTERIOR, NetworkError
 from processing.bundle.rank_diagnosis import RankDefectError
-from processing.bundle.rotations import omega_phi_kappa
 from processing.bundle.terms import Kind
+from processing.geometry.rotation import omega_phi_kappa
 from processing.rig import Rig, Sensor
 
 EXPECTED_SIGMA_PX: Final = 0.02

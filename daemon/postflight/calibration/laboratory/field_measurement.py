@@ -8,26 +8,72 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Final
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import AfterValidator, BaseModel, ConfigDict
 
 from daemon.mission.store.level0 import read_tiff
 from daemon.postflight.calibration.laboratory.laboratory_series import (
-    LaboratorySeries,
+    PathInFolder,
+    SensorOfRig,
     SeriesError,
-    within_folder,
+    SeriesFile,
 )
 from processing.geometry.lens import measured_from_ideal
 from processing.geometry.rotation import rotation_matrix
 from processing.matching.disc_targets import disc_positions, identify_targets
 from processing.rig import Cone, Rig, Sensor
+from processing.rig.value_types import Number, Positive, Text, Triple
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, int, int], None]
 
 _REACH_PX: Final = 120.0
+
+
+def _orthogonal(rows: tuple[Triple, Triple, Triple]) -> tuple[Triple, Triple, Triple]:
+    matrix = np.array(rows)
+    if not np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-3):
+        raise ValueError("it is a rotation matrix, three rows of three numbers")
+    return rows
+
+
+Rotation = Annotated[tuple[Triple, Triple, Triple], AfterValidator(_orthogonal)]
+
+
+class _Row(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class SurveyedTarget(_Row):
+    """A target of the field with its standard deviation."""
+
+    name: Text
+    xyz_m: Triple
+    sigma_m: Positive
+
+
+class FieldImage(_Row):
+    """One look at the field, as the list has it."""
+
+    name: Text
+    files: dict[SensorOfRig, PathInFolder]
+    position_m: Triple
+    object_from_rig: Rotation
+    temperatures: dict[str, Number] = {}
+
+
+class FieldSeries(SeriesFile):
+    """The keys of a series for `calibrate lab`."""
+
+    KIND = "lab"
+
+    images: tuple[FieldImage, ...]
+    offset_sigma_mm: Positive = 0.2
+    skew_sigma_per_mm: Positive = 5e-6
+    targets: tuple[SurveyedTarget, ...]
 
 
 @dataclass(frozen=True)
@@ -60,49 +106,31 @@ class TargetObservations:
     px: Array
 
 
-def field_exposures(series: LaboratorySeries) -> list[FieldExposure]:
-    """The exposures of the series; the caller ends with `Series.checked`."""
-    known = {s.name for s in series.rig.sensors}
-    found = []
-    for image in series.images:
-        files = image.table("files")
-        for name in files.content:
-            if name not in known:
-                files.add_problem(name, f"a sensor of the rig is one of {', '.join(sorted(known))}")
-        temperatures = image.table("temperatures", optional=True)
-        found.append(
-            FieldExposure(
-                name=image.text("name"),
-                files={name: series.folder / within_folder(files, name) for name in files.content},
-                position_m=np.array(image.triple("position_m")),
-                object_from_rig=_matrix(image),
-                temperatures={n: temperatures.number(n) for n in temperatures.content},
-            )
+def field_exposures(series: FieldSeries) -> list[FieldExposure]:
+    """The exposures of a series."""
+    return [
+        FieldExposure(
+            name=image.name,
+            files=image.files,
+            position_m=np.array(image.position_m),
+            object_from_rig=_nearest_rotation(image.object_from_rig),
+            temperatures=image.temperatures,
         )
-    return found
+        for image in series.images
+    ]
 
 
-def field_of(series: LaboratorySeries) -> TargetField:
-    """The targets of the series; the caller ends with `Series.checked`."""
-    names, xyz, sigma = [], [], []
-    for target in series.table.tables("targets"):
-        names.append(target.text("name"))
-        xyz.append(target.triple("xyz_m"))
-        sigma.append(target.number("sigma_m", positive=True))
-    return TargetField(tuple(names), np.array(xyz).reshape(-1, 3), np.array(sigma))
+def field_of(series: FieldSeries) -> TargetField:
+    """The targets of a series."""
+    return TargetField(
+        tuple(target.name for target in series.targets),
+        np.array([target.xyz_m for target in series.targets]).reshape(-1, 3),
+        np.array([target.sigma_m for target in series.targets]),
+    )
 
 
-def _matrix(image: Any) -> Array:
-    content = image.content.get("object_from_rig")
-    image.known_keys.add("object_from_rig")
-    try:
-        matrix = np.array(content, dtype=float)
-    except (TypeError, ValueError):
-        matrix = np.zeros(0)
-    if matrix.shape != (3, 3) or not np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-3):
-        image.add_problem("object_from_rig", "it is a rotation matrix, three rows of three numbers")
-        return np.eye(3)
-    left, _, right = np.linalg.svd(matrix)
+def _nearest_rotation(rows: Rotation) -> Array:
+    left, _, right = np.linalg.svd(np.array(rows))
     return np.asarray(left @ right)
 
 

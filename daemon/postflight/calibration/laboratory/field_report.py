@@ -6,7 +6,7 @@ import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,7 @@ from daemon.postflight.calibration.laboratory.field_network import LENS_FREE
 from daemon.postflight.calibration.laboratory.head_geometry import LENS_KEYS
 from daemon.postflight.calibration.laboratory.laboratory_report import of_series
 from daemon.postflight.calibration.laboratory.laboratory_series import LaboratorySeries
-from daemon.postflight.calibration.plots import histogram_svg, map_svg, vectors_svg
+from daemon.postflight.plots import histogram_svg, map_svg, vectors_svg
 from processing.bundle.adjustment_results import image_residuals_mm, systematic_residuals
 from processing.bundle.network import INTERIOR
 from processing.rig import Rig
@@ -126,7 +126,7 @@ def covariance_bytes(rows: Sequence[EstimatedParameter], covariance: Array) -> b
 
 
 def field_report(
-    series: LaboratorySeries,
+    series: LaboratorySeries[Any],
     found: RigCalibration,
     *,
     calibration_id: str,

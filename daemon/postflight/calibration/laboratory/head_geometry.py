@@ -9,14 +9,19 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ConfigDict, Field, Strict
 
 from daemon.mission.store.level0 import read_tiff
-from daemon.postflight.calibration.laboratory.laboratory_series import LaboratorySeries, SeriesError
+from daemon.postflight.calibration.laboratory.laboratory_series import (
+    PathInFolder,
+    SensorOfRig,
+    SeriesError,
+    SeriesFile,
+)
 from processing.bundle.adjust import Adjustment, AdjustmentSettings, adjust
 from processing.bundle.adjustment_results import image_residuals_mm
 from processing.bundle.network import (
@@ -36,6 +41,7 @@ from processing.geometry.residual_grid import (
     cross_validation_residuals,
     fit_residual_grid,
 )
+from processing.geometry.rotation import rotation_from_angles, rotation_matrix
 from processing.matching.target_matching import (
     TargetImage,
     TargetPositions,
@@ -43,9 +49,11 @@ from processing.matching.target_matching import (
     positions_of,
 )
 from processing.rig import Cone, Lens, Sensor
+from processing.rig.value_types import Number, Positive, Text
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, int, int], None]
+Pixel = Annotated[int, Strict()]
 
 FREE: Final = ("dx0", "dy0", "df", "k1", "k2", "p1", "p2", "b1", "b2")
 """Without k3, which a field of 40 degrees hardly separates from k2."""
@@ -61,14 +69,27 @@ _MIN_TARGETS: Final = 12
 class Target:
     """One image: a cut-out at `origin_px`, its collimator angles and its series."""
 
-    path: Path
-    sensor: str
-    series: str
-    rotation_deg: float
-    origin_px: tuple[int, int]
-    alpha_rad: float
-    beta_rad: float
-    temperature_c: float
+    __pydantic_config__ = ConfigDict(extra="forbid")
+
+    path: Annotated[PathInFolder, Field(alias="file")]
+    sensor: SensorOfRig
+    series: Text
+    alpha_rad: Number
+    beta_rad: Number
+    temperature_c: Number
+    rotation_deg: Number = 0.0
+    origin_px: tuple[Pixel, Pixel] = (0, 0)
+
+
+class CollimatorSeries(SeriesFile):
+    """The keys of a series for `calibrate head`."""
+
+    KIND = "head"
+    RENAMED: ClassVar = {"images.turned_deg": "rotation_deg"}
+
+    images: tuple[Target, ...]
+    target_radius_rad: Positive
+    angle_sigma_rad: Positive = 1e-6
 
 
 @dataclass(frozen=True)
@@ -112,36 +133,6 @@ class HeadGeometry:
         return replace(self.cone.lens, **values, residual_grid=grid)
 
 
-def targets_of(series: LaboratorySeries) -> list[Target]:
-    """The images of the series, every one checked by the caller with `Series.checked`."""
-    known = [s.name for s in series.rig.sensors]
-    found = []
-    for image in series.images:
-        origin = image.content.get("origin_px", [0, 0])
-        image.known_keys.add("origin_px")
-        if not (
-            isinstance(origin, list) and len(origin) == 2 and all(type(v) is int for v in origin)
-        ):
-            image.add_problem("origin_px", "it is the column and row of the cut-out's first pixel")
-            origin = [0, 0]
-        if "turned_deg" in image.content:
-            image.known_keys.add("turned_deg")
-            image.add_problem("turned_deg", "it is now named rotation_deg; rename it")
-        found.append(
-            Target(
-                path=series.file(image),
-                sensor=image.choice("sensor", known),
-                series=image.text("series"),
-                rotation_deg=image.number("rotation_deg", 0.0),
-                origin_px=(origin[0], origin[1]),
-                alpha_rad=image.number("alpha_rad"),
-                beta_rad=image.number("beta_rad"),
-                temperature_c=image.number("temperature_c"),
-            )
-        )
-    return found
-
-
 def layer_mm(sensor: Sensor, px: Array) -> Array:
     """Layer coordinates (n, 2), mm, of pixel positions (column, row), as the rig places them."""
     u = (px[:, 0] - (sensor.width_px - 1) / 2) * sensor.pitch_mm
@@ -157,14 +148,13 @@ def collimator_axes(alpha_rad: float, beta_rad: float) -> Array:
 
     alpha turns about the laboratory's y, beta lifts: direction (sin a cos b, sin b, -cos a cos b).
     """
-    (sa, ca), (sb, cb) = ((math.sin(x), math.cos(x)) for x in (alpha_rad, beta_rad))
-    return np.array([[sa * cb, ca, -sa * sb], [sb, 0.0, cb], [-ca * cb, sa, ca * sb]])
+    right, up, backwards = rotation_from_angles("YX", [-alpha_rad, beta_rad]).T
+    return np.stack([-backwards, right, up], axis=1)
 
 
 def rotation_about_axis(degrees: float) -> Array:
     """Laboratory from camera for a head turned in its holder, (3, 3)."""
-    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return rotation_matrix(0.0, 0.0, math.radians(degrees))
 
 
 def calibrate_head(

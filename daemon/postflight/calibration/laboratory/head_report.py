@@ -20,7 +20,7 @@ from daemon.postflight.calibration.calibration_report import (
 from daemon.postflight.calibration.laboratory.head_geometry import LENS_KEYS, HeadGeometry
 from daemon.postflight.calibration.laboratory.laboratory_report import of_series
 from daemon.postflight.calibration.laboratory.laboratory_series import LaboratorySeries
-from daemon.postflight.calibration.plots import Curve, chart_svg, histogram_svg, vectors_svg
+from daemon.postflight.plots import Curve, chart_svg, histogram_svg, vectors_svg
 from processing.bundle.adjustment_results import AdjustedParameter, exposures_of, parameters_of
 from processing.bundle.network import INTERIOR
 from processing.rig import Rig
@@ -59,7 +59,7 @@ def calibrated_rig(
 
 
 def head_report(
-    series: LaboratorySeries,
+    series: LaboratorySeries[Any],
     heads: Sequence[HeadGeometry],
     *,
     calibration_id: str,

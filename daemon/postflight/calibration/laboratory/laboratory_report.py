@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from daemon.postflight.calibration.calibration_report import (
     CalibrationReport,
@@ -21,7 +22,7 @@ from daemon.postflight.calibration.laboratory.laboratory_series import (
 
 def of_series(
     report: CalibrationReport,
-    series: LaboratorySeries,
+    series: LaboratorySeries[Any],
     *,
     sensors: set[str],
     previous: tuple[Path, Previous] | None,
@@ -36,9 +37,9 @@ def of_series(
         compared: what is compared with that; all quantities if omitted.
     """
     rig = series.rig
-    serials = {**series.serials, **part_serials(rig, sensors), **report.serials}
+    serials = {**series.file.serials, **part_serials(rig, sensors), **report.serials}
     warnings = list(report.warnings)
-    if series.simulated:
+    if series.file.simulated:
         warnings.append("Emulated images: no calibration of a real camera.")
     if previous is not None:
         warnings += serial_warnings(previous[1], serials)
@@ -49,8 +50,8 @@ def of_series(
     return replace(
         report,
         facts=[
-            ("measured", series.date),
-            ("source", series.source),
+            ("measured", series.file.date),
+            ("source", series.file.source),
             ("rig", f"{rig.name}, calibration {rig.calibration_id}"),
             *report.facts,
         ],

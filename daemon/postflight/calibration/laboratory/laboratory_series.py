@@ -1,7 +1,6 @@
 """A laboratory series on disk: a folder with `series.json`, the rig file and images.
 
-The list of images is checked completely, and all its mistakes are reported at once. Each
-calibration reads the fields of its own kind of series.
+The keys of the images are declared by the calibration of each kind of series.
 """
 
 from __future__ import annotations
@@ -10,13 +9,23 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any, Final
+from typing import Annotated, Any, ClassVar, Final, Generic, Literal, TypeVar
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Strict,
+    ValidationError,
+    ValidationInfo,
+)
 
 from daemon.errors import DaemonError
 from processing.rig import Rig, load_rig
-from processing.rig.toml_table import TomlTable
+from processing.rig.problem_sentences import findings_of, sentences, shown
+from processing.rig.value_types import Flag, Text
 
-SERIES_FORMAT: Final = 1
 SERIES_MAX_BYTES: Final = 50_000_000
 _MAX_LISTED: Final = 20
 
@@ -30,53 +39,62 @@ class SeriesError(DaemonError, ValueError):
         super().__init__("\n".join(listed))
 
 
+class SeriesFile(BaseModel):
+    """The keys of `series.json` that every kind of series has; `images` are of its kind."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    KIND: ClassVar[str]
+    RENAMED: ClassVar[Mapping[str, str]] = {}
+    """Former keys, and their present names."""
+
+    format: Literal[1] = 1
+    kind: Text
+    date: Text
+    source: Text = ""
+    simulated: Flag = False
+    serials: dict[str, Text] = {}
+
+
+Series = TypeVar("Series", bound=SeriesFile)
+
+
 @dataclass(frozen=True)
-class LaboratorySeries:
-    """Properties of the complete series. `table` answers for the keys of its kind, `images` are the
-    single ones; `checked` ends the asking."""
+class LaboratorySeries(Generic[Series]):
+    """A series of one kind with its rig; `file` is the content of `series.json`."""
 
-    folder: Path
     rig: Rig
-    date: str
-    source: str
-    simulated: bool
-    serials: Mapping[str, str]
-    table: TomlTable
-    images: tuple[TomlTable, ...]
-
-    def checked(self) -> None:
-        """Refuse the series with every mistake found so far.
-
-        Raises:
-            SeriesError: a key was missing, of another kind, or unknown.
-        """
-        for image in self.images:
-            image.refuse_unknown()
-        self.table.refuse_unknown()
-        if self.table.problems:
-            raise SeriesError(self.table.problems)
-
-    def file(self, image: TomlTable) -> Path:
-        """The image's file."""
-        return self.folder / within_folder(image, "file")
+    file: Series
 
 
-def within_folder(table: TomlTable, key: str) -> str:
-    """A file name; it leaves the folder neither upwards nor to the root, else it is complained of
-    and empty."""
-    name = table.text(key)
+def _path_in_folder(name: str, info: ValidationInfo) -> str:
     path = PurePosixPath(name)
     if path.is_absolute() or ".." in path.parts or not name:
-        table.add_problem(key, "it is a name within the folder")
-        return ""
+        raise ValueError("it is a name within the folder")
+    folder: Path = (info.context or {})["folder"]
+    return str(folder / name)
+
+
+def _sensor_of_rig(name: str, info: ValidationInfo) -> str:
+    known: list[str] = (info.context or {})["sensors"]
+    if name not in known:
+        raise ValueError(f"a sensor of the rig is one of {', '.join(known)}")
     return name
 
 
-def read_series(folder: Path, *, kind: str) -> LaboratorySeries:
+PathInFolder = Annotated[Path, Strict(False), BeforeValidator(_path_in_folder)]
+"""A file of the series; its name leaves the folder neither upwards nor to the root."""
+SensorOfRig = Annotated[Text, AfterValidator(_sensor_of_rig)]
+
+
+def read_series(folder: Path, model: type[Series]) -> LaboratorySeries[Series]:
     """Read `series.json` and `rig.toml` of a folder.
 
+    Args:
+        folder: holds both and the images.
+        model: the keys of the kind of series that is needed.
+
     Raises:
-        SeriesError: the list is missing, damaged, or of another kind.
+        SeriesError: the list is missing, damaged, of another kind, or has mistakes: all of them.
         processing.rig.RigError: the rig file cannot be used.
     """
     path = folder / "series.json"
@@ -90,30 +108,15 @@ def read_series(folder: Path, *, kind: str) -> LaboratorySeries:
         ) from error
     except (ValueError, RecursionError) as error:
         raise SeriesError([f"{path}: not valid JSON ({error})"]) from error
-    if not isinstance(content, dict):
-        raise SeriesError([f"{path}: holds no table; see docs/calibration.md"])
-    problems: list[str] = []
-    table = TomlTable(content, "", path.name, problems)
-    if table.integer("format", SERIES_FORMAT) != SERIES_FORMAT:
-        table.add_problem("format", f"this version reads format {SERIES_FORMAT}")
-    found = table.text("kind")
-    if found != kind:
-        table.add_problem("kind", f"`syntopic calibrate {kind}` takes a series of kind {kind!r}")
-        raise SeriesError(problems)
-    serials = table.table("serials", optional=True)
-    names = {name: serials.text(name, "") for name in serials.content}
-    simulated = content.get("simulated", False) is True
-    table.known_keys.add("simulated")
-    return LaboratorySeries(
-        folder=folder,
-        rig=load_rig(folder / "rig.toml"),
-        date=table.text("date"),
-        source=table.text("source", ""),
-        simulated=simulated,
-        serials=names,
-        table=table,
-        images=tuple(table.tables("images")),
-    )
+    if isinstance(content, dict) and content.get("kind") != model.KIND:
+        text = f"is {shown(content.get('kind'))}; this calibration takes {model.KIND!r}"
+        raise SeriesError(sentences([(("kind",), text)], path.name))
+    rig = load_rig(folder / "rig.toml")
+    context = {"folder": folder, "sensors": [sensor.name for sensor in rig.sensors]}
+    try:
+        return LaboratorySeries(rig, model.model_validate(content, context=context))
+    except ValidationError as error:
+        raise SeriesError(sentences(findings_of(error, model.RENAMED), path.name)) from error
 
 
 def part_serials(rig: Rig, sensors: set[str]) -> dict[str, str]:

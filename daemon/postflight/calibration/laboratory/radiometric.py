@@ -9,14 +9,19 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ConfigDict, Field, Strict
 
 from daemon.mission.store.level0 import read_tiff
-from daemon.postflight.calibration.laboratory.laboratory_series import LaboratorySeries, SeriesError
+from daemon.postflight.calibration.laboratory.laboratory_series import (
+    PathInFolder,
+    SensorOfRig,
+    SeriesError,
+    SeriesFile,
+)
 from processing.calibration.radiometric.dark_signal import DarkSignal, fit_dark_signal
 from processing.calibration.radiometric.defects import DefectMap, find_defects, smooth_field
 from processing.calibration.radiometric.flat_residual import FlatResidual, flat_residual
@@ -37,6 +42,7 @@ from processing.calibration.radiometric.spatial_noise import SpatialNoise, spati
 from processing.calibration.radiometric.vignetting import ApertureModel, fit_aperture
 from processing.radiometry.calibration import GAIN_LIMITS, RadiometricCalibration
 from processing.rig import Sensor
+from processing.rig.value_types import Number, Positive, Text
 
 Progress = Callable[[str], None]
 
@@ -49,16 +55,32 @@ _SIGNIFICANT_SIGMAS: Final = 4.0
 class CalibrationShot:
     """One image of the series."""
 
-    path: Path
-    sensor: str
-    set_name: str
+    __pydantic_config__ = ConfigDict(extra="forbid")
+
+    path: Annotated[PathInFolder, Field(alias="file")]
+    sensor: SensorOfRig
+    set_name: Annotated[Text, Field(alias="set")]
     light: Literal["dark", "flat"]
-    use: Literal["fit", "check"]
-    monitor: float
-    exposure_time_s: float
-    f_number: float
-    tdi_shifts: int
-    temperature_c: float
+    exposure_time_us: Positive
+    f_number: Positive
+    temperature_c: Number
+    use: Literal["fit", "check"] = "fit"
+    monitor: Number = 1.0
+    tdi_shifts: Annotated[int, Strict()] = 0
+
+    @property
+    def exposure_time_s(self) -> float:
+        return self.exposure_time_us * 1e-6
+
+
+class RadiometricSeries(SeriesFile):
+    """The keys of a series for `calibrate radiometric`."""
+
+    KIND = "radiometric"
+
+    images: tuple[CalibrationShot, ...]
+    temperature_sigma_c: Number = 0.1
+    monitor_sigma: Number = 1e-3
 
 
 @dataclass(frozen=True)
@@ -112,32 +134,15 @@ class HeadCalibration:
         return abs(value) > _SIGNIFICANT_SIGMAS * sigma
 
 
-def shots_of(series: LaboratorySeries) -> list[CalibrationShot]:
-    """The images of the series, every one checked.
+def refuse_mixed_sets(shots: Sequence[CalibrationShot]) -> None:
+    """Refuse sets whose images were not taken under one condition.
 
     Raises:
         SeriesError: with every mistake.
     """
-    known = [s.name for s in series.rig.sensors]
-    shots = [
-        CalibrationShot(
-            path=series.file(image),
-            sensor=image.choice("sensor", known),
-            set_name=image.text("set"),
-            light="dark" if image.choice("light", ("flat", "dark")) == "dark" else "flat",
-            use="check" if image.choice("use", ("fit", "check"), "fit") == "check" else "fit",
-            monitor=image.number("monitor", 1.0),
-            exposure_time_s=image.number("exposure_time_us", positive=True) * 1e-6,
-            f_number=image.number("f_number", positive=True),
-            tdi_shifts=image.integer("tdi_shifts", 0),
-            temperature_c=image.number("temperature_c"),
-        )
-        for image in series.images
-    ]
-    problems = series.table.problems
-    for members in sets_of(shots).values():
-        problems += _differing_conditions(members)
-    return shots
+    problems = [p for members in sets_of(shots).values() for p in _differing_conditions(members)]
+    if problems:
+        raise SeriesError(problems)
 
 
 def sets_of(shots: Sequence[CalibrationShot]) -> dict[str, list[CalibrationShot]]:
@@ -150,7 +155,7 @@ def sets_of(shots: Sequence[CalibrationShot]) -> dict[str, list[CalibrationShot]
 
 def _differing_conditions(members: Sequence[CalibrationShot]) -> list[str]:
     first = members[0]
-    keys = ("sensor", "light", "use", "exposure_time_s", "f_number", "tdi_shifts")
+    keys = ("sensor", "light", "use", "exposure_time_us", "f_number", "tdi_shifts")
     found = [
         f"series.json: set {first.set_name!r} holds images of unlike {key}; a set is one condition"
         for key in keys

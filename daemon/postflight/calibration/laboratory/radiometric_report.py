@@ -20,7 +20,7 @@ from daemon.postflight.calibration.laboratory.laboratory_report import of_series
 from daemon.postflight.calibration.laboratory.laboratory_series import LaboratorySeries
 from daemon.postflight.calibration.laboratory.radiometric import HeadCalibration
 from daemon.postflight.calibration.laboratory.radiometric_maps import maps_against
-from daemon.postflight.calibration.plots import Curve, chart_svg, histogram_svg, map_svg
+from daemon.postflight.plots import Curve, chart_svg, histogram_svg, map_svg
 from processing.calibration.radiometric.defects import relative_response
 
 RATIO_BAR: Final = 1.05
@@ -67,7 +67,7 @@ def quantities_of(head: HeadCalibration) -> list[Quantity]:
 
 
 def radiometric_report(
-    series: LaboratorySeries,
+    series: LaboratorySeries[Any],
     heads: Sequence[HeadCalibration],
     *,
     calibration_id: str,

@@ -32,14 +32,14 @@ def flown(flying: Flight, *, has_height: bool) -> Exposure:
     """One exposure at second 0 among positions with and without a height."""
     given = fly_one(flying, 1, 0.0)
     frames = stored_frames(flying, 1, NS)
-    flying.mark(mark(given))
+    flying.take(mark(given))
     for t_s in (-0.4, -0.2, 0.2, 0.4, 2.4):
         sample = nav(t_s)
         if not has_height:
             sample = replace(sample, fix="2d", height_m=None, vertical_sigma_m=None)
         read = record_of(message_of(sample))
         assert read == sample, "the flight log holds what was absent as absent"
-        flying.navigation(sample)
+        flying.take(sample)
     flying.stored(1, frames)
     return seal(flying, 5 * NS)
 

@@ -14,6 +14,7 @@ from daemon.onboard.flight.arming import (
     FILE,
     MissingPrerequisite,
     Readiness,
+    absent_parts,
     missing_prerequisites,
     override_message,
     overrides_content,
@@ -36,6 +37,14 @@ READY = Readiness(
 
 def test_nothing_is_missing_where_all_is_there() -> None:
     assert missing_prerequisites(READY, LimitsSection()) == ()
+
+
+def test_absent_devices_and_data_are_named() -> None:
+    assert absent_parts(READY) == []
+    probes: dict[str, Any] = {"0": None, "1": (None, 60.0)}
+    absent = replace(READY, absent=["head SU00"], position_age_s=None, probes_c=probes)
+    assert absent_parts(absent) == ["head SU00", "time and position", "temperature of 0"]
+    assert absent_parts(replace(absent, needs_time=False, probes_c={})) == ["head SU00"]
 
 
 @pytest.mark.parametrize(

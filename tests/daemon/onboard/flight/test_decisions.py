@@ -1,54 +1,30 @@
-"""What is due at an instant, and what the flight log records of it."""
+"""What is due at an instant is recorded in the flight log, and nothing else is."""
 
 from __future__ import annotations
 
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
-import pytest
-
-from daemon.onboard.flight.decisions import Tick, tick
-
-NOTHING = Tick((), (), None, None, asked_to_seal=True, resolved=0)
+from daemon.onboard.flight.decisions import Actions, decision_of
+from daemon.onboard.timing.gps_clock import ClockEvent
 
 
-def due(to_seal: object = None) -> Any:
-    """A flight with a provisional record, and perhaps one to seal."""
-    return SimpleNamespace(
-        due_to_store=lambda _: [],
-        due_to_give_up=lambda _: [],
-        due_to_seal=lambda _: to_seal,
-        due_provisionally=lambda: "provisional",
-        resolved_marks=[],
-    )
+def test_an_instant_is_logged_only_if_something_was_due() -> None:
+    assert Actions(7, next_ns=9).decision is None
+    clock_events = (ClockEvent("pps-holdover", True, "no edge"),)
+    assert Actions(7, clock_events=clock_events).decision is None
 
 
-@pytest.mark.parametrize(
-    ("may_seal", "allow_provisional", "to_seal", "provisional"),
-    [
-        (True, True, None, "provisional"),
-        (True, False, None, None),
-        (False, True, None, None),
-        (False, False, None, None),
-        (True, True, "sealed", None),
-    ],
-)
-def test_a_record_is_provisional_only_while_none_is_sealed(
-    may_seal: bool, allow_provisional: bool, to_seal: object, provisional: object
-) -> None:
-    found = tick(due(to_seal), 7, may_seal=may_seal, allow_provisional=allow_provisional)
-    assert (found.to_seal, found.provisional) == (to_seal, provisional)
-    assert found.asked_to_seal is may_seal
-
-
-def test_a_tick_is_logged_only_if_something_was_due() -> None:
-    assert NOTHING.detail is None
-    given_up = Tick((), ((3, "no head sent a frame"),), None, None, asked_to_seal=True, resolved=0)
-    assert given_up.detail == {
-        "store": [],
-        "given_up": [3],
-        "seal": None,
-        "foreseen": None,
-        "resolved": 0,
-        "asked_to_seal": True,
+def test_what_was_due_is_read_back_from_the_log() -> None:
+    one: Any = SimpleNamespace(number=5, capture=SimpleNamespace(number=5))
+    due = Actions(7, (one,), ((3, "no head sent a frame"),), cast(Any, ("mark",)), one, one)
+    decision = due.decision
+    assert decision is not None and decision_of(decision.message()) == decision
+    assert (decision.kind, decision.mono_ns) == ("advance", 7)
+    assert decision.detail == {
+        "store": [5],
+        "lost": [3],
+        "spurious": 1,
+        "seal": 5,
+        "provisional": 5,
     }

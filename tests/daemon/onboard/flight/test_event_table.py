@@ -77,5 +77,6 @@ def test_every_entry_has_cause_and_action_in_complete_sentences() -> None:
 
 
 def test_the_page_of_the_docs_is_current() -> None:
-    page = (ROOT / "docs" / "events.md").read_text("utf-8")
-    assert page == as_markdown(), "run: syntopic explain --markdown > docs/events.md"
+    page = (ROOT / "docs/reference/flight/events.md").read_text("utf-8")
+    command = "syntopic explain --markdown > docs/reference/flight/events.md"
+    assert page == as_markdown(), f"run: {command}"

@@ -56,12 +56,12 @@ def expose(flown: Flight, log: FlightLog, number: int) -> None:
     """The devices' part of an exposure: trigger, frames, mark, navigation, temperatures, PPS."""
     at_s = number * INTERVAL_S
     for step in range(INTERVAL_S * NAVIGATION_HZ):
-        flown.navigation(sample := nav(at_s - INTERVAL_S + step / NAVIGATION_HZ))
+        flown.take(sample := nav(at_s - INTERVAL_S + step / NAVIGATION_HZ))
         log.write(message_of(sample))
     for second in (at_s - 1, at_s):
-        flown.pps(PpsEdge("gnss", second, second * NS, 1_000))
+        flown.take(PpsEdge("gnss", second, second * NS, 1_000))
     for probe in RIG.probes:
-        flown.temperature(TemperatureSample(probe, 20.0, (at_s - 1) * NS))
+        flown.take(TemperatureSample(probe, 20.0, (at_s - 1) * NS))
     assert flown.order(at_s * NS) == number
     given = pulse(number, at_s)
     flown.fired(given)
@@ -69,9 +69,9 @@ def expose(flown: Flight, log: FlightLog, number: int) -> None:
     log.write(message_of(LoggedTrigger(number, unit, given.delays_ns, given.strobe_delay_ns)))
     for head in HEADS:
         arrived = replace(frame(head, given), width_px=WIDTH_PX, height_px=HEIGHT_PX)
-        flown.frame(arrived)
+        flown.take(arrived)
         log.write(message_of(arrived))
-    flown.mark(stamped := mark(given))
+    flown.take(stamped := mark(given))
     log.write(message_of(stamped))
 
 
@@ -88,19 +88,20 @@ def fly(root: Path, exposures: int) -> dict[str, int | float]:
             resident, open_before = resident_bytes(), descriptors()
         expose(flown, log, number)
         now_ns = (number * INTERVAL_S + 1) * NS
-        for due in flown.due_to_store(now_ns):
-            position = {record.sensor: pixels[record.sensor] for record in due.capture.frames}
-            flown.stored(due.capture.number, writer.write(due.capture, position))
-        while (record := flown.due_to_seal(now_ns)) is not None:
-            writer.seal(record)
-            flown.sealed(record.number, record.state)
+        while (actions := flown.advance(now_ns)).decision is not None:
+            for due in actions.store:
+                position = {record.sensor: pixels[record.sensor] for record in due.capture.frames}
+                flown.stored(due.capture.number, writer.write(due.capture, position))
+            if (record := actions.seal) is not None:
+                writer.seal(record)
+                flown.sealed(record.number)
         assert flown.ledger.imbalances() == []
         if number > KEPT and (old := mission.level0(number - KEPT)).is_dir():
             durable.remove_tree(old)
     flown.land()
-    while (record := flown.due_to_seal((exposures + 10) * INTERVAL_S * NS)) is not None:
+    while (record := flown.advance((exposures + 10) * INTERVAL_S * NS).seal) is not None:
         writer.seal(record)
-        flown.sealed(record.number, record.state)
+        flown.sealed(record.number)
     figures = {
         "exposures": exposures,
         "growth_bytes": resident_bytes() - resident,

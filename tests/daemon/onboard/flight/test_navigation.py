@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import pytest
 
-from daemon.orientation.navigation import Track, metres_per_degree, navigation_at
+from daemon.orientation.geodesy import metres_per_degree
+from daemon.orientation.navigation import Track, navigation_at
 from drivers.contract import NavSample
 
 NS = 1_000_000_000

@@ -8,7 +8,8 @@ from typing import Any
 
 import pytest
 
-from daemon.orientation.navigation import Track, _Segment, metres_per_degree, navigation_at
+from daemon.orientation.geodesy import metres_per_degree
+from daemon.orientation.navigation import Track, _Segment, navigation_at
 from drivers.contract import NavSample
 from tests.daemon.onboard.flight.test_navigation import GPS_NS, HEIGHT, LATITUDE, LONGITUDE, NS
 

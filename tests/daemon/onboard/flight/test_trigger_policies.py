@@ -8,6 +8,7 @@ from dataclasses import replace
 import pytest
 
 from daemon.onboard.flight.trigger_policies import DistanceTrigger, IntervalTrigger, pulse_delays_ns
+from daemon.orientation.geodesy import metres_per_degree
 from drivers.contract import NavSample
 from processing.rig import find_rig
 
@@ -62,14 +63,19 @@ def test_a_distance_falls_due_from_1_m_per_s_on() -> None:
     assert trigger.due(1, 0, replace(nav(0.0, 0), velocity_ned_mps=None)) is None
 
 
-def test_the_way_to_the_east_counts_by_the_cosine_of_the_latitude() -> None:
+def test_the_way_to_the_east_counts_by_the_length_of_a_degree_there() -> None:
     """From an exposure 2 s after the last position to one 0.02 degrees further east."""
     velocity = (30.0, 40.0, -3.0)
     trigger = DistanceTrigger(1000.0, NS)
     trigger.fired(2 * NS, replace(nav(0.0, 0), velocity_ned_mps=velocity))
-    there = replace(nav(60.0, 10 * NS), longitude_deg=11.01, velocity_ned_mps=velocity)
-    metres_per_degree = math.radians(1.0) * 6_371_000.0
-    east_m = 0.01 * metres_per_degree * math.cos(math.radians(48.0)) - 80.0
+    _, metres_per_degree_east = metres_per_degree(48.0, 0.0)
+    there = replace(
+        nav(0.0, 10 * NS),
+        latitude_deg=48.0 + 60.0 / metres_per_degree(48.0, 0.0)[0],
+        longitude_deg=11.01,
+        velocity_ned_mps=velocity,
+    )
+    east_m = 0.01 * metres_per_degree_east - 80.0
     expected_ns = 10 * NS + (1000.0 - east_m) / 50.0 * NS
     assert trigger.due(0, 2 * NS, there) == pytest.approx(expected_ns, abs=2e5)
 

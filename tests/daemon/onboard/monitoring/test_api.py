@@ -247,6 +247,7 @@ def test_metrics_speak_prometheus(camera: Camera, client: TestClient) -> None:
         *flight_events.exposure(1),
         flight_events.status(triggers=1),
         flight_events.lost("SU02"),
+        {"event": "counters", "devices": {"SU02": {"frames": 7, "underruns": 0}}},
     ):
         camera.state.apply(event)
     text = client.get("/metrics").text
@@ -264,6 +265,8 @@ def test_metrics_speak_prometheus(camera: Camera, client: TestClient) -> None:
     assert requests and requests <= {name for name, _ in samples}
     assert samples["syntopic_clock_sigma_seconds", ()] == pytest.approx(25e-9)
     assert samples["syntopic_device_ready", (("device", "SU02"), ("kind", ""))] == 0
+    labels = (("counter", "frames"), ("device", "SU02"), ("kind", ""))
+    assert samples["syntopic_device_events_total", labels] == 7
     assert samples["syntopic_phase", (("phase", "flying"),)] == 1
 
 

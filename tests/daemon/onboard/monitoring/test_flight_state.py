@@ -94,3 +94,15 @@ def test_the_status_puts_right_what_was_dropped() -> None:
     assert state.phase == "armed"
     assert state.brief()["status"]["ledger"]["triggers"]["triggers"] == 5
     assert not state.faults()[0]["stands"]
+
+
+def test_counters_are_listed_with_their_devices_and_are_no_part_of_telemetry() -> None:
+    state = state_of(flight_events.mission(), flight_events.lost("SU02"))
+    cursor = state.sequence
+    state.apply({"event": "counters", "devices": {"SU02": {"frames": 7}, "SU03": {"frames": 8}}})
+    (device,) = state.devices()
+    assert device["name"] == "SU02" and device["counters"] == {"frames": 7}
+    assert state.changed("devices", cursor) == state.changed("events", cursor) == []
+    assert "counters" not in state.snapshot()["devices"][0]
+    state.apply({"event": "counters", "devices": {"SU02": {"frames": 9}}})
+    assert state.devices()[0]["counters"] == {"frames": 9}

@@ -14,7 +14,8 @@ from typing import Any
 
 import pytest
 
-from daemon.configuration.model import SIGNING_STATE, from_mapping
+from daemon.configuration.model import SIGNING_STATE
+from daemon.configuration.service_file import from_mapping
 from daemon.onboard.monitoring.mavlink.senders import (
     DATAGRAM_MAX_BYTES,
     PEERS_MAX,

@@ -26,6 +26,9 @@ from processing.rig import load_rig, shipped_rigs
 from tests.daemon.onboard.monitoring import flight_events
 from tests.daemon.onboard.monitoring.test_mavsdk_camera import Flying, wait_for
 
+pytestmark = pytest.mark.realtime
+
+
 dialect = pytest.importorskip(
     "pymavlink.dialects.v20.ardupilotmega", reason="pip install 'syntopic[mavlink]'"
 )

@@ -19,6 +19,9 @@ from daemon.onboard.service.messages import Answer, CommandRefused, ServiceComma
 from processing.rig import load_rig, shipped_rigs
 from tests.daemon.onboard.monitoring import flight_events
 
+pytestmark = pytest.mark.realtime
+
+
 WITHIN_S = 40.0
 RIG = load_rig(shipped_rigs()["ultracam-x-mini"])
 

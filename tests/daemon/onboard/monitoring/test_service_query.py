@@ -7,10 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from daemon.cli.check import collect_results
-from daemon.configuration.model import load
+from daemon.cli.check import STATUSES, collect_results
+from daemon.configuration.service_file import load
 from daemon.onboard.preflight.check_results import (
-    EXIT_STATUS,
     CheckOutcome,
     CheckResult,
     failed,
@@ -105,7 +104,7 @@ def test_the_exit_status_is_that_of_the_worst_finding() -> None:
     ill, idle = failed("head", "SUA", "gone"), CheckResult("stream", "f", CheckOutcome.NOT_TRIED)
     cases = (([], 0), ([well, idle], 0), ([well, late], 3), ([late, ill, well], 1))
     for results, status in cases:
-        assert EXIT_STATUS[worst_outcome(results)] == status
+        assert STATUSES[worst_outcome(results).value] == status
 
 
 def _nothing_is_opened(*_: object, **__: object) -> list[CheckResult]:

@@ -96,10 +96,10 @@ def test_the_schema_names_every_reported_key() -> None:
     ):
         state.apply(event)
     snapshot = state.snapshot()
-    del snapshot["events"]  # each kind has its own keys, docs/events.md
+    del snapshot["events"]  # each kind has its own keys, docs/reference/flight/events.md
     subscription = set(snapshot)
     for part in snapshot.values():
         for item in part if isinstance(part, list) else [part]:
             subscription |= set(item) if isinstance(item, dict) else set()
-    schema = (Path(__file__).parents[4] / "docs/telemetry.md").read_text()
+    schema = (Path(__file__).parents[4] / "docs/reference/flight/telemetry.md").read_text()
     assert {key for key in subscription if f"`{key}`" not in schema} == set()

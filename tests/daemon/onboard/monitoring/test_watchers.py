@@ -21,6 +21,9 @@ from daemon.onboard.service.messages import ServiceEvent, Stop
 from daemon.onboard.service.processes import ChildProcess
 from tests.daemon.onboard.monitoring import flight_events
 
+pytestmark = pytest.mark.realtime
+
+
 WATCHERS, STALLED, EXPOSURES = 50, 10, 60
 GROWTH_MAX_KB = 60_000
 LET_GO_WITHIN_S = PING_S + PONG_TIMEOUT_S + 2.0

@@ -11,8 +11,9 @@ import pytest
 
 from daemon.mission.log.flight_log import FlightLog, LogReader, read
 from daemon.mission.log.log_records import Message
+from daemon.onboard.service.command_execution import CommandHandlers
+from daemon.onboard.service.message_dispatcher import MessageDispatcher
 from daemon.onboard.service.messages import Answer, AppendToLog, CommandRefused, ServiceCommand
-from daemon.onboard.service.service import Service
 from daemon.onboard.storage.writer import _Writer
 from tests.daemon.onboard.service.test_command_execution import FakeService
 
@@ -22,20 +23,22 @@ pytestmark = pytest.mark.trust
 class Flight(FakeService):
     """Takes commands as the service does, and remembers what it sends to whom."""
 
-    _on_command = Service._on_command
-    _on_command_refused = Service._on_command_refused
-    _audit = Service._audit
-
     def __init__(self) -> None:
         super().__init__()
         self.sent: list[tuple[str, AppendToLog]] = []
         self.answers: list[Answer] = []
         self.events: list[dict[str, Any]] = []
-        self.supervisor = SimpleNamespace(send=lambda *sent: self.sent.append(sent))
-        self.monitoring = SimpleNamespace(answer=self.answers.append)
+        commands = CommandHandlers(
+            self,
+            self.answers.append,
+            lambda *sent: self.sent.append(sent),
+            lambda event, **content: self.events.append({"event": event, **content}),
+        )
+        self._dispatcher = MessageDispatcher()
+        self._dispatcher.add(commands.handlers)
 
-    def _event(self, event: str, **content: Any) -> None:
-        self.events.append({"event": event, **content})
+    def receive(self, message: object) -> None:
+        self._dispatcher.dispatch(message)
 
 
 def synced(folder: Path) -> list[Message]:
@@ -51,11 +54,9 @@ def test_a_command_and_a_refusal_are_in_the_flight_log_and_on_the_disk(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     flight = Flight()
-    flight._on_command(ServiceCommand(1, "trigger", {}, "anna", "operator", "10.0.0.9"))
-    flight._on_command(
-        ServiceCommand(2, "acknowledge", {"fault": "x"}, "eva", "administrator", "unix")
-    )
-    flight._on_command_refused(CommandRefused("land", "unknown", "none", "10.0.0.66", "no", 7))
+    flight.receive(ServiceCommand(1, "trigger", {}, "anna", "operator", "10.0.0.9"))
+    flight.receive(ServiceCommand(2, "acknowledge", {"fault": "x"}, "eva", "administrator", "unix"))
+    flight.receive(CommandRefused("land", "unknown", "none", "10.0.0.66", "no", 7))
     assert [answer.done for answer in flight.answers] == [True, False]
     assert [(one["event"], one["name"]) for one in flight.events] == [
         ("command", "trigger"),

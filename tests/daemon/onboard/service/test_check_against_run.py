@@ -21,7 +21,7 @@ from typing import NamedTuple
 import pytest
 import serial
 
-from daemon.configuration.model import load
+from daemon.configuration.service_file import load
 from daemon.mission.layout import CURRENT_FILE
 from daemon.onboard.preflight import prerequisites, system_check
 from daemon.onboard.service.startup import create_mission

@@ -6,7 +6,8 @@ import copy
 from dataclasses import replace
 from pathlib import Path
 
-from daemon.configuration.model import Configuration, from_mapping
+from daemon.configuration.model import Configuration
+from daemon.configuration.service_file import from_mapping
 from daemon.onboard.capture.devices import (
     device_specs,
     exposure_times_ns,

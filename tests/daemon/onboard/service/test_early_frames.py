@@ -7,34 +7,24 @@ from dataclasses import replace
 
 import pytest
 
+from daemon.onboard.service.exposure_sequence import EARLY_FRAME_LIMIT_NS
 from daemon.onboard.service.flight_line import Order
-from daemon.onboard.service.messages import Fired
-from daemon.onboard.service.record_ingest import EARLY_FRAME_LIMIT_NS, RecordIngest
+from daemon.onboard.service.messages import Fired, Recycle
 from drivers.contract import TriggerPulse
-from tests.daemon.onboard.flight.test_flight import HEADS, NS, STROBE_NS, flight, frame, pulse
+from tests.daemon.onboard.flight.test_flight import HEADS, NS, STROBE_NS, frame, pulse
+from tests.daemon.onboard.service.sequence_bench import SequenceBench
 
 pytestmark = pytest.mark.trust
 INTERVAL_S = 1.35
 
 
-class Flown:
+class Flown(SequenceBench):
     """A flight's records in the order in which they come; what was reported of frames."""
-
-    def __init__(self) -> None:
-        self.flight = flight()
-        self.logged: list[object] = []
-        self.reported: list[str] = []
-        self.ingest = RecordIngest(
-            self.flight,
-            self.logged.append,
-            lambda event, **content: self.reported.append(f"{event} {content.get('cause')}"),
-        )
 
     def order(self, number: int) -> None:
         given = pulse(number, INTERVAL_S * number)
         assert self.flight.order(given.mono_ns) == number
-        order = Order(number, given.mono_ns, given.delays_ns, STROBE_NS)
-        self.ingest.orders[number] = order
+        self.sequence.fire(Order(number, given.mono_ns, given.delays_ns, STROBE_NS))
 
     def frame(self, number: int, head: str, *, is_timed: bool) -> None:
         """A frame of a head; one of a folder has no clock of its own."""
@@ -42,16 +32,14 @@ class Flown:
         came = frame(head, given, slot=number % 3)
         if not is_timed:
             came = replace(came, device_clock_ns=None, device_clock_mono_ns=None)
-        self.ingest.dispatch(came)
+        self.receive(came)
 
     def answer(self, number: int, *, fired: bool = True) -> None:
         given = pulse(number, INTERVAL_S * number)
         trigger_pulse = TriggerPulse(
             number, given.mono_ns, given.sigma_ns, given.count, given.spread_ns
         )
-        self.ingest.dispatch(
-            Fired(number, trigger_pulse if fired else None, "" if fired else "no unit")
-        )
+        self.receive(Fired(number, trigger_pulse if fired else None, "" if fired else "no unit"))
 
     @property
     def frames(self) -> dict[str, int]:
@@ -73,10 +61,10 @@ def test_a_frame_before_the_answer_to_its_trigger_is_used(is_timed: bool) -> Non
         flown.answer(number)
         flown.frame(number, HEADS[2], is_timed=is_timed)
     assert flown.frames == {"used": 15, "spurious": 0, "late": 0}
-    assert not flown.reported
+    assert flown.events == [("triggered", number) for number in range(1, 6)]
     # A replay of the log sees the trigger first.
-    kinds = [type(record).__name__ for record in flown.logged]
-    assert kinds == ["LoggedTrigger", "Frame", "Frame", "Frame"] * 5
+    kinds = ["decision", "trigger", *(f"frame/{head}" for head in HEADS)]
+    assert flown.logged == kinds * 5
 
 
 def test_an_early_frame_is_not_given_to_an_exposure_whose_own_is_missing() -> None:
@@ -111,16 +99,31 @@ def test_an_early_frame_of_a_trigger_that_failed_is_spurious_and_its_slot_free()
     assert flown.frames == {"used": 0, "spurious": 0, "late": 0}
     flown.answer(1, fired=False)
     assert flown.frames["spurious"] == 1
-    assert flown.flight.idle_slots == [(HEADS[0], 1)]
+    assert flown.sent["capture"][-1] == Recycle({HEADS[0]: 1})
 
 
 def test_a_trigger_that_never_answers_keeps_no_slot_for_ever() -> None:
     flown = Flown()
     flown.order(1)
     flown.frame(1, HEADS[0], is_timed=False)
-    came = pulse(1, INTERVAL_S).mono_ns + NS
-    flown.ingest.emit_time_events(came)
-    assert not flown.flight.idle_slots
-    flown.ingest.emit_time_events(came + EARLY_FRAME_LIMIT_NS + NS)
-    assert flown.flight.idle_slots == [(HEADS[0], 1)]
+    given = pulse(1, INTERVAL_S)
+    arrived_ns = frame(HEADS[0], given).mono_ns
+    for now_ns in (arrived_ns + EARLY_FRAME_LIMIT_NS, arrived_ns + EARLY_FRAME_LIMIT_NS + NS):
+        assert flown.frames["spurious"] == 0
+        flown.now_ns = now_ns
+        flown.sequence.advance()
+    assert flown.sent["capture"][-1] == Recycle({HEADS[0]: 1})
     assert flown.frames["spurious"] == 1
+
+
+def test_the_answer_to_a_trigger_that_was_given_up_ends_nothing() -> None:
+    """It comes after up to ten seconds, its exposure is given up after eight and sealed as lost."""
+    flown = Flown()
+    flown.order(1)
+    due = flown.flight.advance(pulse(1, INTERVAL_S).mono_ns + 9 * NS)
+    assert due.lost == ((1, "no pulse was given"),) and due.seal is not None
+    flown.flight.sealed(1)
+    flown.answer(1)
+    flown.frame(1, HEADS[0], is_timed=True)
+    assert flown.frames["late"] == 1 and flown.sent["capture"][-1] == Recycle({HEADS[0]: 1})
+    assert not flown.flight.ledger.imbalances()

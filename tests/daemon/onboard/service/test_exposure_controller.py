@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from daemon.configuration.model import from_mapping
+from daemon.configuration.service_file import from_mapping
 from daemon.onboard.capture.exposure_controller import PAN, ExposureController
 from daemon.onboard.service.messages import ApplyExposureSettings
 from processing.radiometry.histogram import BINS

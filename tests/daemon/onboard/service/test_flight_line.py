@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from daemon.configuration.model import from_mapping
+from daemon.configuration.service_file import from_mapping
 from daemon.onboard.flight.flight import Flight
 from daemon.onboard.flight.ledger import Ledger
 from daemon.onboard.service.flight_line import FlightLine, Order
@@ -23,7 +23,7 @@ def make_line(tmp_path: Path, *, count: int, flown: int = 0, reserve: int = 0) -
     content["limits"] = {"disk_reserve_bytes": reserve}
     configuration, rig = from_mapping(content, tmp_path / "service.toml")
     flight = Flight(rig, {"SU00": ""}, IDENTITY, LIMITS, Ledger(heads=["SU00"]), flown + 1)
-    flight.navigation(nav(0.0))
+    flight.take(nav(0.0))
     plan = next(iter(tmp_path.glob("plan.*")), None)
     return FlightLine(configuration, rig, flight, tmp_path, flown, plan=plan)
 
@@ -85,17 +85,10 @@ def test_exposures_carry_the_ids_of_the_planned_line_and_its_strip(tmp_path: Pat
         assert (opened.line_id, opened.strip_id) == expected
 
 
-def test_absent_devices_are_named(tmp_path: Path) -> None:
-    absent = make_line(tmp_path, count=1).absent(lambda _: False, has_trigger=False)
-    assert absent[:2] == ["head SU00", "trigger"]
-    assert "temperature of 0" in absent
-    assert "time and position" not in absent
-
-
 def test_a_position_counts_for_its_own_instant_once_the_clock_knows_it(tmp_path: Path) -> None:
     line = make_line(tmp_path, count=1)
     sample = nav(1.0)
-    line._flight.navigation(sample)
+    line._flight.take(sample)
     placed = line._position()
     assert placed is not None
     # Messages alone do not reveal their delay.
@@ -103,7 +96,7 @@ def test_a_position_counts_for_its_own_instant_once_the_clock_knows_it(tmp_path:
     clock = line._flight.clock
     for second in range(-3, 1):
         clock.pps_edge(second * 1_000_000_000, 1_000)
-    line._flight.navigation(nav(1.2))
+    line._flight.take(nav(1.2))
     placed = line._position()
     assert placed is not None
     assert placed.mono_ns == pytest.approx(1_200_000_000, abs=100_000)

@@ -62,7 +62,8 @@ class Seen:
 
     def changed(self, name: str, disk: int, *in_use: int) -> None:
         disks = tuple(self.disks[i] for i in in_use)
-        self.mirror.dispatch(DiskChanged(name, self.disks[disk], "it is so", disks, 1))
+        message = DiskChanged(name, self.disks[disk], "it is so", disks, 1)
+        self.mirror.handlers[DiskChanged](message)
 
 
 @pytest.fixture

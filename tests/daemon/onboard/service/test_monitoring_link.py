@@ -75,8 +75,10 @@ def test_a_restarted_process_receives_the_persistent_events() -> None:
     seen.emit({"event": "exposure-settings", "number": 5})
     seen.emit({"event": "device", "device": "SU02", "name": "lost", "number": 6})
     seen.emit({"event": "exposure-settings", "number": 7})
+    seen.emit({"event": "counters", "number": 8})
+    seen.emit({"event": "counters", "number": 9})
     seen.start()
-    assert line.sent == [1, 2, 6, 7]
+    assert line.sent == [1, 2, 6, 7, 9]
 
 
 @pytest.mark.trust

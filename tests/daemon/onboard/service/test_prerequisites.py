@@ -9,10 +9,16 @@ from typing import Any
 
 import pytest
 
-from daemon.configuration.model import Configuration, load
+from daemon.configuration.model import Configuration
+from daemon.configuration.service_file import load
 from daemon.onboard.preflight import prerequisites
 from daemon.onboard.preflight.check_results import CheckOutcome, CheckResult
-from daemon.onboard.preflight.prerequisites import CHECKS, CHECKS_AFTER_RESTART, exposure_interval_s
+from daemon.onboard.preflight.prerequisites import (
+    CHECKS,
+    CHECKS_AFTER_RESTART,
+    CHECKS_AT_START,
+    exposure_interval_s,
+)
 from processing.rig import Rig
 from tests.daemon.onboard.service.flight_parts import Planted
 
@@ -121,8 +127,9 @@ def test_what_prevents_ends_the_looking_and_a_restart_measures_nothing(planted: 
 
     found = prerequisites.prerequisites(configuration, rig, (is_blocking, never))
     assert [one.name for one in found] == ["b"]
-    # The health of disks is watched in flight anyway.
-    assert set(CHECKS) - set(CHECKS_AFTER_RESTART) == {
+    # The health of disks is watched in flight, and the process of the page checks its own.
+    assert set(CHECKS) - set(CHECKS_AT_START) == {prerequisites.monitoring}
+    assert set(CHECKS_AT_START) - set(CHECKS_AFTER_RESTART) == {
         prerequisites.pace,
         prerequisites.disk_health,
     }

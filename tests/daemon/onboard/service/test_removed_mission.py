@@ -11,9 +11,10 @@ from pathlib import Path
 import pytest
 
 from daemon import cli
-from daemon.configuration.model import load
+from daemon.configuration.service_file import load
+from daemon.mission.interrupted_mission import interrupted_mission
 from daemon.mission.layout import CURRENT_FILE, Mission
-from daemon.onboard.service.startup import create_mission, interrupted_mission
+from daemon.onboard.service.startup import create_mission
 from tests.daemon.onboard.service.flight_parts import Planted
 
 pytestmark = pytest.mark.trust

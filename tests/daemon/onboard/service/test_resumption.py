@@ -10,11 +10,12 @@ import pytest
 import typer
 
 from daemon.cli.run import run as run_command
-from daemon.configuration.model import load
+from daemon.configuration.service_file import load
+from daemon.mission.interrupted_mission import interrupted_mission
 from daemon.mission.layout import Mission
 from daemon.onboard.preflight.resumption import resume, rig_differences
 from daemon.onboard.service.notify import Notifier
-from daemon.onboard.service.startup import create_mission, interrupted_mission
+from daemon.onboard.service.startup import create_mission
 from tests.daemon.onboard.service.flight_parts import RIG, Planted, in_threads
 
 pytestmark = pytest.mark.trust

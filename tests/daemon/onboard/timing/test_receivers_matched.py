@@ -12,6 +12,8 @@ import threading
 import time
 from dataclasses import dataclass, field
 
+import pytest
+
 from daemon.onboard.timing.gps_clock import GpsClock
 from daemon.onboard.timing.mark_matching import MarkMatcher
 from daemon.onboard.timing.pulses import Cause, FiredPulse, MatchResult
@@ -26,6 +28,9 @@ from sim_hw.receivers.septentrio_receiver import SeptentrioReceiver
 from sim_hw.receivers.ublox_receiver import UbloxReceiver
 from sim_hw.world.world_clock import WorldClock
 from tests.sim_hw.receiver_state import state_at
+
+pytestmark = pytest.mark.realtime
+
 
 PULSES = 4
 LOST = 2

@@ -1,7 +1,7 @@
 """Timestamps say how good they are: 95 +- 2.5 % of errors lie inside two stated sigmas.
 
 A thousand independent hosts, each with a crystal, interrupts and round trips of its own; see
-`benchmarks.time_chain`, which prints the figures of docs/time.md.
+`benchmarks.time_chain`, which prints the figures of docs/explanation/time.md.
 """
 
 from __future__ import annotations

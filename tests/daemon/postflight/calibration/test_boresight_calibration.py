@@ -14,7 +14,8 @@ from typer.testing import CliRunner
 from benchmarks.boresight import write_flight
 from daemon.cli import app
 from daemon.configuration.model import MountSection
-from daemon.orientation.georeference import Georeference, utm_of
+from daemon.orientation.geodesy import utm_of
+from daemon.orientation.georeference import Georeference
 from daemon.postflight.calibration.boresight_calibration import (
     BoresightError,
     inertial_of_mission,
@@ -80,7 +81,6 @@ def test_exposures_with_other_names_are_an_error_that_states_so(project) -> None
 
 
 def test_the_trajectory_of_a_mission_is_taken_at_its_marks(tmp_path: Path) -> None:
-    pytest.importorskip("pyproj", reason="pip install 'syntopic[geodesy]'")
     fine = [sample_at(EPOCH_NS + 4_900_000_000 + i * 10_000_000) for i in range(40)]
     mission = mission_at(tmp_path / "m", samples=fine)
     crs = utm_of(PLAN.latitude_deg, PLAN.longitude_deg)
@@ -106,7 +106,6 @@ def test_the_trajectory_of_a_mission_is_taken_at_its_marks(tmp_path: Path) -> No
 
 
 def test_a_time_offset_moves_orientations_along_the_flight(tmp_path: Path) -> None:
-    pytest.importorskip("pyproj", reason="pip install 'syntopic[geodesy]'")
     fine = [sample_at(EPOCH_NS + 4_900_000_000 + i * 10_000_000) for i in range(40)]
     mission = mission_at(tmp_path / "m", samples=fine)
     at = master_of(mission, MountSection())
@@ -116,7 +115,6 @@ def test_a_time_offset_moves_orientations_along_the_flight(tmp_path: Path) -> No
 
 
 def test_another_mount_orients_in_addition_to_the_one_flown(tmp_path: Path) -> None:
-    pytest.importorskip("pyproj", reason="pip install 'syntopic[geodesy]'")
     mission = mission_at(tmp_path / "m")
     mount = tmp_path / "mount.toml"
     mount.write_text("[mount]\nboresight_deg = [0.0, 0.1, 0.0]\n")

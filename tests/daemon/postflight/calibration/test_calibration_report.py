@@ -7,7 +7,6 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from daemon.postflight.calibration.calibration_report import (
@@ -23,12 +22,9 @@ from daemon.postflight.calibration.calibration_report import (
     with_content_id,
     write_calibration,
 )
-from daemon.postflight.calibration.plots import (
+from daemon.postflight.plots import (
     Curve,
     chart_svg,
-    histogram_svg,
-    map_svg,
-    vectors_svg,
 )
 
 REPORT = CalibrationReport(
@@ -117,18 +113,3 @@ def test_another_serial_number_is_reported(tmp_path: Path) -> None:
     assert serial_warnings(previous, {"head": "H-1"}) == []
     with pytest.raises(CalibrationFolderError, match="syntopic calibrate lab"):
         read_previous(tmp_path / "a", kind="lab")
-
-
-def test_plots_draw_what_is_finite_and_stand_alone() -> None:
-    values = np.array([1.0, np.nan, 3.0, -1.0])
-    drawings = [
-        chart_svg("t", ("x", "y"), [Curve("", values, values)], log=True, bars=[(2.0, "bar")]),
-        chart_svg("t", ("x", "y"), []),
-        histogram_svg("t", "DN", values, log=True),
-        map_svg("t", np.arange(12.0).reshape(3, 4), "DN"),
-        vectors_svg("t", np.eye(2), np.eye(2), half=(2.0, 1.0), unit=("um", 1e3)),
-    ]
-    for svg in drawings:
-        assert svg.startswith("<svg")
-        assert "nan" not in svg.lower().replace("dominant", "")
-        assert 'href="http' not in svg

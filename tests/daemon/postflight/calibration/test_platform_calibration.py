@@ -15,10 +15,9 @@ from typer.testing import CliRunner
 from benchmarks import dmc_platform, ultracam_platform
 from daemon.cli import app
 from daemon.mission.layout import Mission
-from processing.bundle.rotations import omega_phi_kappa, rotations_from_vectors
 from processing.calibration.platform import calibrate_platform, calibrated_rig
 from processing.geometry.placement import nominal_placements
-from processing.geometry.rotation import rotation_matrix
+from processing.geometry.rotation import omega_phi_kappa, rotation_matrix, rotations_from_vectors
 from processing.mosaic.free_mosaic import free_mosaic
 from processing.mosaic.stitch_record import StitchRecord, stitch_record, stitch_record_json
 from processing.rig import Rig, find_rig, load_rig, shipped_rigs
@@ -39,8 +38,8 @@ def with_rotations(rig: Rig, corrections: dict[str, tuple[float, float, float]])
     cones = []
     for cone in rig.cones:
         turn = np.array(corrections.get(cone.name, (0.0, 0.0, 0.0)))
-        rotation = rotations_from_vectors(turn[None])[0] @ rotation_matrix(*cone.rotation_rad)
-        omega, phi, kappa = (float(v) for v in omega_phi_kappa(rotation[None])[0])
+        rotation = rotations_from_vectors(turn) @ rotation_matrix(*cone.rotation_rad)
+        omega, phi, kappa = (float(v) for v in omega_phi_kappa(rotation))
         cones.append(replace(cone, rotation_rad=(omega, phi, kappa)))
     return replace(rig, cones=tuple(cones))
 

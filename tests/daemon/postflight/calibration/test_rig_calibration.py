@@ -11,8 +11,7 @@ from typer.testing import CliRunner
 
 from benchmarks.rig_calibration import write_block
 from daemon.cli import app
-from processing.geometry.orientation import phi_omega_kappa
-from processing.geometry.rotation import rotation_matrix
+from processing.geometry.rotation import phi_omega_kappa, rotation_matrix
 from processing.rig import find_rig, load_rig
 from sim_hw.blocks.oblique import TABLE_2_GRAD, simulate_oblique_block, table_2_rotation
 

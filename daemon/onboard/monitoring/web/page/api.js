@@ -48,5 +48,5 @@ for (const [path, methods] of Object.entries(api.paths)) {
 sections.push(element("section", {},
   element("h2", {}, element("span", { className: "method", textContent: "WS" }),
     element("code", { textContent: "/api/v1/telemetry" })),
-  element("p", { textContent: "Telemetry, form=json or form=msgpack; bytes_per_s limits the rate. See docs/telemetry.md." })));
+  element("p", { textContent: "Telemetry, form=json or form=msgpack; bytes_per_s limits the rate. See docs/reference/flight/telemetry.md." })));
 container.replaceChildren(...sections);

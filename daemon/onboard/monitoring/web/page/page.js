@@ -2,6 +2,7 @@
 
 import { flight, connect, onChange } from "./telemetry.js";
 import { confirmCommand, requestToken, command } from "./commands.js";
+import { fetchJson } from "./http.js";
 import { drawMap } from "./map.js";
 import { drawExposure } from "./exposure.js";
 import { followPlan } from "./plan.js";
@@ -148,12 +149,30 @@ function drawFaults() {
   }));
 }
 
+// Counters of the devices by name. They are not part of telemetry and are read for expanded kinds.
+const counters = new Map();
+
+async function readCounters() {
+  for (const device of (await fetchJson("/api/v1/devices")) || []) counters.set(device.name, device.counters);
+  for (const item of by("devices").querySelectorAll("li[data-device]")) {
+    item.querySelector(".counters").textContent = countersText(item.dataset.device);
+  }
+}
+
+function countersText(name) {
+  return Object.entries(counters.get(name) || {}).filter(([, count]) => count)
+    .map(([counter, count]) => `${counter.replaceAll("_", " ")} ${count}`).join(", ");
+}
+
 function deviceItem(device) {
-  return element("li", { className: device.state },
+  const item = element("li", { className: device.state },
     element("span", { textContent: DEVICE_MARKS[device.state] || "○", ariaHidden: "true" }),
     element("span", { textContent: device.name }),
     element("span", { className: "detail", textContent:
-      device.state === "ready" ? "ready" : `${device.state}. ${device.sentence}` }));
+      device.state === "ready" ? "ready" : `${device.state}. ${device.sentence}` }),
+    element("span", { className: "counters", textContent: countersText(device.name) }));
+  item.dataset.device = device.name;
+  return item;
 }
 
 const isWaiting = (device) => device.state === "searching";
@@ -172,6 +191,7 @@ function drawDevices() {
       element("summary", { textContent: `${!notReady.length ? "●" : notReady.every(isWaiting) ? "◌" : "✖"} ${kind}: ${readyCount} of ${devices.length} ready` }),
       element("ul", {}, ...notReady.map(deviceItem), ...devices.filter((one) => !notReady.includes(one)).map(deviceItem)));
     container.dataset.kind = kind;
+    container.addEventListener("toggle", () => container.open && readCounters());
     return element("li", {}, container);
   }));
 }

@@ -16,12 +16,13 @@ from typer.testing import CliRunner
 from daemon.cli.calibrate import app
 from daemon.postflight.calibration.laboratory.head_geometry import (
     FREE,
+    CollimatorSeries,
     Target,
     head_network,
     layer_mm,
-    targets_of,
 )
 from daemon.postflight.calibration.laboratory.laboratory_series import SeriesError, read_series
+from daemon.postflight.calibration.laboratory.radiometric import RadiometricSeries
 from processing.bundle.adjust import adjust
 from processing.bundle.network import INTERIOR
 from processing.geometry.residual_grid import grid_from_bytes
@@ -98,8 +99,8 @@ def test_matching_among_the_targets_has_no_bias(laboratory: Path) -> None:
     from daemon.mission.store.level0 import read_tiff
     from daemon.postflight.calibration.laboratory.head_geometry import _nominal
 
-    series = read_series(laboratory / "1" / "series", kind="head")
-    targets = targets_of(series)[::2]
+    series = read_series(laboratory / "1" / "series", CollimatorSeries)
+    targets = series.file.images[::2]
     rig = series.rig
     images = []
     for target in targets:
@@ -125,7 +126,8 @@ def test_matching_among_the_targets_has_no_bias(laboratory: Path) -> None:
 def test_the_uncertainty_of_the_parameters_is_honest_over_fifty_seeds() -> None:
     rig = find_rig("dmc")
     cone, sensor = rig.cone("1"), rig.sensor("P1")
-    # What matching and a collimator of 0.3 urad give in a head of 120 mm: see docs/calibration.md.
+    # What matching and a collimator of 0.3 urad give in a head of 120 mm: see
+    # docs/how-to/processing/calibration.md.
     sigma_px = 0.004
     squares, beyond_three, errors = 0.0, 0, 0
     worst = 0.0
@@ -139,7 +141,7 @@ def test_the_uncertainty_of_the_parameters_is_honest_over_fifty_seeds() -> None:
                 if at is not None:
                     px.append(at + random.normal(0.0, sigma_px, 2))
                     targets.append(
-                        Target(Path(), "P1", str(holder), 90.0 * holder, (0, 0), alpha, beta, 20.0)
+                        Target(Path(), "P1", str(holder), alpha, beta, 20.0, 90.0 * holder)
                     )
         network = head_network(
             cone, targets, layer_mm(sensor, np.array(px)), sigma_mm=sigma_px * sensor.pitch_mm
@@ -201,7 +203,6 @@ def test_too_few_targets_and_another_kind_of_series_are_refused(
     content["images"][0]["turned_deg"] = content["images"][0].pop("rotation_deg")
     (tmp_path / "series.json").write_text(json.dumps(content))
     run = CliRunner().invoke(app, ["head", str(tmp_path), "--out", str(tmp_path / "x")])
-    assert ".turned_deg is " in str(run.exception)
-    assert "it is now named rotation_deg; rename it" in str(run.exception)
+    assert "images[0].turned_deg is now named rotation_deg; rename it" in str(run.exception)
     with pytest.raises(SeriesError, match="kind is 'head'"):
-        read_series(tmp_path, kind="radiometric")
+        read_series(tmp_path, RadiometricSeries)

@@ -1,0 +1,272 @@
+"""Features of an opened GenICam head by name: what exists, what may be written, and its value.
+
+Every call goes through `Features`, which turns the errors and assertions of Aravis into one
+exception with the reason.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, Final
+
+from drivers.cameras.aravis.feature_value import FeatureValue
+from drivers.cameras.aravis.library import aravis, aravis_error, message_of
+from drivers.errors import DriverError
+
+RELATIVE_TOLERANCE: Final = 1e-3
+"""Between a number that was written and the number read back; heads round to their steps."""
+
+
+class FeatureError(DriverError):
+    """A feature that does not exist or does not accept a value; the message is the reason."""
+
+
+class Features:
+    """The features of one opened device. Not thread-safe.
+
+    Args:
+        device: the device of Aravis.
+    """
+
+    def __init__(self, device: Any) -> None:
+        self._device = device
+        self._library = aravis()
+        self._failed = aravis_error()
+
+    def kind(self, name: str) -> str | None:
+        """The type of a feature's value.
+
+        Returns:
+            `boolean`, `integer`, `float`, `enumeration`, `string` or `command`; None if the head's
+            description has no feature of this name, or only a category.
+        """
+        node = self._device.get_feature(name)
+        library = self._library
+        if node is None or isinstance(node, library.GcCategory):
+            return None
+        for found, type_ in (
+            ("command", library.GcCommand),
+            ("boolean", library.GcBoolean),
+            ("enumeration", library.GcEnumeration),
+            ("float", library.GcFloat),
+            ("integer", library.GcInteger),
+            ("string", library.GcString),
+        ):
+            if isinstance(node, type_):
+                return found
+        return None
+
+    def is_available(self, name: str) -> bool:
+        """Whether the head has the feature and offers it in its present state."""
+        if self.kind(name) is None:
+            return False
+        try:
+            return bool(self._device.is_feature_available(name))
+        except self._failed:
+            return False
+
+    def is_locked(self, name: str) -> bool:
+        """Whether another setting of the head locks the feature."""
+        node = self._device.get_feature(name)
+        try:
+            return bool(node is not None and node.is_locked())
+        except self._failed:
+            return False
+
+    def is_writable(self, name: str) -> bool:
+        """Whether the feature is available, not locked and not read-only."""
+        if not self.is_available(name) or self.is_locked(name):
+            return False
+        try:
+            mode = self._device.get_feature(name).get_actual_access_mode()
+        except self._failed:
+            return False
+        return bool(mode != self._library.GcAccessMode.RO)
+
+    def entries(self, name: str) -> list[str]:
+        """The entries that an enumeration offers in the head's present state."""
+        if self.kind(name) != "enumeration":
+            return []
+        try:
+            found = self._device.dup_available_enumeration_feature_values_as_strings(name)
+        except self._failed:
+            return []
+        return [str(entry) for entry in found or ()]
+
+    def bounds(self, name: str) -> tuple[float, float]:
+        """Lowest and highest value of a number; infinite where the head states none."""
+        try:
+            if self.kind(name) == "integer":
+                low, high = self._device.get_integer_feature_bounds(name)
+            else:
+                low, high = self._device.get_float_feature_bounds(name)
+        except self._failed:
+            return -math.inf, math.inf
+        if not low <= high or not (math.isfinite(low) or math.isfinite(high)):
+            return -math.inf, math.inf
+        return float(low), float(high)
+
+    def increment(self, name: str) -> int:
+        """Step of an integer; 1 where the head states none."""
+        try:
+            return max(1, int(self._device.get_integer_feature_increment(name)))
+        except self._failed:
+            return 1
+
+    def get(self, name: str) -> FeatureValue:
+        """The value of a feature.
+
+        Raises:
+            FeatureError: the head has no such feature, or does not return it.
+        """
+        device = self._device
+        try:
+            match self.kind(name):
+                case "boolean":
+                    return bool(device.get_boolean_feature_value(name))
+                case "integer":
+                    return int(device.get_integer_feature_value(name))
+                case "float":
+                    return float(device.get_float_feature_value(name))
+                case "enumeration" | "string":
+                    value = device.get_string_feature_value(name)
+                    if value is None:
+                        raise FeatureError(f"{name} has no valid value")
+                    return str(value)
+                case "command":
+                    raise FeatureError(f"{name} is a command and has no value")
+        except self._failed as error:
+            raise FeatureError(f"{name} cannot be read: {message_of(error)}") from None
+        except UnicodeDecodeError:
+            raise FeatureError(f"{name} is no text in UTF-8") from None
+        raise FeatureError(f"the head has no feature {name}")
+
+    def number(self, name: str) -> float | None:
+        """The value of a number; None if the head does not offer it or it is not finite."""
+        if not self.is_available(name):
+            return None
+        try:
+            value = self.get(name)
+        except FeatureError:
+            return None
+        if isinstance(value, str | bool) or not math.isfinite(value):
+            return None
+        return float(value)
+
+    def text(self, name: str) -> str:
+        """The value of an enumeration or text; empty if the head does not offer it."""
+        if not self.is_available(name):
+            return ""
+        try:
+            return str(self.get(name))
+        except FeatureError:
+            return ""
+
+    def set(self, name: str, value: FeatureValue) -> FeatureValue:
+        """Write a feature and read it back.
+
+        A feature that already has the value is not written.
+
+        Returns:
+            The value the head holds afterwards; a number may be rounded to the head's step.
+
+        Raises:
+            FeatureError: the head refuses the value or does not keep it.
+        """
+        kind = self.kind(name)
+        if kind == "command":
+            self.execute(name)
+            return True
+        converted = _converted(name, kind, value)
+        if not self.is_available(name):
+            raise FeatureError(f"{name} is not available in the head's present state")
+        if self._is_held(name, converted):
+            return self.get(name)
+        if not self.is_writable(name):
+            reason = "locked by another setting" if self.is_locked(name) else "read-only"
+            raise FeatureError(f"{name} is {self._shown(name)} and {reason}")
+        if kind == "enumeration" and converted not in self.entries(name):
+            offered = ", ".join(self.entries(name)) or "no entry"
+            raise FeatureError(f"{name} has no entry {converted}; the head has {offered}")
+        try:
+            self._write(name, kind, converted)
+        except self._failed as error:
+            raise FeatureError(f"{name} = {converted} is refused: {message_of(error)}") from None
+        found = self.get(name)
+        if not _is_close(found, converted):
+            raise FeatureError(f"{name} was set to {converted}, and the head holds {found}")
+        return found
+
+    def write_only(self, name: str, value: int) -> None:
+        """Write an integer that the head does not return. FeatureError: it refuses it."""
+        if self.kind(name) != "integer":
+            raise FeatureError(f"the head has no feature {name}")
+        try:
+            self._device.set_integer_feature_value(name, value)
+        except self._failed as error:
+            raise FeatureError(f"{name} = {value} is refused: {message_of(error)}") from None
+
+    def execute(self, name: str) -> None:
+        """Execute a command. FeatureError: the head has none, or refuses it."""
+        if self.kind(name) != "command":
+            raise FeatureError(f"the head has no command {name}")
+        try:
+            self._device.execute_command(name)
+        except self._failed as error:
+            raise FeatureError(f"{name} is refused: {message_of(error)}") from None
+
+    def first_available(self, names: Sequence[str]) -> str | None:
+        """The first of these features that the head offers."""
+        return next((name for name in names if self.is_available(name)), None)
+
+    def first_entry(self, name: str, wanted: Sequence[str]) -> str | None:
+        """The first of these entries that an enumeration offers."""
+        offered = self.entries(name)
+        return next((entry for entry in wanted if entry in offered), None)
+
+    def _is_held(self, name: str, value: FeatureValue) -> bool:
+        try:
+            return self.get(name) == value
+        except FeatureError:
+            return False
+
+    def _shown(self, name: str) -> str:
+        try:
+            return str(self.get(name))
+        except FeatureError:
+            return "unreadable"
+
+    def _write(self, name: str, kind: str | None, value: FeatureValue) -> None:
+        device = self._device
+        if kind == "boolean":
+            device.set_boolean_feature_value(name, value)
+        elif kind == "integer":
+            device.set_integer_feature_value(name, value)
+        elif kind == "float":
+            device.set_float_feature_value(name, value)
+        else:
+            device.set_string_feature_value(name, value)
+
+
+def _converted(name: str, kind: str | None, value: FeatureValue) -> FeatureValue:
+    """The value in the type of the feature. FeatureError: it is of another type."""
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    if kind == "boolean" and isinstance(value, bool):
+        return value
+    if kind == "integer" and is_number and float(value) == int(value):
+        return int(value)
+    if kind == "float" and is_number:
+        return float(value)
+    if kind in ("enumeration", "string") and isinstance(value, str):
+        return value
+    if kind is None:
+        raise FeatureError(f"the head has no feature {name}")
+    needed = {"boolean": "true or false", "integer": "a whole number", "float": "a number"}
+    raise FeatureError(f"{name} = {value!r}; {needed.get(kind, 'a text')} is needed")
+
+
+def _is_close(found: FeatureValue, wanted: FeatureValue) -> bool:
+    if isinstance(found, str) or isinstance(wanted, str | bool):
+        return found == wanted
+    return math.isclose(found, wanted, rel_tol=RELATIVE_TOLERANCE, abs_tol=1e-9)

@@ -1,0 +1,137 @@
+"""Features that are switched off before a head is configured, since they falsify its frames.
+
+Automatic functions change exposure and gain from frame to frame and lock the features that set
+them. Processing inside the head (gamma, sharpening, look-up tables, defect correction) changes
+radiometry; mirroring, binning, decimation, offsets and test patterns change geometry.
+
+Source: GenICam SFNC 2.7 for the standard names; the descriptions of Allied Vision, Basler,
+FLIR and Point Grey heads for the others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from typing import Final
+
+from drivers.cameras.aravis.feature_access import FeatureError, Features
+from drivers.cameras.aravis.feature_value import FeatureValue
+
+NEUTRAL: Final[tuple[tuple[str, FeatureValue], ...]] = (
+    ("SequencerMode", "Off"),
+    ("SequenceEnable", False),
+    ("pgrHDRModeEnabled", False),
+    ("ExposureAuto", "Off"),
+    ("GainAuto", "Off"),
+    ("BlackLevelAuto", "Off"),
+    ("BalanceWhiteAuto", "Off"),
+    ("BalanceRatioAuto", "Off"),
+    ("SharpnessAuto", "Off"),
+    ("HueAuto", "Off"),
+    ("SaturationAuto", "Off"),
+    ("IrisAuto", "Off"),
+    ("pgrExposureCompensationAuto", "Off"),
+    ("AcquisitionFrameRateAuto", "Off"),
+    ("AcquisitionFrameRateEnable", False),
+    ("AcquisitionFrameRateEnabled", False),
+    ("GammaEnable", False),
+    ("GammaEnabled", False),
+    ("Gamma", 1.0),
+    ("SharpeningEnable", False),
+    ("SharpnessEnable", False),
+    ("SharpnessEnabled", False),
+    ("HueEnabled", False),
+    ("SaturationEnable", False),
+    ("SaturationEnabled", False),
+    ("NoiseReductionEnable", False),
+    ("LUTEnable", False),
+    ("ColorTransformationEnable", False),
+    ("ColorTransformationMode", "Off"),
+    ("RgbTransformLightSource", "Off"),
+    ("OnBoardColorProcessEnabled", False),
+    ("DefectCorrectionEnable", False),
+    ("DefectCorrectStaticEnable", False),
+    ("DefectMaskEnable", False),
+    ("PixelDefectControl", "Off"),
+    ("BSLPixelDefectCorrectionMode", "Off"),
+    ("TestPattern", "Off"),
+    ("TestImageSelector", "Off"),
+    ("TestPatternGeneratorSelector", "Off"),
+    ("pgrPixelBigEndian", False),
+    ("ReverseX", False),
+    ("ReverseY", False),
+    ("BinningHorizontal", 1),
+    ("BinningVertical", 1),
+    ("DecimationHorizontal", 1),
+    ("DecimationVertical", 1),
+    ("OffsetX", 0),
+    ("OffsetY", 0),
+)
+"""Feature and its neutral value, in the order in which they are written."""
+PASSES: Final = 2
+WITHOUT_EFFECT_WHILE_LOCKED: Final = frozenset(
+    {"OnBoardColorProcessEnabled", "HueEnabled", "SaturationEnabled", "SharpnessEnabled"}
+    | {"SaturationEnable", "ColorTransformationEnable", "RgbTransformLightSource"}
+)
+"""Processing of colour images, which heads lock while they send monochrome or Bayer images."""
+GATED: Final[Mapping[str, tuple[str, ...]]] = {"Gamma": ("GammaEnable", "GammaEnabled")}
+"""Features that have no effect while one of these switches exists and is off."""
+
+
+def switch_off(
+    features: Features, chosen: Collection[str]
+) -> tuple[dict[str, FeatureValue], list[str]]:
+    """Write the neutral value of every feature in `NEUTRAL` that the head offers.
+
+    Args:
+        features: the head's features.
+        chosen: features whose value the configuration states; they are left alone.
+
+    Returns:
+        The values that the head now holds, and one sentence for each feature that keeps another.
+    """
+    held: dict[str, FeatureValue] = {}
+    waiting = [name for name, _ in NEUTRAL if name not in chosen]
+    refused: dict[str, str] = {}
+    # A feature may be locked by one that stands later in the list.
+    for _ in range(PASSES):
+        refused = {}
+        for name in waiting:
+            try:
+                wanted = _wanted(features, name)
+                if wanted is not None:
+                    held[name] = features.set(name, wanted)
+            except FeatureError as error:
+                if not (name in WITHOUT_EFFECT_WHILE_LOCKED and features.is_locked(name)):
+                    refused[name] = str(error)
+        waiting = list(refused)
+    return held, [
+        f"{reason}; switch {name} off in the head, or state its value under features"
+        for name, reason in refused.items()
+    ]
+
+
+def _wanted(features: Features, name: str) -> FeatureValue | None:
+    """The neutral value of a feature; None if it is absent or has no effect."""
+    if not features.is_available(name):
+        return None
+    if any(features.text(switch) == "False" for switch in GATED.get(name, ())):
+        return None
+    return _neutral(features, name, dict(NEUTRAL)[name])
+
+
+def _neutral(features: Features, name: str, value: FeatureValue) -> FeatureValue | None:
+    """The neutral value in the type of this head's feature; None if it has none."""
+    kind = features.kind(name)
+    if kind == "enumeration":
+        wanted = (
+            ["Off", "False", "Disable", "Disabled", "None"]
+            if value in (False, "Off")
+            else [str(value), f"X{value}", f"{name}{value}"]
+        )
+        return features.first_entry(name, wanted)
+    if kind == "boolean":
+        return False if value in (False, "Off") else None
+    if kind in ("integer", "float") and not isinstance(value, str):
+        low, high = features.bounds(name)
+        return value if low <= value <= high else None
+    return None

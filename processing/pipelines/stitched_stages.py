@@ -1,0 +1,169 @@
+"""What the stages of `processing.pipelines.stitched` hand on, and the figures of its report."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.geometry.conditions import (
+    exposure_scale_figures,
+    exposure_scales,
+    parallax_px,
+    unknown_exposure_figures,
+)
+from processing.geometry.placement import SensorPlacement
+from processing.geometry.virtual_camera import GroundPlane, projection_figures
+from processing.image.colour import BandRegistration
+from processing.image.composition import Composition
+from processing.matching.content_check import ContentCheck, content_figures
+from processing.matching.tie_point_search import saturated_window_fraction
+from processing.mosaic.estimated_dc import EstimatedDc, estimated_dc_figures
+from processing.mosaic.free_mosaic import Mosaic
+from processing.mosaic.held import HeldQuantities, scale_figures
+from processing.mosaic.layers import LayerCheck, layer_figures
+from processing.mosaic.mounting import PlatformCheck, platform_figures
+from processing.mosaic.precision import UncertaintyContribution, precision_figures
+from processing.mosaic.readout_slips import slip_figures
+from processing.mosaic.stitching import Stitching
+from processing.pipelines.exposure_pipeline import Stages
+from processing.pipelines.product import PipelineSettings
+from processing.quality.band_levels import level_figures
+from processing.quality.common_windows import measure_common_windows
+from processing.quality.figures import FigureGroup
+from processing.quality.figures.circumstances import ParallaxFigures
+from processing.quality.figures.image import ValidFigures
+from processing.quality.figures.stitching import SaturatedOverlapFigures, SupportFigures
+from processing.quality.frame_blocks import block_edges, block_figures
+from processing.quality.frame_identity import identity_figures
+from processing.quality.frame_signal import sharpness_figures, signal_figures
+from processing.quality.local_sharpness import local_blur_figures
+from processing.quality.relative_sharpness import relative_sharpness_figures
+from processing.quality.signal_steps import signal_steps, step_figures
+from processing.quality.stitching_figures import poorest_overlap, stitching_figures
+from processing.quality.valid_area import Mask
+from processing.radiometry.level1 import FrameStatistics, exposed_rows
+from processing.rig import Rig
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class CorrectedFrames:
+    """Level-1 by sensor name, and where calibration and TDM place the sensors.
+
+    `by_pattern` are frames that show another head's fixed pattern, `figures` those of the raw
+    frames.
+    """
+
+    level1: Mapping[str, Array]
+    statistics: Mapping[str, FrameStatistics]
+    start: Mapping[str, SensorPlacement]
+    ground: GroundPlane | None
+    by_pattern: Mapping[str, str]
+    figures: tuple[FigureGroup | None, ...]
+
+
+@dataclass(frozen=True)
+class AdjustedFrames:
+    """Where the stitching places the frames, and what was found out about it."""
+
+    stitching: Stitching
+    content: ContentCheck
+    estimated_dc: tuple[EstimatedDc, ...]
+    platform: PlatformCheck | None
+    layers: LayerCheck | None
+    held: HeldQuantities | None
+    uncertainty_contribution: UncertaintyContribution
+
+
+@dataclass(frozen=True)
+class ComposedImage:
+    """The virtual image: PAN, and by band the colour and its cells without valid pixels."""
+
+    pan: Composition
+    registrations: tuple[BandRegistration, ...]
+    colour: Mapping[str, Array]
+    gaps: Mapping[str, Mask]
+    baselines: Mapping[str, Mosaic]
+    geometry: Mapping[str, Mapping[str, Array]]
+    quicklook: Array
+
+
+StitchedStages = Stages[CorrectedFrames, AdjustedFrames, ComposedImage]
+
+
+def figures_of(
+    rig: Rig, settings: PipelineSettings, stages: StitchedStages
+) -> Iterator[FigureGroup | None]:
+    """All figures of a stitched exposure but those of its conditions and of its valid area."""
+    conditions, temperatures = stages.exposure.conditions, stages.exposure.temperatures
+    corrected, adjusted, image = stages.corrected, stages.adjusted, stages.image
+    level1, start, stitching = corrected.level1, corrected.start, adjusted.stitching
+    tie_points, mosaic = stitching.tie_points, stitching.image
+    yield exposure_scale_figures(exposure_scales(rig, conditions.exposure_time_s))
+    yield unknown_exposure_figures(rig, level1.keys(), conditions.exposure_time_s)
+    yield from corrected.figures
+    exposed = {
+        s.name: exposed_rows(s, start[s.name].tdi_shifts) for s in rig.sensors if s.name in start
+    }
+    pan = [s for cone in rig.pan_cones for s in cone.sensors if s.name in level1]
+    yield from signal_figures(pan, level1, corrected.statistics)
+    yield sharpness_figures(pan, level1, exposed)
+    yield from stitching_figures(
+        rig,
+        tie_points,
+        mosaic,
+        validity=stitching.validity,
+        balance=image.pan.balance,
+        bands=image.registrations,
+        present=level1,
+    )
+    yield _saturated_overlap(rig, settings, corrected, stitching)
+    yield SupportFigures(stitching.weak)
+    yield estimated_dc_figures(adjusted.estimated_dc)
+    yield from platform_figures(adjusted.platform)
+    yield scale_figures(adjusted.held)
+    yield projection_figures(rig, conditions, settings.relief_fraction)
+    yield content_figures(adjusted.content)
+    yield relative_sharpness_figures(rig, start, level1)
+    means = {n: seen.lines for n, seen in corrected.statistics.items() if seen.lines is not None}
+    yield step_figures(signal_steps(rig.sensors, means))
+    yield block_figures(block_edges(rig, mosaic.placements, level1, means))
+    shared = measure_common_windows(rig, mosaic.placements, level1)
+    yield local_blur_figures(rig, shared)
+    yield level_figures(rig, shared)
+    yield identity_figures(rig, corrected.by_pattern, start, tie_points, image.registrations)
+    yield from layer_figures(adjusted.layers)
+    yield slip_figures(rig, stitching.slips)
+    yield precision_figures(
+        rig, mosaic, level1, temperatures.usable_c, adjusted.uncertainty_contribution
+    )
+    yield ValidFigures(float(np.count_nonzero(image.pan.source)) / image.pan.source.size)
+    yield ParallaxFigures(parallax_px(rig, conditions, settings.relief_fraction))
+
+
+def farthest_shift_px(content: ContentCheck) -> float:
+    """How far the farthest frame lies from where points are sought; zero where all are there."""
+    return max((math.hypot(*shift) for shift in content.shifted_px.values()), default=0.0)
+
+
+def _saturated_overlap(
+    rig: Rig, settings: PipelineSettings, corrected: CorrectedFrames, stitching: Stitching
+) -> SaturatedOverlapFigures | None:
+    """Whether saturation is why the poorest overlap has too few tie points."""
+    pairs: Sequence[tuple[str, str]] = stitching.tie_points.pairs
+    poorest = poorest_overlap(rig, stitching.image, corrected.level1)
+    if poorest is None or poorest not in pairs:
+        return None
+    if stitching.image.used[poorest] >= settings.thresholds.tie_points_per_overlap:
+        return None
+    return SaturatedOverlapFigures(
+        saturated_window_fraction(
+            rig, corrected.start, corrected.level1, poorest, settings=settings.tie_points
+        )
+    )

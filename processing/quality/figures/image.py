@@ -1,0 +1,222 @@
+"""Figures of the pixels: content, words, signal, sharpness, valid area."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Annotated
+
+from processing.quality.figures.group import FigureGroup, Key, Names
+
+
+@dataclass(frozen=True)
+class ContentFigures(FigureGroup):
+    """Frames that show other ground than their neighbours, or lie elsewhere."""
+
+    mismatched_sensors: Annotated[
+        Names,
+        "frames with texture that match no neighbour, comma separated",
+    ] = ()
+    mismatched_positions: Annotated[
+        int | None,
+        "textured positions of the worst of them that were tried",
+    ] = None
+    shifted_sensors: Annotated[
+        Names,
+        "frames found farther from their calibrated place than points are sought",
+    ] = ()
+    shifted_px: Annotated[float | None, "how far the farthest of them was, PAN pixels"] = None
+
+
+@dataclass(frozen=True)
+class UnreadFigures(FigureGroup):
+    """Pixels that were not read out."""
+
+    unread_worst_fraction: Annotated[
+        float | None,
+        "share of the worst sensor's pixels far below black: not read out",
+    ] = None
+    unread_worst_sensor: Annotated[str | None, "which sensor that is"] = None
+
+
+@dataclass(frozen=True)
+class SaturationFigures(FigureGroup):
+    """Saturated pixels."""
+
+    saturated_fraction: Annotated[float | None, "share of saturated pixels, all PAN sensors"] = None
+    saturated_worst_fraction: Annotated[float | None, "the same of the worst sensor"] = None
+    saturated_worst_sensor: Annotated[str | None, "which sensor that is"] = None
+
+
+@dataclass(frozen=True)
+class SignalFigures(FigureGroup):
+    """Brightness of the image."""
+
+    mean_dn: Annotated[float | None, "mean signal above black of the PAN sensors, DN"] = None
+    bright_fraction: Annotated[
+        float | None,
+        "95th percentile of PAN signal as a share of full scale",
+    ] = None
+
+
+@dataclass(frozen=True)
+class SharpnessFigures(FigureGroup):
+    """Fine detail of the image."""
+
+    sharpness: Annotated[
+        float | None,
+        "share of the finest detail: 0.25 smooth, 1 without any correlation",
+    ] = None
+
+
+@dataclass(frozen=True)
+class BalanceFigures(FigureGroup):
+    """Signal of the PAN heads against each other."""
+
+    balance_spread: Annotated[
+        float | None,
+        "largest over smallest gain between PAN heads, less one",
+    ] = None
+    gain_outlier: Annotated[
+        str | None,
+        "PAN sensor whose signal in the overlaps is far off that of the others",
+    ] = None
+    gain_outlier_signal: Annotated[float | None, "its signal over theirs"] = None
+
+
+@dataclass(frozen=True)
+class SignalStepFigures(FigureGroup):
+    """Steps of the signal from line to line."""
+
+    signal_step: Annotated[
+        float | None,
+        "largest change of signal from one whole line of a frame to the next, relative",
+    ] = None
+    signal_step_sensor: Annotated[str | None, "the frame it is in"] = None
+    signal_step_axis: Annotated[str | None, "rows or columns"] = None
+    signal_step_at: Annotated[int | None, "the last line before it, raw pixels"] = None
+    signal_step_lines: Annotated[
+        int | None,
+        "lines of the frame where the signal steps; many are banding",
+    ] = None
+
+
+@dataclass(frozen=True)
+class BlockFigures(FigureGroup):
+    """Blocks of a frame with another offset or gain."""
+
+    block_sensor: Annotated[
+        str | None,
+        "frame with a block whose signal differs: its edges follow lines of pixels, and no "
+        "other head shows them",
+    ] = None
+    block_step_dn: Annotated[float | None, "change of signal over its edge, DN"] = None
+    block_step: Annotated[float | None, "the same, relative"] = None
+    block_axis: Annotated[str | None, "the edge runs between two rows or two columns"] = None
+    block_at: Annotated[int | None, "the last line before it, raw pixels"] = None
+    block_first: Annotated[int | None, "first pixel of the edge in these lines"] = None
+    block_last: Annotated[int | None, "last pixel of it"] = None
+
+
+@dataclass(frozen=True)
+class WordFormatFigures(FigureGroup):
+    """Words in another format than the rig file states."""
+
+    word_format: Annotated[
+        Names,
+        "what is wrong with the words of a frame: left-justified, byte-swapped, beyond the "
+        "sensor's bits",
+    ] = ()
+    word_format_sensors: Annotated[Names, "the frames it is wrong in, comma separated"] = ()
+
+
+@dataclass(frozen=True)
+class RelativeSharpnessFigures(FigureGroup):
+    """A PAN sensor less sharp than its neighbours."""
+
+    blurred_sensor: Annotated[
+        str | None,
+        "PAN sensor that is less sharp than its neighbours in their overlaps",
+    ] = None
+    blurred_ratio: Annotated[float | None, "its fine detail over theirs"] = None
+
+
+@dataclass(frozen=True)
+class LocalBlurFigures(FigureGroup):
+    """The least sharp regions."""
+
+    colour_blur_sensor: Annotated[
+        str | None,
+        "colour sensor with the region that is least sharp against the other frames of the "
+        "same ground",
+    ] = None
+    colour_blur_deficit: Annotated[
+        float | None,
+        "what is missing there of the share of the finest detail",
+    ] = None
+    colour_blur_region: Annotated[str | None, "which region, raw pixels"] = None
+    pan_blur_sensor: Annotated[
+        str | None,
+        "PAN sensor with the region that has least detail of its own pixels for what colour "
+        "sees there",
+    ] = None
+    pan_blur_deficit: Annotated[
+        float | None,
+        "how many times less energy than usual, natural logarithm, beyond that of the next "
+        "frame's region",
+    ] = None
+    pan_blur_region: Annotated[str | None, "which region, raw pixels"] = None
+
+
+@dataclass(frozen=True)
+class IdentityFigures(FigureGroup):
+    """Frames that another head took."""
+
+    exchanged_frames: Annotated[
+        Names,
+        "frames that another head took than the one they are stored for, comma separated",
+    ] = ()
+    exchanged_from: Annotated[Names, "the heads they came from, in the same order"] = ()
+    exchanged_by: Annotated[str | None, "what shows it: fixed pattern, geometry"] = None
+
+
+@dataclass(frozen=True)
+class BandLevelFigures(FigureGroup):
+    """Signal of the bands against PAN, by band."""
+
+    level_by_band: Annotated[
+        Mapping[str, float | None],
+        "signal of a band over that of PAN on the same ground, median",
+        Key("<band>_over_pan"),
+    ] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class ClippingFigures(FigureGroup):
+    """A signal that ends below full scale."""
+
+    clipped_sensor: Annotated[
+        str | None,
+        "frame whose signal ends at one value below full scale",
+    ] = None
+    clipped_sensors: Annotated[Names, "all such frames, comma separated"] = ()
+    clipped_dn: Annotated[int | None, "that value, raw DN"] = None
+    clipped_fraction: Annotated[float | None, "share of its pixels there"] = None
+
+
+@dataclass(frozen=True)
+class ValidFigures(FigureGroup):
+    """Data in the image."""
+
+    valid_fraction: Annotated[float | None, "share of virtual image pixels that hold data"] = None
+
+
+@dataclass(frozen=True)
+class ValidAreaFigures(FigureGroup):
+    """Valid area of the band that has the least."""
+
+    valid_worst_fraction: Annotated[
+        float | None,
+        "share of the image with valid pixels, of the band that has the least",
+    ] = None
+    valid_worst_band: Annotated[str | None, "which band that is"] = None

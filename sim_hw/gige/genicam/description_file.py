@@ -1,0 +1,146 @@
+"""Read a GenICam description: the nodes of a camera by name.
+
+Source: GenICam Standard 2.1.1, section 2 (GenApi), schemas 1.0 and 1.1.
+"""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from xml.etree import ElementTree
+
+from sim_hw.errors import SimulatorError
+
+_CONTAINERS = frozenset({"Group", "RegisterDescription"})
+_BIT_PROPERTIES = frozenset({"Bit", "LSB", "MSB", "Sign"})
+_DESCRIPTION_MAX_NBYTES = 64 << 20
+
+
+class DescriptionError(SimulatorError, ValueError):
+    """A file that is no GenICam description."""
+
+
+@dataclass(frozen=True)
+class Property:
+    """One element of a node: its text and its attributes."""
+
+    text: str
+    attributes: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Node:
+    """One node: its kind (such as `IntReg`), name and elements by tag, in order."""
+
+    kind: str
+    name: str
+    properties: Mapping[str, tuple[Property, ...]]
+    entries: tuple[Node, ...] = ()
+
+    def text(self, tag: str, default: str = "") -> str:
+        """The text of the first element with this tag."""
+        found = self.properties.get(tag)
+        return found[0].text if found else default
+
+    def texts(self, tag: str) -> list[str]:
+        """The texts of all elements with this tag."""
+        return [item.text for item in self.properties.get(tag, ())]
+
+
+@dataclass(frozen=True)
+class Description:
+    """The description of one camera: vendor, model and nodes."""
+
+    vendor: str
+    model: str
+    namespace: str
+    schema: tuple[int, int]
+    nodes: Mapping[str, Node]
+    xml: bytes
+
+
+def read_description(data: bytes) -> Description:
+    """Read a description as a camera stores it, also zipped.
+
+    Text before the first `<`, which programs write that save a description, is skipped.
+
+    Raises:
+        DescriptionError: it is no GenICam description.
+    """
+    if data[:2] == b"PK":
+        data = _unzip(data)
+    start = data.find(b"<")
+    if start < 0 or len(data) > _DESCRIPTION_MAX_NBYTES:
+        raise DescriptionError("the file contains no XML; save the description of a camera")
+    xml = data[start:]
+    try:
+        root = ElementTree.fromstring(xml)
+    except ElementTree.ParseError as error:
+        raise DescriptionError(f"the XML cannot be read: {error}") from None
+    if _tag(root) != "RegisterDescription":
+        raise DescriptionError(f"the root is {_tag(root)}; a description has RegisterDescription")
+    nodes = {node.name: node for node in _nodes(root)}
+    return Description(
+        vendor=root.get("VendorName", ""),
+        model=root.get("ModelName", ""),
+        namespace=root.get("StandardNameSpace", ""),
+        schema=(int(root.get("SchemaMajorVersion", 1)), int(root.get("SchemaMinorVersion", 0))),
+        nodes=nodes,
+        xml=xml,
+    )
+
+
+def _unzip(data: bytes) -> bytes:
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            names = [name for name in archive.namelist() if name.lower().endswith(".xml")]
+            if not names or archive.getinfo(names[0]).file_size > _DESCRIPTION_MAX_NBYTES:
+                raise DescriptionError("the archive contains no description")
+            return archive.read(names[0])
+    except zipfile.BadZipFile as error:
+        raise DescriptionError(f"the archive cannot be read: {error}") from None
+
+
+def _tag(element: ElementTree.Element) -> str:
+    return element.tag.rpartition("}")[2]
+
+
+def _nodes(parent: ElementTree.Element) -> Iterator[Node]:
+    for element in parent:
+        kind = _tag(element)
+        if kind in _CONTAINERS:
+            yield from _nodes(element)
+        elif kind == "StructReg":
+            yield from _struct_entries(element)
+        elif element.get("Name"):
+            yield _node(kind, element)
+
+
+def _node(kind: str, element: ElementTree.Element) -> Node:
+    entries = tuple(_node("EnumEntry", e) for e in element if _tag(e) == "EnumEntry")
+    return Node(kind, element.get("Name", ""), _properties(element), entries)
+
+
+def _properties(element: ElementTree.Element) -> dict[str, tuple[Property, ...]]:
+    found: dict[str, tuple[Property, ...]] = {}
+    for child in element:
+        tag = _tag(child)
+        if tag != "EnumEntry":
+            text = (child.text or "").strip()
+            found[tag] = (*found.get(tag, ()), Property(text, dict(child.attrib)))
+    return found
+
+
+def _struct_entries(element: ElementTree.Element) -> Iterator[Node]:
+    """A StructReg is one register; each entry is a MaskedIntReg with its own bits."""
+    common = {
+        tag: found
+        for tag, found in _properties(element).items()
+        if tag not in _BIT_PROPERTIES | {"StructEntry"}
+    }
+    for entry in element:
+        if _tag(entry) == "StructEntry":
+            own = _properties(entry)
+            yield Node("MaskedIntReg", entry.get("Name", ""), {**common, **own})

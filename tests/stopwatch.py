@@ -1,0 +1,80 @@
+"""Wall-clock limits that hold on a busy machine as well.
+
+A limit of a device or a process is asserted on the time that passed less the time for which the
+machine withheld its cores: the kernel counts for each thread how long it was ready to run and did
+not run. On an idle machine that is close to zero and the limit holds as it is written.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+
+CALIBRATION_S = 0.2
+
+
+class Stopwatch:
+    """Measures from its creation on; covers this process and the processes it started."""
+
+    def __init__(self) -> None:
+        self._begun_s = time.monotonic()
+        self._waited_ns = _waited_ns()
+        self._last_ns: dict[str, int] = {}
+
+    @property
+    def elapsed_s(self) -> float:
+        """Seconds of wall time."""
+        return time.monotonic() - self._begun_s
+
+    @property
+    def withheld_s(self) -> float:
+        """Seconds for which threads were ready and waited for a core, all threads added up.
+
+        Threads that ended count up to the last reading; zero where the kernel does not count.
+        """
+        self._last_ns |= _waited_ns()
+        waited_ns = sum(ns - self._waited_ns.get(task, 0) for task, ns in self._last_ns.items())
+        return waited_ns * 1e-9
+
+    @property
+    def own_s(self) -> float:
+        """Seconds of wall time that the machine did not withhold; not negative."""
+        return max(0.0, self.elapsed_s - self.withheld_s)
+
+    def is_within(self, limit_s: float) -> bool:
+        """Whether less than the limit has passed, on a machine with idle cores."""
+        return self.elapsed_s < limit_s or self.own_s < limit_s
+
+
+def slowdown() -> float:
+    """How many times longer a computation takes now than it computes; 1.0 on an idle machine."""
+    begun_s, begun_cpu_s = time.monotonic(), time.thread_time()
+    while time.thread_time() - begun_cpu_s < CALIBRATION_S:
+        pass
+    return max(1.0, (time.monotonic() - begun_s) / CALIBRATION_S)
+
+
+def _waited_ns() -> dict[str, int]:
+    """How long each thread has waited for a core since it began, by its path in /proc.
+
+    Source: Documentation/scheduler/sched-stats.rst of the kernel, /proc/<pid>/schedstat.
+    """
+    found = {}
+    for process in _family(os.getpid()):
+        with suppress(OSError):
+            for task in Path(f"/proc/{process}/task").iterdir():
+                with suppress(OSError, IndexError):
+                    found[str(task)] = int((task / "schedstat").read_text("ascii").split()[1])
+    return found
+
+
+def _family(process: int) -> Iterator[int]:
+    """A process and its living descendants."""
+    yield process
+    with suppress(OSError):
+        for task in Path(f"/proc/{process}/task").iterdir():
+            for child in (task / "children").read_text("ascii").split():
+                yield from _family(int(child))
