@@ -161,7 +161,20 @@ def vip_mm_from_raw(placement: SensorPlacement, colrow: Array) -> Array:
     Source: Ladstädter et al. (2010), eq. 1.
     """
     corrected = corrected_mm_from_raw(placement, np.asarray(colrow, dtype=np.float64))
-    return apply_projective(placement.layer @ placement.similarity.matrix, corrected)
+    return vip_mm_from_corrected(placement, corrected)
+
+
+def vip_mm_from_corrected(placement: SensorPlacement, corrected_mm: Array) -> Array:
+    """The last step of `vip_mm_from_raw`, from `corrected_mm_from_raw`.
+
+    Args:
+        placement: of the sensor.
+        corrected_mm: u' (n, 2).
+
+    Returns:
+        Points (n, 2) of the virtual image plane, mm.
+    """
+    return apply_projective(placement.layer @ placement.similarity.matrix, corrected_mm)
 
 
 def raw_from_vip_mm(placement: SensorPlacement, xy_mm: Array) -> Array:

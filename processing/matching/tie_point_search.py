@@ -6,7 +6,7 @@ What is found there is matched in `processing.matching.tie_points`.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -104,7 +104,9 @@ def pan_searches(
             at_a = at_b
         elif a in frames and b in frames:
             area = _shrunk(
-                _raw_area(placements[a], overlap.rectangle), usable_pixels(placements[a]), margin_px
+                _raw_areas(placements[a], [overlap.rectangle])[0],
+                usable_pixels(placements[a]),
+                margin_px,
             )
             cells = _cells(area, settings.points_per_overlap, settings.window_pp_px + 3)
             at_a = _features(frames[a], cells, half, settings.window_pp_px)
@@ -116,9 +118,21 @@ def pan_searches(
     return result
 
 
-def overlap_pixels(placement: SensorPlacement, overlap: Overlap) -> tuple[int, int, int, int]:
-    """First and last column, first and last row of a sensor's usable pixels in an overlap."""
-    return _shrunk(_raw_area(placement, overlap.rectangle), usable_pixels(placement), 0)
+def overlap_pixels(
+    placement: SensorPlacement, seen: Sequence[Overlap]
+) -> list[tuple[int, int, int, int]]:
+    """Usable pixels of a sensor in overlaps.
+
+    Args:
+        placement: of the sensor.
+        seen: overlaps of this sensor.
+
+    Returns:
+        First and last column, first and last row by overlap.
+    """
+    usable = usable_pixels(placement)
+    areas = _raw_areas(placement, [overlap.rectangle for overlap in seen])
+    return [_shrunk(area, usable, 0) for area in areas]
 
 
 def _seen_searches(
@@ -130,7 +144,7 @@ def _seen_searches(
 ) -> tuple[NDArray[np.int64], tuple[int, int, int, int] | None]:
     """Positions in b where a sees the same, and the region of b that holds their windows."""
     a, b = placements[overlap.sensor_a], placements[overlap.sensor_b]
-    area = _shrunk(_raw_area(b, overlap.rectangle), usable_pixels(b), margin_px)
+    area = _shrunk(_raw_areas(b, [overlap.rectangle])[0], usable_pixels(b), margin_px)
     cells = _cells(area, settings.points_per_overlap, settings.window_pp_px + 3)
     at_b = _features(
         frames[overlap.sensor_b], cells, settings.window_pp_px // 2, settings.window_pp_px
@@ -186,7 +200,7 @@ def colour_searches(
             max(coverage[name].y_max_mm for name in coverage),
         )
         area = _shrunk(
-            _raw_area(placements[colour], union), usable_pixels(placements[colour]), margin_px
+            _raw_areas(placements[colour], [union])[0], usable_pixels(placements[colour]), margin_px
         )
         wanted_count = settings.points_per_sensor * len(coverage)
         cells = _cells(area, wanted_count, settings.window_pc_px + 1)
@@ -256,7 +270,7 @@ def saturated_window_fraction(
         if (overlap.sensor_a, overlap.sensor_b) != pair:
             continue
         for name in pair:
-            area = _raw_area(placements[name], overlap.rectangle)
+            area = _raw_areas(placements[name], [overlap.rectangle])[0]
             left, right, top, low = _shrunk(area, usable_pixels(placements[name]), 0)
             columns, rows = (right + 1 - left) // size, (low + 1 - top) // size
             if name in frames and columns > 0 and rows > 0:
@@ -277,26 +291,19 @@ def _round_robin(
     return np.where(hit.any(axis=1), hit.argmax(axis=1), -1)
 
 
-def _raw_area(
-    placement: SensorPlacement, rectangle: Rectangle
-) -> tuple[float, float, float, float]:
-    """First and last column, first and last row of a VIP rectangle in a sensor's raw frame."""
-    r = rectangle
-    corners = np.array(
-        [
-            [r.x_min_mm, r.y_min_mm],
-            [r.x_max_mm, r.y_min_mm],
-            [r.x_min_mm, r.y_max_mm],
-            [r.x_max_mm, r.y_max_mm],
-        ]
-    )
-    raw = raw_from_vip_mm(placement, corners)
-    return (
-        float(raw[:, 0].min()),
-        float(raw[:, 0].max()),
-        float(raw[:, 1].min()),
-        float(raw[:, 1].max()),
-    )
+def _raw_areas(
+    placement: SensorPlacement, rectangles: Sequence[Rectangle]
+) -> list[tuple[float, float, float, float]]:
+    """First and last column, first and last row of VIP rectangles in a sensor's raw frame."""
+    corners = [
+        [(x, y) for y in (r.y_min_mm, r.y_max_mm) for x in (r.x_min_mm, r.x_max_mm)]
+        for r in rectangles
+    ]
+    raw = raw_from_vip_mm(placement, np.reshape(corners, (-1, 2))).reshape(-1, 4, 2)
+    low, high = raw.min(axis=1), raw.max(axis=1)
+    return [
+        (float(a[0]), float(b[0]), float(a[1]), float(b[1])) for a, b in zip(low, high, strict=True)
+    ]
 
 
 def _shrunk(

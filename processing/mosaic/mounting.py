@@ -22,7 +22,11 @@ from scipy.linalg import block_diag
 from scipy.stats import chi2
 
 from processing.geometry.drift import sensor_dc
-from processing.geometry.placement import corrected_mm_from_raw, vip_mm_from_raw
+from processing.geometry.placement import (
+    corrected_mm_from_raw,
+    vip_mm_from_corrected,
+    vip_mm_from_raw,
+)
 from processing.geometry.projective import apply_projective
 from processing.geometry.rotation import (
     angles_by_rotation_vector,
@@ -255,14 +259,16 @@ def rotation_of_layer(rig: Rig, mosaic: Mosaic, cone: Cone) -> Array | None:
         start = mosaic.start[sensor.name]
         corrected = corrected_mm_from_raw(start, _grid(sensor))
         _, columns, design = vip_and_design(model, start, corrected, np.zeros(len(model.names)))
-        layer = design[np.isin(columns, np.arange(first, first + 8))] * model.pitch_mm
+        layer = design[(columns >= first) & (columns < first + 8)] * model.pitch_mm
         moves.append(layer.transpose(2, 1, 0).reshape(-1, 8))
-        place = vip_mm_from_raw(start, _grid(sensor))
+        place = vip_mm_from_corrected(start, corrected)
         rotation_columns.append(
             small_rotation_design(place, model.f_mm).transpose(2, 0, 1).reshape(-1, 3)
         )
-    fit = np.linalg.pinv(np.concatenate(rotation_columns)) @ np.concatenate(moves)
-    rows[:, first : first + 8] = fit
+    by_rotation = np.concatenate(rotation_columns)
+    rows[:, first : first + 8] = np.linalg.solve(
+        by_rotation.T @ by_rotation, by_rotation.T @ np.concatenate(moves)
+    )
     return rows
 
 

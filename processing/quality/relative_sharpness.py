@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.geometry.placement import SensorPlacement
-from processing.geometry.topology import overlaps
+from processing.geometry.topology import Overlap, overlaps
 from processing.image.sharpness import sharpness
 from processing.matching.tie_point_search import overlap_pixels
 from processing.quality.figures.image import RelativeSharpnessFigures
@@ -40,16 +40,19 @@ def relative_sharpness_figures(
         placements: of the sensors, by name.
         frames: Level-1 words by sensor name, (h, w) uint16.
     """
+    common = [o for o in overlaps(rig) if o.sensor_a in frames and o.sensor_b in frames]
+    shares: dict[tuple[str, Overlap], tuple[float | None, float | None]] = {}
+    for name in {name for o in common for name in (o.sensor_a, o.sensor_b)}:
+        own = [o for o in common if name in (o.sensor_a, o.sensor_b)]
+        areas = overlap_pixels(placements[name], own)
+        for overlap, (left, right, top, low) in zip(own, areas, strict=True):
+            shares[name, overlap] = sharpness(
+                rig.sensor(name), frames[name], (top, low), (left, right)
+            )
     ratios: dict[str, list[float]] = {}
-    for overlap in overlaps(rig):
+    for overlap in common:
         a, b = overlap.sensor_a, overlap.sensor_b
-        if a not in frames or b not in frames:
-            continue
-        shares = []
-        for name in (a, b):
-            left, right, top, low = overlap_pixels(placements[name], overlap)
-            shares.append(sharpness(rig.sensor(name), frames[name], (top, low), (left, right)))
-        for of_a, of_b in zip(*shares, strict=True):
+        for of_a, of_b in zip(shares[a, overlap], shares[b, overlap], strict=True):
             if of_a is None or of_b is None:
                 continue
             detail_a, detail_b = max(of_a - SMOOTH, 1e-3), max(of_b - SMOOTH, 1e-3)

@@ -105,7 +105,7 @@ def test_pixels_of_the_overlap_are_compared(monkeypatch: pytest.MonkeyPatch) -> 
     relative_sharpness_figures(MINI, PLACEMENTS, frames)
     for overlap in overlaps(MINI):
         for name in (overlap.sensor_a, overlap.sensor_b):
-            assert seen[name].pop(0) == overlap_pixels(PLACEMENTS[name], overlap)
+            assert [seen[name].pop(0)] == overlap_pixels(PLACEMENTS[name], [overlap])
 
 
 def test_the_typical_ratio_is_the_lower_quartile_of_its_logarithm() -> None:
