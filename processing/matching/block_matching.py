@@ -88,7 +88,13 @@ def match_block(
         station_m: (n, 3) projection centres, any Cartesian frame with z up.
         rotation: (n, 3, 3) from camera.
         ground_m: height of the ground there, to begin with.
+        settings: grid, windows, searches and limits; None takes the defaults.
         progress: called with the number of images that are done.
+
+    Returns:
+        Image points that at least two images share, and counts by pair of images (k, j), k < j.
+
+    Source: docs/explanation/mathematics/matching.md#least-squares-matching.
     """
     settings = settings or BlockMatching()
     half = settings.window_px // 2
@@ -106,7 +112,7 @@ def match_block(
             progress(k + 1)
             continue
         own = places.astype(np.float64)
-        rays = directions(image, rotation[k], own)
+        rays = _rays(image, rotation[k], own)
         ground = station_m[k] + rays * ((ground_m - station_m[k, 2]) / rays[:, 2:])
         known = np.zeros(len(places), dtype=bool)
         seen = np.zeros(len(places), dtype=np.int64)
@@ -127,7 +133,7 @@ def match_block(
             new = rows[~known[rows]]
             ground[new] = _intersected(
                 (station_m[k], rays[new]),
-                (station_m[j], directions(image, rotation[j], at[new])),
+                (station_m[j], _rays(image, rotation[j], at[new])),
                 ground[new],
             )
             known[new] = True
@@ -150,7 +156,17 @@ def match_block(
 
 
 def image_mm(image: VirtualImage, px: Array) -> Array:
-    """Image coordinates (n, 2), mm, x right, y up, of pixels (n, 2)."""
+    """Image coordinates of pixels.
+
+    Args:
+        image: size and pixel pitch.
+        px: column and row, (n, 2), zero in the middle of the upper left pixel.
+
+    Returns:
+        x right and y up of the image's middle, (n, 2), mm.
+
+    Source: docs/explanation/mathematics/coordinates.md#pixels-and-millimetres.
+    """
     return np.stack(
         [
             (px[:, 0] - (image.width_px - 1) / 2.0) * image.pitch_mm,
@@ -160,14 +176,14 @@ def image_mm(image: VirtualImage, px: Array) -> Array:
     )
 
 
-def directions(image: VirtualImage, rotation: Array, px: Array) -> Array:
+def _rays(image: VirtualImage, rotation: Array, px: Array) -> Array:
     """Rays (n, 3) of pixels (n, 2), object axes."""
     xy = image_mm(image, px)
     return np.asarray(np.column_stack([xy, np.full(len(xy), -image.f_mm)]) @ rotation.T)
 
 
-def pixels_of(image: VirtualImage, station_m: Array, rotation: Array, xyz_m: Array) -> Array:
-    """Pixels (n, 2) where an image sees points (n, 3); NaN behind it."""
+def _pixels_of(image: VirtualImage, station_m: Array, rotation: Array, xyz_m: Array) -> Array:
+    """Pixels (n, 2) where an image sees points (n, 3), m; NaN where a point is behind it."""
     seen = (xyz_m - station_m) @ rotation
     with np.errstate(all="ignore"):
         xy = -image.f_mm * seen[:, :2] / seen[:, 2:]
@@ -182,13 +198,31 @@ def pixels_of(image: VirtualImage, station_m: Array, rotation: Array, xyz_m: Arr
 
 
 def quarter_rotations(rotation: Array, other: Array) -> int:
-    """Quarter turns, counter-clockwise, that align another image with the first."""
+    """Quarter turns, counter-clockwise, that align another image with the first.
+
+    Args:
+        rotation: (3, 3) from camera, of the first image.
+        other: (3, 3) from camera, of the other.
+
+    Returns:
+        0 to 3, for `np.rot90` of the other image.
+    """
     between = rotation.T @ other
     return round(math.atan2(between[1, 0], between[0, 0]) / (math.pi / 2.0)) % 4
 
 
 def rotated_px(px: Array, width: int, height: int, quarters: int) -> Array:
-    """Pixels (n, 2) of an image in that image turned by `np.rot90(image, quarters)`."""
+    """Pixels of an image in that image turned by `np.rot90(image, quarters)`.
+
+    Args:
+        px: column and row before the turn, (n, 2).
+        width: columns before the turn.
+        height: rows before the turn.
+        quarters: quarter turns, counter-clockwise, 0 to 3.
+
+    Returns:
+        Column and row after the turn, (n, 2).
+    """
     column, row = px[:, 0], px[:, 1]
     rotated = {
         0: (column, row),
@@ -199,7 +233,7 @@ def rotated_px(px: Array, width: int, height: int, quarters: int) -> Array:
     return np.stack(rotated, axis=1)
 
 
-def plane_homography(
+def _plane_homography(
     image: VirtualImage, here: tuple[Array, Array], there: tuple[Array, Array], ground_m: float
 ) -> Array:
     """There from here, (3, 3) on pixels, of level ground at a height; poses are place, rotation."""
@@ -222,7 +256,7 @@ def _rectified(
     """Another image so that about a shift is left to find, and pixels' way into it and back."""
     height, width = there.shape
     if min(own[1][2, 2], other[1][2, 2]) < _OBLIQUE_COSINE:
-        from_here = plane_homography(image, own, other, ground_m)
+        from_here = _plane_homography(image, own, other, ground_m)
         to_here = np.asarray(np.linalg.inv(from_here))
         seen = cv2.warpPerspective(
             there, from_here, (width, height), flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP,
@@ -255,7 +289,7 @@ def _matched_in(
 ) -> tuple[int, Array]:
     """Number of places searched in another image, and where they are in it (n, 2), else NaN."""
     rotated, into, back = rectified
-    seen = pixels_of(image, station_m, rotation, ground)
+    seen = _pixels_of(image, station_m, rotation, ground)
     predicted = into(seen)
     margin_px = settings.window_px // 2 + MARGIN_PX + 2
     last = np.array([rotated.shape[1] - 1, rotated.shape[0] - 1])
@@ -293,14 +327,14 @@ def _overlapping(
     c, r = np.meshgrid(
         np.linspace(0, image.width_px - 1, 9), np.linspace(0, image.height_px - 1, 9)
     )
-    rays = directions(image, rotation[k], np.stack([c.ravel(), r.ravel()], axis=1))
+    rays = _rays(image, rotation[k], np.stack([c.ravel(), r.ravel()], axis=1))
     level = station_m[k] + rays * ((ground_m - station_m[k, 2]) / rays[:, 2:])
     last = np.array([image.width_px - 1, image.height_px - 1])
     found = []
     for j in range(k + 1, len(station_m)):
         if rotation[j][:, 2] @ rotation[k][:, 2] < _SIMILAR_VIEW_COSINE:
             continue
-        at = pixels_of(image, station_m[j], rotation[j], level)
+        at = _pixels_of(image, station_m[j], rotation[j], level)
         if ((at >= 0.0) & (at <= last)).all(axis=1).any():
             found.append((float(np.linalg.norm(station_m[j] - station_m[k])), j))
     return [j for _, j in sorted(found)]
@@ -332,6 +366,14 @@ def _cells(image: VirtualImage, settings: BlockMatching) -> NDArray[Any]:
 
 
 def match_counts_by_line(block: BlockTiePoints, line: Sequence[str]) -> tuple[int, int]:
-    """How many matches join images of one line, and of different lines."""
+    """Count matches that join images of one line, and of different lines.
+
+    Args:
+        block: what was matched.
+        line: name of the flight line of each image.
+
+    Returns:
+        Matches within lines, and between lines.
+    """
     along = sum(n for (a, b), n in block.matched.items() if line[a] == line[b])
     return along, sum(block.matched.values()) - along

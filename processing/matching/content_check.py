@@ -75,6 +75,9 @@ def check_content(
         frames: Level-1 words by sensor name.
         tie_points: what was matched there.
         settings: those it was matched with; None takes the defaults.
+
+    Returns:
+        Shifted and mismatched frames; empty where every frame has enough matches.
     """
     settings = settings or TiePointSettings()
     attempted, found = _counts(tie_points)
@@ -121,7 +124,16 @@ def check_content(
 def moved_placements(
     placements: Mapping[str, SensorPlacement], check: ContentCheck, pitch_mm: float
 ) -> dict[str, SensorPlacement]:
-    """Predictions for a second search: the shifted frames where they were found."""
+    """Predictions for a second search: the shifted frames where they were found.
+
+    Args:
+        placements: predictions of the first search, by sensor name.
+        check: what the first search found.
+        pitch_mm: pixel pitch of the PAN sensors, to which `check.shifted_px` refers.
+
+    Returns:
+        Placements by sensor name, those of shifted frames with a translated layer.
+    """
     moved = dict(placements)
     for name, (dx_px, dy_px) in check.shifted_px.items():
         shift = np.eye(3)
@@ -131,7 +143,15 @@ def moved_placements(
 
 
 def content_figures(check: ContentCheck) -> ContentFigures:
-    """The check in figures of the quality report."""
+    """Figures of the quality report from the check.
+
+    Args:
+        check: shifted and mismatched frames of one exposure.
+
+    Returns:
+        Names of the sensors, the largest shift in PAN pixels, the most textured positions of a
+        mismatched frame; None without any.
+    """
     shifts_px = [float(np.hypot(*shift)) for shift in check.shifted_px.values()]
     return ContentFigures(
         mismatched_sensors=tuple(check.mismatched),

@@ -23,10 +23,16 @@ _TAPS: Final = 8
 
 @njit(cache=True)
 def correlation_scratch(side: int, search: int) -> tuple[Array, Array, Array, Array, Array]:
-    """Memory for `correlate`: template, products at all offsets, spreads of a row of them, two rows
-    of sums of b.
+    """Memory for `correlate`.
 
-    Rows of the first two come in whole vectors of eight.
+    Args:
+        side: side of the window, px, odd.
+        search: largest offset of `correlate`, px.
+
+    Returns:
+        Template (side, side), products at all offsets (2 search + 1, 2 search + 1), spreads of a
+        row of them, and two rows of sums of b. Rows of the first two come in whole vectors of
+        eight.
     """
     wide = side + 2 * MARGIN_PX + 2 * search
     return (
@@ -47,10 +53,18 @@ def correlate(
     scratch: tuple[Array, Array, Array, Array, Array],
     surface: Array,
 ) -> None:
-    """Normalised cross correlation of a's window with b at all offsets; -2 where not tried.
+    """Normalised cross correlation of a's window with b at all offsets.
 
-    `reach` holds the first and last column offset and the first and last row offset to be tried;
-    `scratch` is from `correlation_scratch`.
+    Args:
+        a: patch, (2 half + 1 + 2 `MARGIN_PX`) squared, with the window in its middle.
+        b: patch, wider by twice the search range.
+        half: half of the window's side, px.
+        reach: first and last column offset, first and last row offset to be tried, (4,) int64, px.
+        scratch: from `correlation_scratch`.
+        surface: receives the coefficients, (2 search + 1, 2 search + 1), row and column offset; -2
+            where not tried or without contrast.
+
+    Source: docs/explanation/mathematics/matching.md#correlation.
     """
     template, products, spreads, sums, squares = scratch
     side = 2 * half + 1
@@ -147,9 +161,18 @@ def _add_taps(s: Array, w: tuple[Any, ...], o: Array, count: int) -> None:
 
 @njit(cache=True)
 def peak(surface: Array, reach: Array, found: Array) -> bool:
-    """Best offset, its sub-pixel part by parabola, its height and that of the next maximum.
+    """Find the highest coefficient and the next local maximum.
 
-    False where the peak is on the edge of the search range.
+    Args:
+        surface: coefficients from `correlate`, (2 search + 1, 2 search + 1).
+        reach: as of `correlate`.
+        found: receives column offset and row offset, px; their parts below a pixel by a parabola,
+            -0.5 to 0.5 px; height of the peak; height of the next maximum, -1 without one; (6,).
+
+    Returns:
+        False where the peak is on the edge of the search range or not above zero.
+
+    Source: docs/explanation/mathematics/matching.md#correlation.
     """
     search = (surface.shape[0] - 1) // 2
     best, row, col = -2.0, 0, 0

@@ -24,9 +24,14 @@ _MIN_PAIRS: Final = 8
 
 
 def disc_positions(pixels: NDArray[Any]) -> Array:
-    """Middles (n, 2), column and row, of the discs of a frame (height, width).
+    """Measure the middles of the discs of a frame.
 
-    Discs that touch each other, or that the border cuts, are left out.
+    Args:
+        pixels: grey values, (height, width).
+
+    Returns:
+        Column and row of each disc, (n, 2), px. Discs that touch each other, or that the border
+        cuts, are left out; empty without contrast.
     """
     values = np.asarray(pixels, dtype=np.float32)
     ground = float(np.median(values))
@@ -82,13 +87,16 @@ def _middle(values: NDArray[Any], box: tuple[slice, slice], ground: float) -> Ar
 
 
 def identify_targets(predicted: Array, found: Array, *, reach_px: float) -> tuple[Indices, Indices]:
-    """Pairs of predicted (n, 2) and found (m, 2) positions: indices into both.
+    """Assign found positions to predicted ones.
 
     Args:
+        predicted: where the nominal camera would see each target, (n, 2), px.
+        found: measured positions, (m, 2), px.
         reach_px: how far the prediction may be off, in each coordinate.
 
     Returns:
-        Empty where fewer than eight pairs agree; each position is used once.
+        Indices into `predicted` and into `found` of the pairs, each position used once; empty where
+        fewer than eight pairs agree.
     """
     none = np.zeros(0, np.int64)
     if len(predicted) < _MIN_PAIRS or len(found) < _MIN_PAIRS:

@@ -33,11 +33,13 @@ def select_features(
             window and one pixel around it must lie in the frame.
         half_window: half of the window's side, px.
         stride: candidates and gradients are looked at every so many pixels, 1 or 2.
-        words: frame holds Level-1 words.
+        is_uint16: the frame holds Level-1 words.
 
     Returns:
         (n, 3) float64: column, row, eigenvalue (mean squared gradient per pixel along the weaker
         direction, halved step); eigenvalue -1 where bad pixels leave no candidate.
+
+    Source: docs/explanation/mathematics/matching.md#positions.
     """
     count = len(cells)
     result = np.empty((count, 3))

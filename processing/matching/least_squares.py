@@ -42,7 +42,14 @@ _MAX_SHIFT_PX: Final = 1.2
 
 @njit(cache=True)
 def refinement_scratch(side: int) -> tuple[Array, Array, Array, Array, Array]:
-    """Memory for `refine`: rows (2, .), tap weights of a and of b, windows (8, .), wide (4, .)."""
+    """Memory for `refine`.
+
+    Args:
+        side: side of the window, px, odd.
+
+    Returns:
+        Rows (2, .), tap weights of a and of b (4, 8), windows (8, .), wide windows (4, .).
+    """
     stride = window_stride(side)
     return (
         np.zeros((2, (side + 7) * stride), np.float32),
@@ -133,9 +140,10 @@ def refine(
     Args:
         patches: a and b, flat, `PATCH_SLACK` words longer than they need be.
         widths: words from row to row of each.
-        offset: column and row of b's window against a's.
-        shift: start value beyond the offset.
-        half, margin: half of the window's side; pixels around a's window.
+        offset: column and row of b's window against a's, px.
+        shift: start value beyond the offset, x right and y down, px.
+        half: half of the window's side, px.
+        margin: pixels around a's window.
         pixels_a: raw pixels behind one of a's, against one of b's.
         table: `INTERPOLATION`.
         scratch: from `refinement_scratch`.
@@ -143,6 +151,9 @@ def refine(
 
     Returns:
         False where it does not converge within the reach of the patches.
+
+    Source: docs/explanation/mathematics/matching.md#least-squares-matching and
+        #standard-deviation-of-a-match.
     """
     rows, wa, wb, windows, wide = scratch
     fa, ax, ay = windows[0], windows[1], windows[2]

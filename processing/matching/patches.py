@@ -136,7 +136,7 @@ def match_patches(
         ratio: pixels of a per pixel of b along each axis.
         half_window: the window has 2 * half_window + 1 pixels of b.
         search: offsets tried around the prediction, px of b.
-        words: the frames hold Level-1 words.
+        is_uint16: the frames hold Level-1 words.
         table: `INTERPOLATION`.
 
     Returns:

@@ -44,7 +44,15 @@ def _fetch(typing_context: Any, array: Any, row: Any, column: Any) -> Any:
 
 @njit(cache=True)
 def fetch_ahead(frame: Array, column: int, row: int, columns: int, rows: int) -> None:
-    """Begin to bring a box of a frame into the cache."""
+    """Begin to bring a box of a frame into the cache; it may lie beyond the frame.
+
+    Args:
+        frame: (h, w), rows contiguous.
+        column: first column of the box.
+        row: first row of the box.
+        columns: width of the box, px.
+        rows: height of the box, px.
+    """
     step = _LINE_BYTES // frame.itemsize
     for r in range(row, row + rows):
         for c in range(column, column + columns, step):

@@ -62,7 +62,14 @@ INTERPOLATION: Final = _kernel_table()
 
 @njit(cache=True)
 def window_stride(side: int) -> int:
-    """Words from row to row of a window: whole vectors of eight; what is beyond `side` is zero."""
+    """Words from row to row of a window: whole vectors of eight; what is beyond `side` is zero.
+
+    Args:
+        side: side of the window, px.
+
+    Returns:
+        The next multiple of eight.
+    """
     return (side + 7) // 8 * 8
 
 
@@ -140,6 +147,13 @@ def _along_columns(source: Array, w: Array, out: Array, side: int, stride: int) 
 
 @njit(cache=True, fastmath=True)
 def clear_beyond(window: Array, side: int, stride: int) -> None:
+    """Set a window's unused words to zero.
+
+    Args:
+        window: flat, (side * stride,); columns from `side` on are cleared in place.
+        side: side of the window, px.
+        stride: `window_stride` of the side.
+    """
     for r in range(side):
         for c in range(r * stride + side, (r + 1) * stride):
             window[c] = np.float32(0.0)
@@ -159,9 +173,23 @@ def sample_window(
     slope_x: Array,
     slope_y: Array,
 ) -> tuple[float, float]:
-    """A window of `patch` (corner top, left) moved by a shift (x, y): values and both slopes.
+    """Sample a window of a patch at a shift: values and both slopes.
 
-    Returns the noise power the interpolation passes, and that of its slopes' mean.
+    Args:
+        patch: flat float32, `PATCH_SLACK` words longer than it need be.
+        width: words from row to row of the patch.
+        corner: row and column of the window's upper left pixel in the patch, before the shift.
+        shift: x right and y down, px.
+        side: side of the window, px.
+        table: `INTERPOLATION`.
+        rows: memory, (2, (side + 7) * stride).
+        w: receives tap weights of values and slopes in x, then in y, (4, 8).
+        value: receives grey values, (side * stride,).
+        slope_x: receives derivatives in x per pixel, (side * stride,).
+        slope_y: receives derivatives in y per pixel, (side * stride,).
+
+    Returns:
+        Noise power that the interpolation passes, and the mean noise power of both slopes.
     """
     dx, dy = shift
     stride = window_stride(side)
@@ -199,9 +227,21 @@ def add_laplacian(
     factor: np.float32,
     out: Array,
 ) -> None:
-    """Add a factor times the Laplacian of the window that `sample_window` took with weights `w`.
+    """Add a factor times the Laplacian of the window that `sample_window` took.
 
-    The weights of the slopes, w[1] and w[3], are overwritten.
+    Args:
+        patch: as of `sample_window`, like `width`, `corner`, `shift`, `side`, `table` and `rows`.
+        width: words from row to row of the patch.
+        corner: row and column of the window's upper left pixel.
+        shift: x right and y down, px.
+        side: side of the window, px.
+        table: `INTERPOLATION`.
+        rows: memory, (2, (side + 7) * stride).
+        w: tap weights that `sample_window` left, (4, 8); those of slopes, rows 1 and 3, are
+            overwritten.
+        spare: memory, (side * stride,).
+        factor: weight of the Laplacian.
+        out: sum to which it is added, (side * stride,).
     """
     dx, dy = shift
     stride = window_stride(side)

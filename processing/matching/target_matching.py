@@ -70,7 +70,14 @@ class TargetPositions:
 
 
 def first_guess(pixels: Array) -> Array:
-    """Middle (column, row) of what is brighter than the border of a cut-out."""
+    """Middle of what is brighter than the border of a cut-out.
+
+    Args:
+        pixels: grey values, (h, w).
+
+    Returns:
+        Column and row, (2,), px; the cut-out's middle where nothing is brighter.
+    """
     border = np.concatenate([pixels[:3].ravel(), pixels[-3:].ravel()])
     level = float(np.median(border))
     lit = pixels > level + 0.3 * (float(np.percentile(pixels, 98)) - level)
@@ -92,8 +99,13 @@ def positions_of(
     """Match each image to its neighbours in the list and to some far away, and adjust.
 
     Args:
+        images: cut-outs of one target; each is matched to the one before it, among others.
         half_px: half the side of the window around the target.
         partners: how many earlier images each is matched to; at least one.
+        progress: called with the number of pairs that are done, and of all pairs.
+
+    Returns:
+        Positions by image, the matches behind them, and the images without one.
     """
     pairs = _pairs(len(images), partners)
     splines = [spline_filter(image.pixels, order=_ORDER) for image in images]

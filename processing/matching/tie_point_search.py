@@ -75,7 +75,14 @@ class PairSearch:
 
 
 def usable_pixels(placement: SensorPlacement) -> tuple[int, int, int, int]:
-    """First and last column, first and last row that are fully exposed (not the TDI rows)."""
+    """Fully exposed part of a frame, without the TDI rows.
+
+    Args:
+        placement: sensor and TDI shifts.
+
+    Returns:
+        First and last column, first and last row.
+    """
     sensor, n = placement.sensor, placement.tdi_shifts
     first_row = n if sensor.tdi_row_sign > 0 else 0
     last_row = sensor.height_px - 1 - (0 if sensor.tdi_row_sign > 0 else n)
@@ -88,6 +95,17 @@ def pan_searches(
     frames: Mapping[str, Frame],
     settings: TiePointSettings,
 ) -> list[PairSearch]:
+    """Search positions of the overlaps of PAN sensors.
+
+    Args:
+        rig: the camera.
+        placements: predictions by sensor name.
+        frames: Level-1 frames by sensor name, (h, w).
+        settings: number of points and windows.
+
+    Returns:
+        One for each overlap of the rig, in its order; without positions where a frame is missing.
+    """
     half = settings.window_pp_px // 2
     margin_px = half + MARGIN_PX + 1
     result = []
@@ -178,8 +196,18 @@ def colour_searches(
 ) -> list[PairSearch]:
     """One grid over the colour master; each of its positions goes to one PAN sensor.
 
-    Where two PAN sensors see the position they take turns: a colour patch used twice would make
-    two observations of one.
+    Where two PAN sensors see the position they take turns: a colour patch used twice would make two
+    observations of one.
+
+    Args:
+        rig: the camera.
+        placements: predictions by sensor name.
+        frames: Level-1 frames by sensor name, (h, w).
+        settings: number of points and windows.
+        ratio: PAN pixels per colour pixel.
+
+    Returns:
+        One for each PAN sensor that the colour master covers; empty without a colour master.
     """
     coverage = colour_coverage(rig)
     if not coverage or rig.colour_master_cone is None:

@@ -60,13 +60,24 @@ class TiePoints:
         return len(self.sigma_px)
 
     def only(self, keep: NDArray[np.bool_]) -> TiePoints:
-        """The points whose rows `keep` (n,) marks; `pairs` and `attempted` stay."""
+        """The points of marked rows; `pairs` and `attempted` stay.
+
+        Args:
+            keep: True for rows that stay, (n,).
+
+        Returns:
+            A copy with those rows.
+        """
         columns = ("sensor_a", "sensor_b", "raw_a", "raw_b", "sigma_px", "correlation", "kind")
         selected = {name: getattr(self, name)[keep] for name in (*columns, "overlap")}
         return replace(self, **selected)
 
     def counts(self) -> dict[tuple[str, str], int]:
-        """Points found per pair of sensors; pairs without any included."""
+        """Count the points of each searched pair of sensors.
+
+        Returns:
+            Points by pair, zero where a pair has none.
+        """
         found = np.bincount(self.overlap, minlength=len(self.pairs))
         return {pair: int(found[i]) for i, pair in enumerate(self.pairs)}
 
