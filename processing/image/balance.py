@@ -99,10 +99,13 @@ def node_means(frames: Array, valid: Array, lattices: Array, cell_px: int, out: 
     """Mean Level-1 signal of 8 x 8 raw pixels around every weight node that frames share.
 
     Args:
-        frames, valid, lattices, cell_px: as in `processing.image.resampling.resample`.
+        frames: (n, rows, columns) uint16, Level-1 words.
+        valid: as in `processing.image.resampling.resample`, (n, 4).
+        lattices: raw column and row at the lattice nodes, (n, rows, columns, 2).
+        cell_px: lattice spacing, target pixels.
         out: (n, rows, columns) float32 at every `WEIGHT_STEP_PX`-th target pixel; overwritten.
-            `NOT_COVERED` where the frame does not reach, `ALONE` where only this one does,
-            `UNUSABLE` where the block holds saturated pixels or holes.
+            `NOT_COVERED` where the frame does not reach, `SINGLE_COVERAGE` where only this one
+            does, `UNUSABLE` where the block holds saturated pixels or holes.
     """
     _node_means(frames, valid, lattices, cell_px, out)
 
@@ -111,6 +114,12 @@ def covered_box(means: Array) -> tuple[slice, slice]:
     """Rows and columns of nodes that hold all a frame covers, with a little around it.
 
     A frame covers one coherent part of the image; every eighth node finds it.
+
+    Args:
+        means: of one frame, (rows, columns) from `node_means`.
+
+    Returns:
+        Slices of rows and of columns, empty where the frame covers no node.
     """
     rows, columns = means.shape
     coarse = means[::_COARSE, ::_COARSE] != np.float32(NOT_COVERED)
@@ -137,6 +146,11 @@ def balance_gains(names: Sequence[str], means: Array) -> Balance:
     Args:
         names: sensors in the order of `means`.
         means: (n, rows, columns) from `node_means`.
+
+    Returns:
+        Gains and offsets of all sensors, and the overlaps with enough samples.
+
+    Source: docs/explanation/mathematics/radiometry.md#balance-between-heads.
     """
     pairs, samples = [], []
     boxes = [covered_box(one) for one in means]

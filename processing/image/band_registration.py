@@ -79,6 +79,12 @@ class RegisteredBand:
 def reference_image(rig: Rig) -> VirtualImage:
     """The ideal image of the reference band: its own pixels, principal point in the middle.
 
+    Args:
+        rig: a rig whose colour master cone is the reference band.
+
+    Returns:
+        Size, pitch and principal distance of the reference band, without drift.
+
     Raises:
         ValueError: the rig names no colour master cone.
     """
@@ -90,7 +96,15 @@ def reference_image(rig: Rig) -> VirtualImage:
 
 
 def band_placements(rig: Rig, temperatures_c: Mapping[str, float]) -> dict[str, SensorPlacement]:
-    """Where calibration puts each band in the reference image, by sensor name."""
+    """Where calibration puts each band in the reference image.
+
+    Args:
+        rig: as of `reference_image`.
+        temperatures_c: temperature by probe name, degC.
+
+    Returns:
+        Placements by sensor name.
+    """
     return nominal_placements(replace(rig, virtual_image=reference_image(rig)), temperatures_c, {})
 
 
@@ -106,9 +120,15 @@ def register_to_reference(
     """Estimate the transformation of a band against the reference band.
 
     Args:
-        reference, other: placements by calibration.
-        reference_frame, band_frame: (h, w) float32 in raw geometry, NaN where a pixel is not to be
-            used.
+        band: name of the band.
+        reference: placement of the reference band by calibration.
+        other: placement of the band by calibration.
+        reference_frame: (h, w) float32 in raw geometry, NaN where a pixel is not to be used.
+        band_frame: the same of the band.
+        settings: windows, searches and limits; None takes the defaults.
+
+    Returns:
+        The registration; the identity with `registered` False where too few points agree.
     """
     settings = settings or BandSettings()
     nominal = RegisteredBand(
@@ -130,9 +150,15 @@ def register_to_reference(
 def raw_of_reference_pixels(
     image: VirtualImage, placement: SensorPlacement, band_from_reference: Array
 ) -> Array:
-    """Raw (column, row) of a band behind every pixel of the reference image, (H, W, 2) float32.
+    """Raw (column, row) of a band behind every pixel of the reference image.
 
-    Pixels the lens polynomial cannot reach are far outside.
+    Args:
+        image: from `reference_image`.
+        placement: of the band, by calibration.
+        band_from_reference: (3, 3), mm in the ideal image, of a `RegisteredBand`.
+
+    Returns:
+        (H, W, 2) float32; pixels the lens polynomial cannot reach are far outside.
     """
     columns = np.arange(0, image.width_px + _LATTICE_PX, _LATTICE_PX)
     rows = np.arange(0, image.height_px + _LATTICE_PX, _LATTICE_PX)

@@ -223,6 +223,15 @@ def _is_near_identity(corners):
 def straight_taps(frame, valid, lattice, band, column, cell, reach):
     """Whether a cell's taps are one rectangle of raw pixels, and none of them marred.
 
+    Args:
+        frame: (h, w) uint16 words, contiguous.
+        valid: first and last usable raw column, first and last usable raw row.
+        lattice: (rows, columns, 2) raw (column, row) at the nodes.
+        band: row of the cell in the lattice.
+        column: column of the cell in the lattice.
+        cell: side of the cell, px.
+        reach: of a `processing.image.kernels.Kernel`.
+
     Returns:
         Raw column and row that the taps of the cell's first pixel lie around; -1, -1 where the cell
         has to be fetched by `fetch_cell`.
@@ -284,10 +293,24 @@ def fetch_straight(
     """Rows first .. last - 1 of a cell of straight taps, gain and offset applied, into `out`.
 
     Args:
-        left, top: from `straight_taps`; the other arguments as in `fetch_cell`.
+        frame: as in `fetch_cell`, like `lattice`, `band`, `column`, `cell` and `table`.
+        lattice: raw (column, row) at the nodes.
+        band: row of the cell in the lattice.
+        column: column of the cell in the lattice.
+        cell: side of the cell, px.
+        table: of a `processing.image.kernels.Kernel`.
+        left: raw column from `straight_taps`.
+        top: raw row from `straight_taps`.
+        first: first row of the cell.
+        last: row of the cell behind the last one.
+        gain: factor of the signal, float32.
+        offset: added after the gain, float32.
         lines: scratch, (last - first + 1) * `LINE_LENGTH` float32.
-        phases, steps: scratch, (2, last - first) float32.
+        phases: scratch, (2, last - first) float32.
+        steps: scratch, (2, last - first) float32.
         out: (height, width) uint16; columns x0 .. x0 + n - 1 of the cell's rows are written.
+        x0: first column of `out`.
+        n: columns of the cell that lie in the target.
     """
     width = frame.shape[1]
     flat = frame.reshape(-1)
@@ -337,9 +360,14 @@ def fetch_cell(
     Args:
         frame: (h, w) uint16 words, contiguous.
         valid: first and last usable raw column, first and last usable raw row.
-        lattice: (rows, columns, 2) raw (column, row) at the nodes; `band`, `column` name the cell.
-        cell: its side, px; rows, n: how much of it lies in the target.
-        table, reach: of a `processing.image.kernels.Kernel`.
+        lattice: (rows, columns, 2) raw (column, row) at the nodes.
+        band: row of the cell in the lattice.
+        column: column of the cell in the lattice.
+        cell: its side, px.
+        rows: rows of the cell that lie in the target.
+        n: columns of the cell that lie in the target.
+        table: of a `processing.image.kernels.Kernel`.
+        reach: of the same kernel.
         line: scratch of `LINE_LENGTH` float32.
         spare: scratch, (2, `LINE_LENGTH`) uint16.
         values: (cell, cell) float32, receives the signal where there is any.

@@ -61,6 +61,12 @@ def colour_heads(rig: Rig) -> tuple[ColourHead, ...]:
 
     A cone of one band has it on its only sensor; a cone of several has them behind the colour
     filter array of its only sensor. Of two heads that see the same band the first gives it.
+
+    Args:
+        rig: the camera.
+
+    Returns:
+        Heads that give a band; cones of several sensors are left out.
     """
     heads: list[ColourHead] = []
     given: set[str] = set()
@@ -103,7 +109,16 @@ class BandRegistration:
 
 
 def nominal_registration(band: str, sensor: str, *, textured: int = 0) -> BandRegistration:
-    """A band at its calibrated position."""
+    """A band at its calibrated position.
+
+    Args:
+        band: name of the band.
+        sensor: name of its sensor.
+        textured: positions tried where the band has texture.
+
+    Returns:
+        The identity, `registered` False.
+    """
     return BandRegistration(band, sensor, np.eye(3), 0, None, registered=False, textured=textured)
 
 
@@ -120,10 +135,16 @@ def register_band(
     """Estimate the transformation of a band against green.
 
     Args:
+        band: name of the band.
         green: adjusted placement of the green sensor.
         other: placement of the band's sensor by calibration and TDM.
-        green_frame, band_frame: Level-1 frames, (h, w) uint16.
+        green_frame: Level-1 frame of green, (h, w) uint16.
+        band_frame: Level-1 frame of the band, (h, w) uint16.
         positions: where to match, from `green_positions`; the same for all bands.
+        settings: windows, searches and limits.
+
+    Returns:
+        The registration; `nominal_registration` where too few points match.
     """
     raw_green, raw_band, sigma = _match(green, other, green_frame, band_frame, positions, settings)
     if len(sigma) < settings.min_points:
@@ -146,7 +167,16 @@ def register_band(
 
 
 def green_positions(green: SensorPlacement, green_frame: Array, settings: ColourSettings) -> Array:
-    """Feature-rich pixels of the green frame on an even grid, (n, 2) int64 (column, row)."""
+    """Feature-rich pixels of the green frame on an even grid.
+
+    Args:
+        green: placement of the green sensor.
+        green_frame: Level-1 frame, (h, w) uint16.
+        settings: number of points and window.
+
+    Returns:
+        (n, 2) int64, column and row.
+    """
     cells = _grid(green, _window_margin_px(settings), settings)
     best = select_features(green_frame, cells, settings.window_px // 2, 2, True)
     positions: Array = best[best[:, 2] > 0.0, :2].astype(np.int64)
@@ -154,10 +184,15 @@ def green_positions(green: SensorPlacement, green_frame: Array, settings: Colour
 
 
 def fit_projective(source: Array, target: Array, sigma: Array) -> tuple[Array, float, int]:
-    """The projective transformation near the identity that carries source to target, (n, 2).
+    """The projective transformation near the identity that carries source to target.
 
     Iteratively re-weighted least squares (Tukey's biweight): neither a moving car nor a false match
     can pull it.
+
+    Args:
+        source: (n, 2), any unit.
+        target: (n, 2), the same unit.
+        sigma: standard deviation of each point, (n,), the same unit.
 
     Returns:
         target_from_source (3, 3) with element [2, 2] one; root mean square length of the residuals

@@ -70,6 +70,12 @@ def pan_cell_px(rig: Rig) -> int:
 
     A head that is tilted bends straight lines of the virtual image faster.
 
+    Args:
+        rig: the camera.
+
+    Returns:
+        Lattice spacing, target pixels.
+
     Raises:
         ValueError: the rig has no virtual image.
     """
@@ -119,7 +125,14 @@ class PanComposer:
         self._source = np.zeros((image.height_px, image.width_px), np.uint8)
 
     def frame(self, name: str) -> Array:
-        """Where the Level-1 frame of a sensor is to be written, (h, w) uint16."""
+        """Where the Level-1 frame of a sensor is to be written.
+
+        Args:
+            name: name of the sensor.
+
+        Returns:
+            View of the buffer, (h, w) uint16.
+        """
         index = self.names.index(name)
         sensor = self.sensors[index]
         view: Array = self._frames[index, : sensor.height_px, : sensor.width_px]
@@ -138,6 +151,11 @@ class PanComposer:
         Args:
             placements: by sensor name, adjusted.
             present: sensors whose frames are there; the others leave holes.
+            feather_px: width over which one sensor fades into the next, VIP pixels.
+            interpolation: name of the kernel.
+
+        Returns:
+            Views of the composer's buffers, overwritten by the next call, and the balance.
         """
         raster = pan_raster(self.image)
         for k, name in enumerate(self.names):
@@ -170,12 +188,13 @@ class PanComposer:
     def geometry(self, placements: Mapping[str, SensorPlacement] | None = None) -> dict[str, Array]:
         """Which raw pixel serves which VIP pixel, on every `WEIGHT_STEP_PX`-th VIP pixel.
 
-        For each sensor that contributes: `<sensor>.vip` (n, 2) VIP pixels, `<sensor>.raw` (n, 2)
-        raw pixels, `<sensor>.weight` (n,) above zero.
-
         Args:
-            placements: None uses those of the last image. Others return where the same VIP
-                pixels would be fetched with these placements.
+            placements: None uses those of the last image. Others return where the same VIP pixels
+                would be fetched with these placements.
+
+        Returns:
+            For each sensor that contributes: `<sensor>.vip` (n, 2) VIP pixels, `<sensor>.raw` (n,
+            2) raw pixels, column and row, `<sensor>.weight` (n,) above zero, at most one.
         """
         result: dict[str, Array] = {}
         for k, name in enumerate(self.names):
@@ -244,13 +263,26 @@ class ColourComposer:
         self._source = np.zeros(shape, np.uint8)
 
     def frame(self, head: ColourHead) -> Array:
-        """Where the Level-1 frame of a head is to be written, (h, w) uint16."""
+        """Where the Level-1 frame of a head is to be written.
+
+        Args:
+            head: one of the composer's heads.
+
+        Returns:
+            The buffer, (h, w) uint16.
+        """
         return self._raw[head.sensor.name]
 
     def leading(self, head: ColourHead) -> Array:
         """The frame of the band that a head is matched by, once its own frame is written.
 
         Of a Bayer head all bands are made here.
+
+        Args:
+            head: one of the composer's heads.
+
+        Returns:
+            Level-1 words, (h, w) uint16.
         """
         planes = self._planes[head.sensor.name]
         if not is_bayer(head.sensor):
@@ -267,7 +299,17 @@ class ColourComposer:
         *,
         interpolation: Interpolation,
     ) -> Array:
-        """Resample one band onto the colour raster, (h, w) uint16; see `fill_lattice`."""
+        """Resample one band onto the colour raster.
+
+        Args:
+            band: name of the band, whose frame was written.
+            placement: of the band's sensor.
+            source_from_target_mm: see `fill_lattice`.
+            interpolation: name of the kernel.
+
+        Returns:
+            The composer's buffer of the band, (h, w) uint16, 0 no data.
+        """
         raster = colour_raster(self.image)
         fill_lattice(
             self.image,
@@ -297,11 +339,25 @@ class ColourComposer:
         return self._source
 
     def planes(self, head: ColourHead) -> tuple[Array, ...]:
-        """The frames that the bands of a head are made of, once `leading` was called."""
+        """The frames that the bands of a head are made of, once `leading` was called.
+
+        Args:
+            head: one of the composer's heads.
+
+        Returns:
+            Level-1 words, (h, w) uint16 each.
+        """
         return tuple(self._planes[head.sensor.name])
 
     def empty(self, band: str) -> Array:
-        """The raster of a band whose frame is missing: no data."""
+        """The raster of a band whose frame is missing.
+
+        Args:
+            band: name of the band.
+
+        Returns:
+            The composer's buffer of the band, (h, w) uint16, all 0: no data.
+        """
         self._bands[band][:] = 0
         return self._bands[band]
 

@@ -55,7 +55,16 @@ class Kernel:
 
 
 def phase_corrected_weights(phase: Array) -> Array:
-    """Weights of `TAPS` at phases (n,), shape (n, 6); accurate from -0.04 to 1.04."""
+    """Weights of the phase-corrected kernel.
+
+    Args:
+        phase: right of pixel 0, (n,), px; accurate from -0.04 to 1.04.
+
+    Returns:
+        Weights of the pixels `TAPS`, (n, 6).
+
+    Source: docs/explanation/mathematics/resampling.md#phase-corrected-kernel.
+    """
     powers = np.power.outer(phase - 0.5, np.arange(PHASE_CORRECTED.shape[1]))
     mirrored = np.power.outer(0.5 - phase, np.arange(PHASE_CORRECTED.shape[1]))
     before, after = powers @ PHASE_CORRECTED.T, mirrored @ PHASE_CORRECTED.T
@@ -63,7 +72,16 @@ def phase_corrected_weights(phase: Array) -> Array:
 
 
 def cubic_weights(phase: Array) -> Array:
-    """Keys' cubic convolution with a = -1/2 (Catmull-Rom); arguments as above."""
+    """Weights of Keys' cubic convolution with a = -1/2 (Catmull-Rom).
+
+    Args:
+        phase: right of pixel 0, (n,), px.
+
+    Returns:
+        Weights of the pixels `TAPS`, (n, 6).
+
+    Source: Keys (1981).
+    """
     d = np.abs(phase[:, None] - TAPS)
     inner = (1.5 * d - 2.5) * d * d + 1.0
     outer = ((2.5 - 0.5 * d) * d - 4.0) * d + 2.0
@@ -71,13 +89,20 @@ def cubic_weights(phase: Array) -> Array:
 
 
 def lanczos_weights(phase: Array) -> Array:
-    """Lanczos with three lobes, normalised; arguments as above."""
+    """Weights of Lanczos' kernel with three lobes, normalised.
+
+    Args:
+        phase: right of pixel 0, (n,), px.
+
+    Returns:
+        Weights of the pixels `TAPS`, (n, 6).
+    """
     d = phase[:, None] - TAPS
     return _normalised(np.where(np.abs(d) < 3.0, np.sinc(d) * np.sinc(d / 3.0), 0.0))
 
 
-def bilinear_weights(phase: Array) -> Array:
-    """Linear between pixels 0 and 1, and on beyond them; arguments as above."""
+def _bilinear_weights(phase: Array) -> Array:
+    """Linear between pixels 0 and 1, and on beyond them; (n, 6) at phases (n,), px."""
     weights = np.zeros((len(phase), len(TAPS)))
     weights[:, 2], weights[:, 3] = 1.0 - phase, phase
     return weights
@@ -99,5 +124,5 @@ KERNELS: Final[dict[Interpolation, Kernel]] = {
     "phase-corrected": _kernel(phase_corrected_weights, 2),
     "cubic": _kernel(cubic_weights, 1),
     "lanczos": _kernel(lanczos_weights, 2),
-    "bilinear": _kernel(bilinear_weights, 0),
+    "bilinear": _kernel(_bilinear_weights, 0),
 }

@@ -35,17 +35,39 @@ class Raster:
 
 
 def pan_raster(image: VirtualImage) -> Raster:
-    """The virtual image's own raster."""
+    """The virtual image's own raster.
+
+    Args:
+        image: virtual image.
+
+    Returns:
+        A raster of ratio 1.
+    """
     return Raster(image.width_px, image.height_px, 1)
 
 
 def colour_raster(image: VirtualImage) -> Raster:
-    """The raster of the colour product: `colour_ratio` VIP pixels to the pixel."""
+    """The raster of the colour product: `colour_ratio` VIP pixels to the pixel.
+
+    Args:
+        image: virtual image.
+
+    Returns:
+        A raster of ratio `colour_ratio`.
+    """
     return Raster(image.colour_width_px, image.colour_height_px, image.colour_ratio)
 
 
 def lattice_shape(raster: Raster, cell_px: int) -> tuple[int, int]:
-    """Rows and columns of nodes that hold all pixels of the raster between them."""
+    """Nodes that hold all pixels of a raster between them.
+
+    Args:
+        raster: target raster.
+        cell_px: lattice spacing, target pixels.
+
+    Returns:
+        Rows and columns of nodes.
+    """
     return math.ceil(raster.height_px / cell_px) + 1, math.ceil(raster.width_px / cell_px) + 1
 
 
@@ -61,9 +83,12 @@ def fill_lattice(
     """Write the raw coordinates of one sensor at the lattice nodes.
 
     Args:
+        image: virtual image.
+        raster: target raster over it.
         placement: start or adjusted.
-        out: (rows, columns, 2) float64, see `lattice_shape`; overwritten. Nodes more than two
-            cells from the sensor become `OUTSIDE`.
+        cell_px: lattice spacing, target pixels.
+        out: (rows, columns, 2) float64, see `lattice_shape`; overwritten. Nodes more than two cells
+            from the sensor become `OUTSIDE`.
         source_from_target_mm: (3, 3) homography in VIP mm applied first; carries a point of the
             target raster to where the sensor's placement thinks it is. None: they agree.
     """
@@ -90,9 +115,15 @@ def fill_lattice(
 
 
 def interpolate_lattice(lattice: Array, cell_px: int, colrow: Array) -> Array:
-    """Raw coordinates (n, 2) at target pixels (n, 2), bilinear as in the resampling.
+    """Raw coordinates at target pixels, bilinear as in the resampling.
 
-    NaN where a node of the cell is `OUTSIDE`.
+    Args:
+        lattice: from `fill_lattice`, (rows, columns, 2).
+        cell_px: its spacing, target pixels.
+        colrow: column and row of target pixels, (n, 2).
+
+    Returns:
+        Raw column and row, (n, 2); NaN where a node of the cell is `OUTSIDE`.
     """
     x = np.asarray(colrow[:, 0], np.float64) / cell_px
     y = np.asarray(colrow[:, 1], np.float64) / cell_px

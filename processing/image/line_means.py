@@ -39,6 +39,9 @@ def line_means(frame: Array, rows: tuple[int, int]) -> LineMeans:
     Args:
         frame: (h, w) uint16.
         rows: first and last row looked at.
+
+    Returns:
+        Means in the unit of the frame; no bundles where it is smaller than one.
     """
     first, last = rows
     by_row, by_column = line_sums(last + 1 - first, frame.shape[1])
@@ -48,14 +51,31 @@ def line_means(frame: Array, rows: tuple[int, int]) -> LineMeans:
 
 
 def line_sums(height: int, width: int) -> tuple[Array, Array]:
-    """Zeros for the sums of bundles along rows (bundles, h) and columns (bundles, w), uint32."""
+    """Zeros for the sums of bundles.
+
+    Args:
+        height: rows, px.
+        width: columns, px.
+
+    Returns:
+        Sums along rows (bundles, height) and along columns (bundles, width), uint32.
+    """
     by_row = np.zeros((min(BUNDLES, width // BUNDLE_PX), height), np.uint32)
     by_column = np.zeros((min(BUNDLES, height // BUNDLE_PX), width), np.uint32)
     return by_row, by_column
 
 
 def means_of_sums(by_row: Array, by_column: Array, first_row: int) -> LineMeans:
-    """Means of bundles from their sums."""
+    """Means of bundles from their sums.
+
+    Args:
+        by_row: sums along rows, (bundles, rows) uint32.
+        by_column: sums along columns, (bundles, columns) uint32.
+        first_row: row of the frame with which `by_row` begins.
+
+    Returns:
+        Means, float32.
+    """
     share = np.float32(1.0 / BUNDLE_PX)  # a power of two: exact
     return LineMeans(
         by_row.astype(np.float32) * share, by_column.astype(np.float32) * share, first_row
@@ -101,7 +121,16 @@ def add_line(line, row, row_of_block, by_row, by_column):
 
 @njit(cache=True, nogil=True)
 def add_pixels(frame, places, first_row, sign, by_row, by_column):
-    """Add some pixels (n, 2), row and column, to the sums, or take them off (`sign` -1)."""
+    """Add some pixels to the sums of bundles, or subtract them.
+
+    Args:
+        frame: (h, w) uint16.
+        places: row and column in the frame, (n, 2).
+        first_row: row of the frame with which `by_row` begins.
+        sign: 1 adds, -1 subtracts.
+        by_row: sums along rows, changed in place, (bundles, rows) uint32.
+        by_column: sums along columns, changed in place, (bundles, columns) uint32.
+    """
     bundles, height = by_row.shape
     blocks = len(by_column)
     if bundles == 0 or blocks == 0:

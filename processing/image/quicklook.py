@@ -27,15 +27,17 @@ _HIGH_PERCENT: Final = 99.5
 
 
 def quicklook(pan: Array, colour: Mapping[str, Array]) -> Array:
-    """A picture of about 1200 pixels' width, (h, w, 3) uint8.
+    """A picture of about 1200 pixels' width.
 
     PAN gives the detail, red, green and blue the hue where all three are there; the stretch is
-    chosen from this image alone, so brightness is not comparable between exposures. Pixels without
-    PAN data are dark red.
+    chosen from this image alone, so brightness is not comparable between exposures.
 
     Args:
         pan: (H, W) uint16, 0 is no data.
         colour: bands by name, (h, w) uint16, 0 is no data, on a raster that covers the same image.
+
+    Returns:
+        Red, green, blue, (h, w, 3) uint8; pixels without PAN data are dark red.
     """
     factor = max(round(pan.shape[1] / QUICKLOOK_WIDTH_PX), 1)
     shape = (max(pan.shape[0] // factor, 1), max(pan.shape[1] // factor, 1))

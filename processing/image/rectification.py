@@ -36,7 +36,7 @@ _BAD_BIT: Final = np.uint16(1)
 class RectifiedFrame:
     """Words of sensor a on pixels of sensor b, each divided into `step` by `step`.
 
-    `words` (h, w) uint16 are Level-1 words, 0 where a has nothing usable. Its first pixels divide
+    `pixels` (h, w) uint16 are Level-1 words, 0 where a has nothing usable. Its first pixels divide
     pixel `first` (column, row) of b.
     """
 
@@ -46,11 +46,25 @@ class RectifiedFrame:
     _lattice: Array
 
     def at(self, colrow_b: Array) -> Array:
-        """The first of the pixels that divide pixels (n, 2) of b, (n, 2) int64."""
+        """The first of the pixels that divide pixels of b.
+
+        Args:
+            colrow_b: column and row in b, (n, 2), whole pixels.
+
+        Returns:
+            Column and row in `pixels`, (n, 2) int64.
+        """
         return np.asarray((colrow_b - np.array(self.first)) * self.step, np.int64)
 
     def raw_a(self, colrow: Array) -> Array:
-        """Raw (column, row) in a of positions (n, 2) in `words`."""
+        """Raw coordinates in a of positions in `pixels`.
+
+        Args:
+            colrow: column and row in `pixels`, (n, 2).
+
+        Returns:
+            Raw column and row in a, (n, 2); NaN where b sees nothing of a.
+        """
         return interpolate_lattice(self._lattice, _CELL_PX, colrow)
 
 
@@ -65,10 +79,14 @@ def rectify_to_sensor(
     """The frame of a on the pixels of b, by one resampling.
 
     Args:
-        a, b: predicted places.
+        a: predicted place of the sensor whose frame is resampled.
+        b: predicted place of the other sensor.
         frame_a: Level-1 words, (h, w) uint16.
         region: first and last column, first and last row of b.
         step: pixels of the result to a pixel of b along each axis.
+
+    Returns:
+        The resampled region and its lattice.
 
     Raises:
         ValueError: a frame of another type than words.

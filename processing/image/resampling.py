@@ -60,12 +60,15 @@ def resample(
         weights: (n, rows, columns) uint8 at every `WEIGHT_STEP_PX`-th target pixel.
         gains: (n,) float32, applied to the signal.
         offsets: (n,) float32, added after the gain; None adds nothing.
+        interpolation: name of the kernel.
         out: (height, width) uint16; 0 is no data.
         source: (height, width) uint8: 0 no data, else 1 + index of the frame of greatest weight,
             with `SATURATED_SOURCE` set where one of the four nearest raw pixels was saturated.
 
     Raises:
         ValueError: a cell that is no multiple of the weight step, or larger than `MAX_CELL_PX`.
+
+    Source: docs/explanation/mathematics/resampling.md#evaluation and #saturation-and-holes.
     """
     if cell_px % WEIGHT_STEP_PX or not 0 < cell_px <= MAX_CELL_PX:
         raise ValueError(
@@ -88,7 +91,15 @@ def resample(
 
 
 def usable_area(placement: SensorPlacement, rows: tuple[int, int]) -> Sequence[float]:
-    """First and last usable raw column and row, given the fully exposed rows (level1)."""
+    """Raw pixels of a sensor that the widest kernel may be centred on.
+
+    Args:
+        placement: of the sensor.
+        rows: first and last fully exposed row (`processing.radiometry.level1`).
+
+    Returns:
+        First and last usable raw column, first and last usable raw row.
+    """
     margin = SUPPORT_MARGIN_PX
     return (
         float(margin),

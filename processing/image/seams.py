@@ -52,7 +52,7 @@ class _JoinedSensors:
 
 
 def seam_labels(centres: Array, means: Array, gains: Array, feather_px: int) -> Array:
-    """The owner of every node: index of a frame, (rows, columns) int8.
+    """The owner of every node.
 
     Nodes no frame covers have an owner too (the resampling finds nothing there); a node that any
     frame covers is never given to one that does not.
@@ -63,8 +63,13 @@ def seam_labels(centres: Array, means: Array, gains: Array, feather_px: int) -> 
         gains: (n,) applied to the means before they are compared.
         feather_px: seams keep half of it away from the borders of an overlap where there is room.
 
+    Returns:
+        Index of a frame, (rows, columns) int8.
+
     Raises:
         ValueError: no frames at all.
+
+    Source: docs/explanation/mathematics/radiometry.md#seams.
     """
     if len(means) == 0:
         raise ValueError("no frame to compose an image from; give one at least")
@@ -96,6 +101,13 @@ def sensor_rows(centres: Array, shape: Sequence[int]) -> list[list[int]]:
     """Sensors sorted into rows from above, each row from left to right.
 
     A new row begins where the next middle lies more than a fifth of the image lower.
+
+    Args:
+        centres: column and row of each sensor's middle, (n, 2), target pixels.
+        shape: rows and columns of weight nodes.
+
+    Returns:
+        Indices of sensors, row by row.
     """
     order = np.argsort(centres[:, 1], kind="stable")
     rows: list[list[int]] = []

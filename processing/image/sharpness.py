@@ -35,14 +35,19 @@ def sharpness(
     """Share of the finest detail along track (columns of pixels) and across.
 
     The ratio of the mean squared difference of direct neighbours to that of pixels two apart, both
-    less the photon and read noise the sensor is known to have: 0.25 for a surface without detail at
-    this scale, 0.5 for sharp landscapes, 1 for pixels without any correlation. None where the image
-    is too poor in contrast to say.
+    less the photon and read noise the sensor is known to have.
 
     Args:
+        sensor: bits, gain and read-out noise count.
         frame: Level-1 words, (h, w) uint16.
         rows: first and last exposed row.
         columns: first and last column looked at; None takes all.
+
+    Returns:
+        Along and across: 0.25 for a surface without detail at this scale, 0.5 for sharp landscapes,
+        1 for pixels without any correlation. None where the image is too poor in contrast to say.
+
+    Source: docs/explanation/mathematics/quality.md#sharpness.
     """
     first, last = rows
     left, right = columns or (0, frame.shape[1] - 1)
@@ -58,7 +63,15 @@ def sharpness(
 
 
 def bright_level(sensors: Sequence[Sensor], frames: Sequence[Array]) -> float | None:
-    """The 95th percentile of signal above black as a share of full scale; no data left out."""
+    """The 95th percentile of signal above black, without pixels of no data.
+
+    Args:
+        sensors: bits and full scale count.
+        frames: Level-1 words of each sensor, (h, w) uint16.
+
+    Returns:
+        Share of full scale; None without any data.
+    """
     samples = []
     for sensor, frame in zip(sensors, frames, strict=True):
         pace = _EVERY_ROW * max(1, len(frame) // _ROWS)

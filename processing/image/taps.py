@@ -29,7 +29,15 @@ _VECTOR_WIDTH: Final = 8
 
 @njit(cache=True, fastmath=True, nogil=True, inline="always")
 def weights_at(table, phase):
-    """Row of the table next to a phase, and the phase's distance from it, px."""
+    """Find the row of a table next to a phase.
+
+    Args:
+        table: of a `processing.image.kernels.Kernel`.
+        phase: right of pixel 0, px, float32.
+
+    Returns:
+        Index of the row, and the phase's distance from it, px.
+    """
     steps = phase * np.float32(PHASES)
     row = np.int32(np.floor(steps + np.float32(0.5)))
     row = min(max(row, np.int32(-MARGIN)), np.int32(PHASES + MARGIN))
@@ -80,7 +88,18 @@ def _down(flat, start, width, first, step, table, line, n):
 
 @njit(cache=True, fastmath=True, nogil=True)
 def down(flat, start, width, first, step, table, line, n):
-    """Six raw rows interpolated at n columns from `start` on; phases first + step * j."""
+    """Interpolate n columns across six raw rows; phases are first + step * j.
+
+    Args:
+        flat: raw words, row after row, uint16.
+        start: index in `flat` of the pixel at phase 0 of the first column.
+        width: words from row to row.
+        first: phase at the first column, px, float32.
+        step: change of phase per column, px, float32.
+        table: of a `processing.image.kernels.Kernel`.
+        line: receives n values, float32.
+        n: columns.
+    """
     piece = _piece(abs(step) * np.float32(np.int32(n)), n)
     for done in range(0, n, piece):
         at = first + step * np.float32(np.int32(done))
@@ -89,7 +108,17 @@ def down(flat, start, width, first, step, table, line, n):
 
 @njit(cache=True, fastmath=True, nogil=True)
 def middle_and_span(phases, steps, rows, n):
-    """Middle of the phases of some rows of n pixels, and how far they spread around it."""
+    """Middle of the phases of some rows of n pixels, and how far they spread around it.
+
+    Args:
+        phases: at the first pixel of each row, (rows,) float32, px.
+        steps: change of phase per pixel, (rows,) float32, px.
+        rows: rows looked at.
+        n: pixels of each row.
+
+    Returns:
+        Middle, and largest less least phase, px.
+    """
     least = np.float32(2.0)
     most = np.float32(-1.0)
     along = np.float32(np.int32(n - 1))
@@ -104,7 +133,18 @@ def middle_and_span(phases, steps, rows, n):
 def down_strip(flat, start, width, phases, steps, table, lines, rows, n):
     """As `down` for target rows whose taps lie one raw row apart, with one row of the table.
 
-    Row y has the phases phases[y] + steps[y] * j and goes to `lines` from y * `LINE_LENGTH` on.
+    Row y has the phases phases[y] + steps[y] * j.
+
+    Args:
+        flat: raw words, row after row, uint16.
+        start: index in `flat` of the pixel at phase 0 of the first row's first column.
+        width: words from row to row.
+        phases: at the first column of each row, (rows,) float32, px.
+        steps: change of phase per column, (rows,) float32, px.
+        table: of a `processing.image.kernels.Kernel`.
+        lines: receives row y from y * `LINE_LENGTH` on, float32.
+        rows: target rows.
+        n: columns.
     """
     middle, span = middle_and_span(phases, steps, rows, n)
     if span > _SPAN:
@@ -164,7 +204,16 @@ def _along(a, first, step, table, out, n):
 
 @njit(cache=True, fastmath=True, nogil=True)
 def along(line, first, step, table, out, n):
-    """Six values of the scratch row to each of n; phases first + step * k, taps from k on."""
+    """Interpolate n values along a scratch row; phases are first + step * k, taps from k on.
+
+    Args:
+        line: scratch row, at least n + 5 values, float32.
+        first: phase of the first value, px, float32.
+        step: change of phase per value, px, float32.
+        table: of a `processing.image.kernels.Kernel`.
+        out: receives n values, float32.
+        n: values.
+    """
     piece = _piece(abs(step) * np.float32(np.int32(n)), n)
     for done in range(0, n, piece):
         at = first + step * np.float32(np.int32(done))
@@ -174,9 +223,20 @@ def along(line, first, step, table, out, n):
 
 @njit(cache=True, fastmath=True, nogil=True)
 def values_strip(lines, phases, steps, table, gain, offset, out, y0, x0, rows, n):
-    """As `along` row by row, times gain plus offset, rounded to words that are signal.
+    """As `along` row by row, times gain plus offset, rounded to words that are signal, 1 to 65535.
 
-    Behind the rows, `lines` has one more.
+    Args:
+        lines: scratch rows of `LINE_LENGTH` float32, one more than `rows`.
+        phases: at the first value of each row, (rows,) float32, px.
+        steps: change of phase per value, (rows,) float32, px.
+        table: of a `processing.image.kernels.Kernel`.
+        gain: factor of the signal, float32.
+        offset: added after the gain, float32.
+        out: (height, width) uint16, receives the words.
+        y0: first row of `out`.
+        x0: first column of `out`.
+        rows: target rows.
+        n: values of each row.
     """
     rise = offset + np.float32(0.5)
     middle, span = middle_and_span(phases, steps, rows, n)
@@ -207,7 +267,18 @@ def values_strip(lines, phases, steps, table, gain, offset, out, y0, x0, rows, n
 
 @njit(cache=True, nogil=True)
 def is_clean(flat, start, width, rows, columns):
-    """Whether a box of raw words holds neither saturated pixels nor holes."""
+    """Whether a box of raw words holds neither saturated pixels nor holes.
+
+    Args:
+        flat: raw words, row after row, uint16.
+        start: index in `flat` of the box's first word.
+        width: words from row to row.
+        rows: height of the box, px.
+        columns: width of the box, px.
+
+    Returns:
+        True where no word is 0 or has its lowest bit set.
+    """
     least = np.uint16(65535)
     odd_bits = np.uint16(0)
     for r in range(rows):
@@ -223,8 +294,13 @@ def flags_along(flat, start, width, reach, spare, out, n):
     """Flags of n pixels whose four nearest raw pixels begin at `start` and move along that row.
 
     Args:
+        flat: raw words, row after row, uint16.
+        start: index in `flat` of the upper left of the first pixel's four.
+        width: words from row to row.
         reach: raw pixels beyond the four nearest that count, along each axis.
         spare: scratch, (2, n + 2 + 2 * reach) uint16.
+        out: receives `SATURATED` | `MISSING`, (n,) uint8.
+        n: pixels.
     """
     columns = n + 1 + 2 * reach
     least = spare[0, :columns]
