@@ -243,26 +243,40 @@ class FrameMemory(Protocol):
     """
 
     @property
-    def slot_count(self) -> int: ...
+    def slot_count(self) -> int:
+        """Number of slots; they are numbered from 0."""
 
     @property
-    def slot_nbytes(self) -> int: ...
+    def slot_nbytes(self) -> int:
+        """Bytes of a slot, CHUNK_ALLOWANCE_NBYTES included."""
 
     def address(self, slot: int) -> int:
-        """Address of a slot in this process."""
+        """Address of a slot in this process.
+
+        Args:
+            slot: number of the slot, 0 to `slot_count` - 1.
+
+        Returns:
+            Address of its first byte, a multiple of 8.
+        """
 
 
 class Device(Protocol):
     """The interface of every device."""
 
     @property
-    def name(self) -> str: ...
+    def name(self) -> str:
+        """Name from the configuration."""
 
     @property
-    def state(self) -> LifeCycle: ...
+    def state(self) -> LifeCycle:
+        """Present state of the life cycle."""
 
     def bind(self) -> Mapping[str, str]:
-        """Open the device, write its settings, and return its identity (model, serial, ...).
+        """Open the device and write its settings.
+
+        Returns:
+            Its identity (model, serial number, ...) as text by name.
 
         Raises:
             DeviceError: it does not answer or refuses a setting; the message contains the remedy.
@@ -273,29 +287,62 @@ class Device(Protocol):
 
         A device fault never raises. The driver reports it as a `DeviceEvent` and reconnects with
         back-off.
+
+        Args:
+            sink: receives every record, in this thread.
         """
 
     def close(self) -> None:
         """Stop `run` within two seconds and release the device. May be called twice."""
 
     def statistics(self) -> Mapping[str, int]:
-        """Counters since creation, by stable name."""
+        """Counters since creation; from any thread.
+
+        Returns:
+            Counts by stable name.
+        """
 
 
 class Head(Device, Protocol):
     """A camera head: frames land in the memory it was created with."""
 
     def bind(self, sink: Sink | None = None) -> Mapping[str, str]:
-        """As for a device. `sink` receives an event while another controller holds the head."""
+        """Open the head and write its settings; see `Device.bind`.
+
+        Args:
+            sink: receives an event while another controller holds the head.
+
+        Returns:
+            Its identity as text by name.
+
+        Raises:
+            DeviceError: as for a device.
+        """
 
     def recycle(self, slot: int) -> None:
-        """Return a slot; from any thread."""
+        """Return a slot of a frame that is no longer needed; from any thread.
+
+        Args:
+            slot: `Frame.slot` of that frame.
+
+        Raises:
+            ValueError: the slot was not handed out, or is returned twice.
+        """
 
     def trigger(self) -> None:
-        """Software trigger; from any thread. DeviceError if the head waits for a line."""
+        """Fire the software trigger; from any thread.
+
+        Raises:
+            DeviceError: the head waits for a line, is not running, or refuses.
+        """
 
     def adjust(self, exposure_time_us: float, gain_db: float, tdi_shifts: int) -> None:
         """Use these settings from the next frame on, also after a loss; from any thread.
+
+        Args:
+            exposure_time_us: exposure time, us.
+            gain_db: gain, dB.
+            tdi_shifts: number of line shifts that compensate forward motion; 0 without TDI.
 
         Raises:
             DeviceError: the head is lost, refuses them, or cannot be changed while it runs; the
@@ -319,18 +366,49 @@ class Trigger(Protocol):
     """A trigger unit: it answers requests and delivers no stream of records."""
 
     @property
-    def name(self) -> str: ...
+    def name(self) -> str:
+        """Name from the configuration."""
 
     def bind(self) -> Mapping[str, str]:
-        """Open the unit and return its identity. DeviceError as for a device."""
+        """Open the unit.
+
+        Returns:
+            Its identity as text by name.
+
+        Raises:
+            DeviceError: it does not answer; the message contains the remedy.
+        """
 
     def program(self, delays_ns: Mapping[str, int]) -> None:
-        """Set the delay of every output, by cone, from the instant of firing."""
+        """Set the delays of outputs.
+
+        Args:
+            delays_ns: delay from the instant of firing by output (cone), ns; outputs that are not
+                named keep theirs.
+
+        Raises:
+            DeviceError: an output does not exist, a delay is out of range, or there is no answer.
+        """
 
     def fire(self, sequence: int) -> TriggerPulse:
-        """Fire one pulse. DeviceError if none was fired or if that is unknown."""
+        """Fire one pulse.
+
+        Args:
+            sequence: number of the pulse.
+
+        Returns:
+            The pulse with the host's estimate of its time.
+
+        Raises:
+            DeviceError: none was fired, or that is unknown.
+        """
 
     def statistics(self) -> Mapping[str, int]:
-        """Counters since creation, by stable name; from any thread."""
+        """Counters since creation; from any thread.
 
-    def close(self) -> None: ...
+        Returns:
+            Counts by stable name.
+        """
+
+    def close(self) -> None:
+        """Release the unit; may be called twice."""

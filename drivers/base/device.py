@@ -46,10 +46,15 @@ class DeviceDriver(Configured):
 
     @property
     def state(self) -> LifeCycle:
+        """Present state of the life cycle."""
         return self._state
 
     def run(self, sink: Sink) -> None:
-        """Deliver until `close` is called. See `drivers.contract.Device`."""
+        """Deliver until `close` is called. See `drivers.contract.Device`.
+
+        Args:
+            sink: receives every record, in this thread.
+        """
         if self._closing.is_set():
             return
         self._ended.clear()
@@ -88,7 +93,11 @@ class DeviceDriver(Configured):
         self._state = LifeCycle.INACTIVE
 
     def statistics(self) -> Mapping[str, int]:
-        """Counters since creation, by stable name; see the driver's page."""
+        """Counters since creation; see the driver's page.
+
+        Returns:
+            Counts by stable name.
+        """
         return dict(self.counters)
 
     def _emit_lost(self, sentence: str, event: str = "lost") -> None:

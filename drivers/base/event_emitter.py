@@ -21,13 +21,24 @@ class EventEmitter:
         self.sink: Sink | None = None
 
     def emit(self, event: str, sentence: str, *, fault: bool = False) -> None:
-        """Report a change of state."""
+        """Report a change of state; without effect while there is no sink.
+
+        Args:
+            event: name of the event, a stable kebab-case word.
+            sentence: what happened and the remedy, for the operator.
+            fault: whether it is a fault.
+        """
         if self.sink is not None:
             now_ns = self._clock.mono_ns()
             self.sink(DeviceEvent(self._device, event, fault, sentence, now_ns))
 
     def emit_throttled(self, event: str, sentence: str) -> None:
-        """Report a fault that may occur with every message, at most once in ten seconds."""
+        """Report a fault that may occur with every message, at most once in ten seconds.
+
+        Args:
+            event: name of the event; each name is throttled separately.
+            sentence: what happened and the remedy, for the operator.
+        """
         now_ns = self._clock.mono_ns()
         emitted_ns = self._emitted_ns.get(event)
         if emitted_ns is None or now_ns - emitted_ns >= THROTTLE_INTERVAL_NS:

@@ -62,7 +62,15 @@ def require(*names: str) -> None:
 
 
 def missing(name: str, reason: object) -> MissingExtraError:
-    """The error with the purpose of an extra and the command that installs it."""
+    """The error for an extra that cannot be loaded.
+
+    Args:
+        name: key of EXTRAS.
+        reason: what failed, for the message.
+
+    Returns:
+        The error; its message has the purpose of the extra and the command that installs it.
+    """
     extra = EXTRAS[name]
     sentence = f"{extra.purpose}, which cannot be loaded ({reason})"
     if extra.modules[1:]:
@@ -72,7 +80,14 @@ def missing(name: str, reason: object) -> MissingExtraError:
 
 
 def missing_module(error: ImportError) -> MissingExtraError | None:
-    """The same error for a failed import; None if the module belongs to no extra."""
+    """The error for an import that failed.
+
+    Args:
+        error: the error of the import statement.
+
+    Returns:
+        As `missing`; None if the module belongs to no extra.
+    """
     module = (error.name or "").partition(".")[0]
     for name, extra in EXTRAS.items():
         if module in (*extra.modules, "starlette" if name == "watch" else ""):

@@ -51,20 +51,39 @@ _EXTRAS: Final[Mapping[str, tuple[str, ...]]] = {
 
 
 def extras_of(kind: str, driver_name: str) -> tuple[str, ...]:
-    """The optional libraries a driver needs, by their names in `drivers.base.extras`."""
+    """The optional libraries that a driver needs.
+
+    Args:
+        kind: kind of the device.
+        driver_name: name of the driver.
+
+    Returns:
+        Their names in `drivers.base.extras`; empty for an unknown driver.
+    """
     return _EXTRAS.get(driver_name, ()) if driver_name in _DRIVER_PATHS.get(kind, {}) else ()
 
 
 def kinds() -> Mapping[str, tuple[str, ...]]:
-    """The kinds of devices, and the names of the drivers of each kind."""
+    """The kinds of devices and their drivers.
+
+    Returns:
+        Names of the drivers by kind.
+    """
     return {kind: tuple(driver_paths) for kind, driver_paths in _DRIVER_PATHS.items()}
 
 
 def driver_for(kind: str, driver_name: str) -> type[Configured]:
-    """The driver class.
+    """The class of a driver.
 
     Every class is created with `(name, settings)`; a head also with `memory=` (FrameMemory), the
     software trigger with `heads=` (heads by output).
+
+    Args:
+        kind: kind of the device.
+        driver_name: name of the driver.
+
+    Returns:
+        The class; its module is loaded.
 
     Raises:
         DeviceError: no such kind or driver; the message lists the known ones.
@@ -80,9 +99,15 @@ def driver_for(kind: str, driver_name: str) -> type[Configured]:
 
 
 def problems(kind: str, driver_name: str, settings: Mapping[str, object]) -> list[str]:
-    """The errors in the settings of a device, one sentence each; empty if there are none.
+    """The errors in the settings of a device.
 
-    `settings` holds only the driver's own keys, not the names of the device and the driver.
+    Args:
+        kind: kind of the device.
+        driver_name: name of the driver.
+        settings: the driver's own keys only, without the names of the device and the driver.
+
+    Returns:
+        One sentence for each error; empty if there are none.
     """
     try:
         driver = driver_for(kind, driver_name)

@@ -88,6 +88,12 @@ class Setting(Generic[T]):
     def convert(self, value: object) -> T:
         """The value as this setting's type.
 
+        Args:
+            value: as read from the configuration.
+
+        Returns:
+            The converted value; an integer for a float setting becomes a float, a list a tuple.
+
         Raises:
             ValueError: the value is not allowed; the message states what is.
         """
@@ -131,11 +137,16 @@ class Configured:
 
     @property
     def name(self) -> str:
+        """Name from the configuration."""
         return self._name
 
     @classmethod
     def settings(cls) -> tuple[Setting[Any], ...]:
-        """The declared settings, those of the base classes first."""
+        """The declared settings.
+
+        Returns:
+            Those of the base classes first; an overriding declaration keeps the place of the first.
+        """
         found: dict[str, Setting[Any]] = {}
         for owner in reversed(cls.__mro__):
             found.update({k: v for k, v in vars(owner).items() if isinstance(v, Setting)})
@@ -143,9 +154,14 @@ class Configured:
 
     @classmethod
     def problems(cls, settings: Mapping[str, object]) -> list[str]:
-        """The errors in a configuration section; empty if there are none.
+        """The errors in a configuration section.
 
-        Each sentence contains the key, the value found, and the allowed values.
+        Args:
+            settings: the section, plain values by key.
+
+        Returns:
+            A sentence for each error with the key, the value found and the allowed values; empty if
+            there are none.
         """
         declared = {setting.name: setting for setting in cls.settings()}
         problems = []
@@ -169,7 +185,14 @@ class Configured:
 
     @classmethod
     def setting_conflicts(cls, values: Mapping[str, Any]) -> list[str]:
-        """Conflicts between settings that are valid one by one; overridden by drivers."""
+        """Conflicts between settings that are valid one by one; overridden by drivers.
+
+        Args:
+            values: converted values of all settings by name, defaults included.
+
+        Returns:
+            A sentence for each conflict; empty if there are none.
+        """
         return []
 
     @classmethod

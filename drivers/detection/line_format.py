@@ -30,9 +30,15 @@ class LineFormat:
 
 
 def line_format_of(data: bytes) -> LineFormat | None:
-    """The common format of the lines of a stream; None if it is no text or has no readings.
+    """The common format of the lines of a stream.
 
     A reading is the text after `=` or `:`, or else a number.
+
+    Args:
+        data: bytes as received; the first line may be incomplete.
+
+    Returns:
+        The most frequent format; None if the bytes are no text or their lines have no readings.
 
     Example:
         >>> found = line_format_of(b"T1=21.5 T2=OPEN\\r\\nT1=21.6 T2=-3.0\\r\\n")

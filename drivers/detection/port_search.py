@@ -62,7 +62,12 @@ class DetectionResult:
 
 
 def default_ports() -> list[str]:
-    """Every serial port of the host, by its persistent name if it has one, and usual addresses."""
+    """The ports that are searched if none are named.
+
+    Returns:
+        Every serial port of the host, by its persistent name if it has one, then the usual
+        network addresses.
+    """
     by_id = {}
     if BY_ID.is_dir():
         by_id = {str(link.resolve()): str(link) for link in sorted(BY_ID.iterdir())}
@@ -84,10 +89,13 @@ def search(
     Args:
         ports: serial ports and network addresses.
         ask: whether Modbus registers are requested at a serial port that receives nothing.
-        on_progress: receives the port and the present step.
-        baudrates: in the order of the search.
+        on_progress: receives the port and the present step; called from several threads.
+        baudrates: bit/s, in the order of the search.
         clock: of the listening times.
         open_port: opens a port with a baud rate and a parity.
+
+    Returns:
+        One result for each port, in the order of `ports`, without repeated ports.
     """
     names = list(dict.fromkeys(ports))
     found: dict[str, DetectionResult] = {}

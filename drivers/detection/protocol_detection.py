@@ -82,11 +82,18 @@ class ProtocolDetector:
 
     @property
     def looks_like_text(self) -> bool:
+        """Whether the last bytes are more than 8 and at least 98 % of them printable."""
         text = self._text.translate(None, b"\x00")
         printable = sum(32 <= byte < 127 or byte in b"\t\r\n\xb0" for byte in text)
         return len(text) > 8 and printable >= 0.98 * len(text)
 
     def feed(self, data: bytes, mono_ns: int) -> None:
+        """Pass bytes to all decoders.
+
+        Args:
+            data: bytes as received.
+            mono_ns: their arrival on CLOCK_MONOTONIC, ns.
+        """
         self.nbytes += len(data)
         self._text = (self._text + data)[-TEXT_BUFFER_NBYTES:]
         for _, decoder in self._decoders:
@@ -97,6 +104,12 @@ class ProtocolDetector:
 
         A receiver may send text in addition to binary messages. Until the device has been listened
         to long enough, only binary messages are decisive.
+
+        Args:
+            has_listened_long_enough: whether every message that is sent once a second was received.
+
+        Returns:
+            True if the device is known and nothing that a flight requires is missing.
         """
         detected = self.detected()
         if detected is None or detected.missing:
@@ -104,7 +117,11 @@ class ProtocolDetector:
         return has_listened_long_enough or detected.driver not in ("nmea", "ascii-line", "gpsd")
 
     def detected(self) -> DetectedDevice | None:
-        """The device, by the messages received so far; None if there are none."""
+        """The device, by the messages received so far.
+
+        Returns:
+            The device; None if no protocol is recognized.
+        """
         for candidate, decoder in self._decoders:
             if any(decoder.seen[name] for name in candidate.navigator.required):
                 return _detected_device(candidate, decoder, missing="")

@@ -18,19 +18,45 @@ class Clock(Protocol):
     """The clock that a driver uses."""
 
     def mono_ns(self) -> int:
-        """CLOCK_MONOTONIC."""
+        """The present time.
+
+        Returns:
+            CLOCK_MONOTONIC, ns.
+        """
 
     def wait(self, event: threading.Event, timeout_s: float) -> bool:
-        """Wait for the event, at most `timeout_s`; returns whether it is set."""
+        """Wait for an event.
+
+        Args:
+            event: what is waited for.
+            timeout_s: longest wait, s.
+
+        Returns:
+            Whether the event is set.
+        """
 
 
 class MonotonicClock:
     """CLOCK_MONOTONIC of the host."""
 
     def mono_ns(self) -> int:
+        """The present time.
+
+        Returns:
+            CLOCK_MONOTONIC, ns.
+        """
         return time.monotonic_ns()
 
     def wait(self, event: threading.Event, timeout_s: float) -> bool:
+        """Wait for an event.
+
+        Args:
+            event: what is waited for.
+            timeout_s: longest wait, s.
+
+        Returns:
+            Whether the event is set.
+        """
         return event.wait(timeout_s)
 
 
@@ -47,9 +73,15 @@ class BackOff:
         self._next_s = BACK_OFF_FIRST_S
 
     def next_s(self) -> float:
+        """The pause before the next attempt; doubles the following one.
+
+        Returns:
+            BACK_OFF_FIRST_S to BACK_OFF_LIMIT_S, s.
+        """
         pause_s = self._next_s
         self._next_s = min(2 * pause_s, BACK_OFF_LIMIT_S)
         return pause_s
 
     def reset(self) -> None:
+        """Begin again with the shortest pause."""
         self._next_s = BACK_OFF_FIRST_S

@@ -36,7 +36,14 @@ class UtcFields:
 
 
 def utc_ns(fields: UtcFields) -> int | None:
-    """Nanoseconds since the GPS epoch without leap seconds; None if no such date exists."""
+    """A UTC date and time as a count without leap seconds.
+
+    Args:
+        fields: date and time; `second` 60 counts as the first second of the next minute.
+
+    Returns:
+        Nanoseconds since the GPS epoch, each day with 86 400 s; None if no such date exists.
+    """
     in_day = fields.hour < 24 and fields.minute < 60 and fields.second <= 60
     if not in_day or abs(fields.nano) > SECOND_NS:
         return None
@@ -53,7 +60,15 @@ def gps_from_utc(utc: int, itow_ms: int) -> tuple[int, int] | None:
 
     The difference of both, modulo one week, is the number of leap seconds that the receiver uses.
     So the result is also correct while the receiver uses its firmware's default, in a leap second,
-    and if UTC and GPS are in different weeks. None if they contradict each other.
+    and if UTC and GPS are in different weeks.
+
+    Args:
+        utc: result of `utc_ns`, ns.
+        itow_ms: GPS time of week of the same instant, ms.
+
+    Returns:
+        GPS time, ns since the GPS epoch, and GPS - UTC, s; None if both times differ from whole
+        seconds by more than ITOW_SLACK_NS, or the difference is not 0 to MAX_LEAP_SECONDS.
 
     Example:
         >>> gps_from_utc(utc_ns(UtcFields(2024, 1, 30, 15, 31, 52, -422154)), 228730000)
@@ -68,6 +83,13 @@ def gps_from_utc(utc: int, itow_ms: int) -> tuple[int, int] | None:
 
 def gps_near(itow_ms: int, near_gps_ns: int) -> int:
     """The instant of a time of week that is nearest to another instant, also across a week's end.
+
+    Args:
+        itow_ms: GPS time of week, ms.
+        near_gps_ns: the other instant, ns since the GPS epoch.
+
+    Returns:
+        GPS time within half a week of `near_gps_ns`, ns since the GPS epoch.
 
     Example:
         >>> gps_near(604_799_900, 2400 * WEEK_NS + 50_000_000) - 2400 * WEEK_NS

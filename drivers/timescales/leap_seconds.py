@@ -25,8 +25,15 @@ _STARTS_NS: Final = tuple(
 
 
 def leap_seconds_at(utc_ns: int) -> int:
-    """GPS - UTC in seconds at a UTC instant counted without leap seconds from the GPS epoch.
+    """GPS - UTC at a UTC instant, by the table.
 
-    Within a leap second, pass the instant one second before.
+    Args:
+        utc_ns: nanoseconds since the GPS epoch without leap seconds; within a leap second, the
+            instant one second before.
+
+    Returns:
+        GPS - UTC, s; the present count for any time after the last entry.
+
+    Source: IERS Bulletin C.
     """
     return bisect.bisect_right(_STARTS_NS, utc_ns)

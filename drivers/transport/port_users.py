@@ -48,6 +48,9 @@ def holders(path: str) -> list[PortHolder]:
 
     Args:
         path: the port; links such as those in /dev/serial/by-id are followed.
+
+    Returns:
+        The processes; empty if none is visible or `path` is no character device.
     """
     return _seen(path, lockers_first=True)
 
@@ -55,10 +58,12 @@ def holders(path: str) -> list[PortHolder]:
 def other_holders(path: str) -> list[PortHolder]:
     """Other processes that have a port open, locked or not; for a port that this one has locked.
 
-    Empty for a pseudo-terminal: the program that created it may keep both of its ends open.
-
     Args:
         path: the port, as for `holders`.
+
+    Returns:
+        The processes. Empty for a pseudo-terminal: the program that created it may keep both of its
+        ends open.
     """
     if is_pseudo_terminal(path):
         return []
@@ -66,7 +71,14 @@ def other_holders(path: str) -> list[PortHolder]:
 
 
 def is_pseudo_terminal(path: str) -> bool:
-    """Whether a port is a pseudo-terminal, such as an emulated receiver's."""
+    """Whether a port is a pseudo-terminal, such as an emulated receiver's.
+
+    Args:
+        path: the port; links are followed.
+
+    Returns:
+        By the device number; False if there is no such port.
+    """
     with suppress(OSError):
         return os.major(Path(path).stat().st_rdev) in PTS_MAJORS
     return False
@@ -78,6 +90,9 @@ def port_in_use_sentence(path: str, found: list[PortHolder]) -> str:
     Args:
         path: the port.
         found: the result of `holders` or `other_holders`.
+
+    Returns:
+        The end of a sentence, without a full stop.
     """
     others = [holder for holder in found if holder.pid != os.getpid()]
     if others:

@@ -64,13 +64,31 @@ class SerialPort(Protocol):
     timeout: Any
 
     @property
-    def in_waiting(self) -> int: ...
+    def in_waiting(self) -> int:
+        """Number of bytes that `read` returns without waiting."""
 
-    def read(self, size: int = ...) -> bytes: ...
+    def read(self, size: int = ...) -> bytes:
+        """Read received bytes.
 
-    def write(self, data: bytes, /) -> int | None: ...
+        Args:
+            size: largest number of bytes.
 
-    def close(self) -> None: ...
+        Returns:
+            The bytes; fewer than `size` if no more come within `timeout` seconds.
+        """
+
+    def write(self, data: bytes, /) -> int | None:
+        """Send bytes.
+
+        Args:
+            data: all of them are sent.
+
+        Returns:
+            Number of bytes sent.
+        """
+
+    def close(self) -> None:
+        """Release the port."""
 
 
 class LineLostError(DriverError):
@@ -91,7 +109,13 @@ class SerialLine:
         self._stale = stale
 
     def read(self, timeout_s: float) -> bytes:
-        """The received bytes, after a wait of at most `timeout_s` for the first; may be empty.
+        """Wait for bytes.
+
+        Args:
+            timeout_s: longest wait for the first byte, s.
+
+        Returns:
+            All received bytes; may be empty.
 
         Raises:
             LineLostError: the port is lost.
@@ -102,9 +126,18 @@ class SerialLine:
         return data
 
     def drain(self, steps: int) -> int:
-        """Remove unrequested bytes, in at most `steps` reads; returns their number.
+        """Remove unrequested bytes.
 
         They are logged separately, so that a replay does not take them for an answer.
+
+        Args:
+            steps: largest number of reads, for a line that sends without end.
+
+        Returns:
+            Number of bytes removed.
+
+        Raises:
+            LineLostError: the port is lost.
         """
         count = 0
         for _ in range(steps):
@@ -127,13 +160,21 @@ class SerialLine:
         return data
 
     def write(self, data: bytes) -> None:
-        """Send; LineLostError if the port is lost or accepts nothing for a second."""
+        """Send bytes.
+
+        Args:
+            data: all of them are sent.
+
+        Raises:
+            LineLostError: the port is lost or accepts nothing for WRITE_TIMEOUT_S.
+        """
         try:
             self._port.write(data)
         except (serial.SerialException, OSError, termios.error, TypeError) as error:
             raise LineLostError(_reason(error)) from error
 
     def close(self) -> None:
+        """Release the port; one that is lost may refuse."""
         # A lost port may refuse to close; there is nothing left to release.
         try:
             self._port.close()
@@ -147,10 +188,16 @@ PortOpener = Callable[[str, int, str], SerialPort]
 def open_serial_port(path: str, baudrate: int, parity: str) -> SerialPort:
     """Open a port exclusively, with 8 data bits and one stop bit; or a network address.
 
-    Addresses are tcp://host:port, udpin://host:port (listens; with ?from=ADDRESS to that sender
-    only) and udpout://host:port (sends first).
-
     A port that another program has open is refused, since each would receive a part of the bytes.
+
+    Args:
+        path: serial port; or tcp://host:port, udpin://host:port (listens; with ?from=ADDRESS to
+            that sender only), udpout://host:port (sends first).
+        baudrate: bit/s; not used for a network address.
+        parity: "N", "E" or "O"; not used for a network address.
+
+    Returns:
+        The open port; its reads wait up to READ_TIMEOUT_S until `timeout` is set.
 
     Raises:
         DeviceError: it cannot be opened or another program uses it; the message states the reason,
@@ -258,25 +305,58 @@ class SerialDevice(DeviceDriver):
 
     @abstractmethod
     def line_settings(self) -> tuple[int, str]:
-        """Baud rate and parity."""
+        """Settings of the line.
+
+        Returns:
+            Baud rate, bit/s, and parity, "N", "E" or "O".
+        """
 
     @abstractmethod
     def identify(self, line: SerialLine) -> Mapping[str, str]:
-        """Query the identity; DeviceError with the remedy if no suitable device answers."""
+        """Query the identity.
+
+        Args:
+            line: the open line.
+
+        Returns:
+            Text by name.
+
+        Raises:
+            DeviceError: no suitable device answers; the message contains the remedy.
+            LineLostError: the port is lost.
+        """
 
     @abstractmethod
     def step(self, line: SerialLine) -> Iterable[Sample]:
-        """Listen or send a request once, for a second at most; returns the decoded samples."""
+        """Listen or send a request once, for a second at most.
+
+        Args:
+            line: the open line.
+
+        Returns:
+            The samples that were decoded.
+
+        Raises:
+            LineLostError: the port is lost.
+        """
 
     def connected(self) -> None:
         """A port was opened: discard messages that are incomplete."""
 
     def is_identified(self) -> bool:
-        """Whether the messages are of the device itself, not of another one on its bus."""
+        """Whether the messages are of the device itself, not of another one on its bus.
+
+        Returns:
+            True unless a driver overrides it.
+        """
         return True
 
     def count_messages(self, *, messages: int = 1) -> None:
-        """Count messages that were decoded just now."""
+        """Count messages that were decoded just now.
+
+        Args:
+            messages: their number; 0 or less has no effect.
+        """
         if messages <= 0:
             return
         self.counters["messages"] += messages
@@ -292,7 +372,14 @@ class SerialDevice(DeviceDriver):
     # Interface of Device
 
     def bind(self) -> Mapping[str, str]:
-        """Open the port and query the identity. See `drivers.contract.Device`."""
+        """Open the port and query the identity. See `drivers.contract.Device`.
+
+        Returns:
+            The port, and what `identify` returns.
+
+        Raises:
+            DeviceError: the port cannot be opened or was lost, or no suitable device answers.
+        """
         if self._line is None:
             self._line = self._open()
         try:

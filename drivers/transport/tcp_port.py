@@ -34,7 +34,13 @@ class TcpPort:
         return len(self._buffer)
 
     def read(self, size: int = 1) -> bytes:
-        """At most `size` bytes; empty if none is received within `timeout` seconds.
+        """Read received bytes.
+
+        Args:
+            size: largest number of bytes.
+
+        Returns:
+            At most `size` bytes; empty if none is received within `timeout` seconds.
 
         Raises:
             OSError: the other end closed or the connection broke.
@@ -52,12 +58,23 @@ class TcpPort:
         return data
 
     def write(self, data: bytes, /) -> int:
-        """Send all bytes within a second; OSError if that fails."""
+        """Send all bytes within a second.
+
+        Args:
+            data: bytes to send.
+
+        Returns:
+            Number of bytes sent, all.
+
+        Raises:
+            OSError: the connection broke or accepts nothing.
+        """
         self._connection.settimeout(WRITE_TIMEOUT_S)
         self._connection.sendall(data)
         return len(data)
 
     def close(self) -> None:
+        """End the connection; a pending `read` raises OSError."""
         # The other end has reset the connection: there is nothing left to shut down.
         with contextlib.suppress(OSError):
             self._connection.shutdown(socket.SHUT_RDWR)
@@ -65,7 +82,13 @@ class TcpPort:
 
 
 def open_tcp_port(address: str) -> TcpPort:
-    """Connect to "tcp://host:port".
+    """Connect to an address.
+
+    Args:
+        address: "tcp://host:port".
+
+    Returns:
+        The connection, with TCP keep-alive.
 
     Raises:
         DeviceError: the address is wrong or does not answer; the message contains the remedy.
@@ -87,7 +110,13 @@ def open_tcp_port(address: str) -> TcpPort:
 
 
 def host_and_number(address: str) -> tuple[str, int] | None:
-    """Host and port number of "scheme://host:port"; None for any other text.
+    """Host and port number of an address.
+
+    Args:
+        address: "scheme://host:port".
+
+    Returns:
+        Host and port number; None for any other text.
 
     Example:
         >>> host_and_number("tcp://10.0.0.5:3001")

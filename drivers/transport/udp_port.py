@@ -56,7 +56,15 @@ class SenderFilter:
         return self._last
 
     def accepts(self, source: Address, mono_ns: int) -> bool:
-        """Whether a datagram from `source` is accepted; a rejected one is counted."""
+        """Whether a datagram is accepted; a rejected one is counted.
+
+        Args:
+            source: address and port of its sender.
+            mono_ns: its arrival on CLOCK_MONOTONIC, ns.
+
+        Returns:
+            True if it is of the accepted sender, or of any while none is known.
+        """
         is_restarted = mono_ns - self._last_ns >= PORT_CHANGE_TIMEOUT_S * 1e9
         is_same_port = self.port in (None, source[1]) or is_restarted
         if self.address not in (None, source[0]) or not is_same_port:
@@ -74,7 +82,11 @@ class SenderFilter:
             self.address, self.port = self._last
 
     def sentence(self) -> str:
-        """The number of dropped datagrams of other senders, and the remedy."""
+        """The number of dropped datagrams of other senders, and the remedy.
+
+        Returns:
+            The sentence, without a full stop.
+        """
         hint = (
             "correct ?from= in its port" if self.is_configured else "add ?from=ADDRESS to its port"
         )
@@ -112,7 +124,17 @@ class UdpPort:
         return len(self._buffer)
 
     def read(self, size: int = 1) -> bytes:
-        """At most `size` bytes; empty if none is received in `timeout` seconds; OSError: refused."""
+        """Read received bytes.
+
+        Args:
+            size: largest number of bytes; the rest of a datagram is returned by the next call.
+
+        Returns:
+            At most `size` bytes; empty if none is received within `timeout` seconds.
+
+        Raises:
+            OSError: the other end refused an earlier datagram (ICMP port unreachable).
+        """
         if not self._buffer:
             self._buffer = self._datagram()
         data, self._buffer = self._buffer[:size], self._buffer[size:]
@@ -133,17 +155,34 @@ class UdpPort:
                 return b""
 
     def write(self, data: bytes, /) -> int:
-        """Send one datagram; nothing is sent before a first datagram was received."""
+        """Send one datagram, on a listening port to the latest accepted sender.
+
+        Args:
+            data: bytes of the datagram.
+
+        Returns:
+            Number of bytes sent; 0 on a listening port that has received nothing yet.
+
+        Raises:
+            OSError: it could not be sent.
+        """
         if self.sender is None:
             return self._socket.send(data)
         return self._socket.sendto(data, self.sender.last) if self.sender.last else 0
 
     def close(self) -> None:
+        """Release the socket."""
         self._socket.close()
 
 
 def open_udp_port(address: str) -> UdpPort:
-    """Open "udpin://host:port", "udpin://host:port?from=ADDRESS" or "udpout://host:port".
+    """Open a UDP socket by the form of its address.
+
+    Args:
+        address: "udpin://host:port", "udpin://host:port?from=ADDRESS" or "udpout://host:port".
+
+    Returns:
+        The socket as a port.
 
     Raises:
         DeviceError: the address is wrong or in use; the message contains the remedy.

@@ -11,10 +11,15 @@ MAX_DELAY_NS: Final = 1_000_000_000
 
 
 def check_delays(name: str, delays_ns: Mapping[str, int], outputs: Collection[str]) -> None:
-    """Refuse delays by output, in ns from firing, that the trigger `name` cannot give.
+    """Refuse delays that a trigger cannot give.
+
+    Args:
+        name: name of the trigger, for the message.
+        delays_ns: delay from firing by output, ns; 0 to MAX_DELAY_NS.
+        outputs: outputs that the trigger has.
 
     Raises:
-        DeviceError: with all errors.
+        DeviceError: an output does not exist or a delay is out of range; with all errors.
     """
     wrong = [
         f"output {output!r} does not exist; the trigger has {', '.join(outputs)}"

@@ -26,15 +26,39 @@ MAX_STALE_ANSWERS: Final = 32
 class SocketLike(Protocol):
     """The used part of a `socket.socket`."""
 
-    def settimeout(self, value: float, /) -> None: ...
+    def settimeout(self, value: float, /) -> None:
+        """As of `socket.socket`.
 
-    def sendall(self, data: bytes, /) -> None: ...
+        Args:
+            value: longest wait of an operation, s.
+        """
 
-    def recv(self, size: int, /) -> bytes: ...
+    def sendall(self, data: bytes, /) -> None:
+        """As of `socket.socket`.
 
-    def shutdown(self, how: int, /) -> None: ...
+        Args:
+            data: bytes to send, all of them.
+        """
 
-    def close(self) -> None: ...
+    def recv(self, size: int, /) -> bytes:
+        """As of `socket.socket`.
+
+        Args:
+            size: largest number of bytes.
+
+        Returns:
+            Received bytes; empty if the other end closed the connection.
+        """
+
+    def shutdown(self, how: int, /) -> None:
+        """As of `socket.socket`.
+
+        Args:
+            how: direction, such as `socket.SHUT_RDWR`.
+        """
+
+    def close(self) -> None:
+        """Release the socket."""
 
 
 Connect = Callable[[str, int, float], SocketLike]
@@ -42,7 +66,19 @@ Connect = Callable[[str, int, float], SocketLike]
 
 
 def connect_tcp(host: str, port: int, timeout_s: float) -> SocketLike:
-    """A TCP connection that sends every line without delay (TCP_NODELAY)."""
+    """A TCP connection that sends every line without delay (TCP_NODELAY).
+
+    Args:
+        host: name or address of the unit.
+        port: TCP port.
+        timeout_s: longest wait for the connection, s.
+
+    Returns:
+        The connected socket.
+
+    Raises:
+        OSError: the unit does not answer.
+    """
     connection = socket.create_connection((host, port), timeout=timeout_s)
     connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     return connection
@@ -91,7 +127,14 @@ class PulseBusTrigger(Configured):
         )
 
     def bind(self) -> Mapping[str, str]:
-        """Connect; the unit's name, outputs and count. See `drivers.contract.Trigger`."""
+        """Connect. See `drivers.contract.Trigger`.
+
+        Returns:
+            The unit's name, address, outputs and count of pulses.
+
+        Raises:
+            DeviceError: no pulse bus of version 1 answers, or it is in use.
+        """
         with self._lock:
             self._connect()
             self._count = self._query_count()
@@ -103,7 +146,10 @@ class PulseBusTrigger(Configured):
             }
 
     def program(self, delays_ns: Mapping[str, int]) -> None:
-        """Set the delay of every output named, in ns from firing.
+        """Set the delay of every output named.
+
+        Args:
+            delays_ns: delay from firing by output, ns.
 
         Raises:
             DeviceError: unknown output, delay out of range, or no answer.
@@ -126,6 +172,12 @@ class PulseBusTrigger(Configured):
         The time is the middle of the round trip, its sigma half of it. If the answer is lost, the
         driver reconnects and compares the unit's count. If the unit has fired, the time is between
         the request and the time-out, and sigma is half of that interval.
+
+        Args:
+            sequence: number of the pulse, echoed by the unit.
+
+        Returns:
+            The pulse, with the unit's own count.
 
         Raises:
             DeviceError: no unit, refused, or no answer in time. If the count cannot be read either,
@@ -164,7 +216,11 @@ class PulseBusTrigger(Configured):
             self._disconnect()
 
     def statistics(self) -> Mapping[str, int]:
-        """pulses, failures, answers_lost (of pulses that were fired), opened, stale_answers."""
+        """Counters since creation.
+
+        Returns:
+            pulses, failures, answers_lost (of pulses that were fired), opened, stale_answers.
+        """
         return dict(self._counters)
 
     # The connection; the lock is held

@@ -54,19 +54,36 @@ class SoftwareTrigger(Configured):
         )
 
     def bind(self) -> Mapping[str, str]:
-        """The outputs and heads. See `drivers.contract.Trigger`."""
+        """Nothing is opened. See `drivers.contract.Trigger`.
+
+        Returns:
+            The outputs and the number of heads.
+        """
         return {"outputs": " ".join(self._delays_ns), "heads": str(len(self._heads))}
 
     def program(self, delays_ns: Mapping[str, int]) -> None:
-        """Set the delay of every output named, in ns from firing. DeviceError for a wrong one."""
+        """Set the delay of every output named.
+
+        Args:
+            delays_ns: delay from firing by output, ns.
+
+        Raises:
+            DeviceError: unknown output, or delay out of range.
+        """
         check_delays(self.name, delays_ns, self._delays_ns)
         self._delays_ns.update(delays_ns)
 
     def fire(self, sequence: int) -> TriggerPulse:
         """Trigger all heads; returns if at least one was triggered, and logs the failed ones.
 
+        Args:
+            sequence: number of the pulse.
+
+        Returns:
+            The pulse; `count` is the number of pulses since creation.
+
         Raises:
-            DeviceError: no head was triggered; one line per head.
+            DeviceError: no head was triggered (one line per head), or the trigger is closed.
         """
         if self._closing.is_set():
             raise DeviceError(f"{self.name}: the trigger is closed; create a new one")
@@ -105,7 +122,11 @@ class SoftwareTrigger(Configured):
         self._threads.shutdown(wait=False, cancel_futures=True)
 
     def statistics(self) -> Mapping[str, int]:
-        """pulses, failures (heads that were not triggered)."""
+        """Counters since creation.
+
+        Returns:
+            pulses, failures (heads that were not triggered).
+        """
         return dict(self._counters)
 
     def _fire_one(self, head: Head, delay_ns: int, start_ns: int) -> tuple[int, int]:

@@ -57,24 +57,48 @@ class KernelPps:
         self._fd = os.open(path, os.O_RDWR | os.O_CLOEXEC)
 
     def capabilities(self) -> int:
-        """The CAPTURE_* and CAN_* bits."""
+        """What the source can do (PPS_GETCAP).
+
+        Returns:
+            The CAPTURE_* and CAN_* bits.
+        """
         answer = bytearray(struct.pack("@i", 0))
         fcntl.ioctl(self._fd, GETCAP, answer)
         return int(struct.unpack("@i", answer)[0])
 
     def mode(self) -> int:
-        """The edges that are captured at present."""
+        """The edges that are captured at present (PPS_GETPARAMS).
+
+        Returns:
+            The CAPTURE_* bits.
+        """
         return int(self._params()[1])
 
     def set_mode(self, mode: int) -> None:
-        """Capture these edges; EPERM without CAP_SYS_TIME."""
+        """Capture these edges (PPS_SETPARAMS).
+
+        Args:
+            mode: CAPTURE_* bits.
+
+        Raises:
+            OSError: EPERM without CAP_SYS_TIME, EINVAL for a bit that the source does not have.
+        """
         params = self._params()
         fcntl.ioctl(self._fd, SETPARAMS, bytearray(PARAMS.pack(API_VERSION, mode, *params[2:])))
 
     def fetch(self, timeout_s: float) -> Edges | None:
-        """The edges after the next one was captured; None if none is captured in time.
+        """Wait for the next edge (PPS_FETCH).
 
         An edge before the call does not end the wait; `latest` returns it.
+
+        Args:
+            timeout_s: longest wait, s; with 0 the kernel returns at once.
+
+        Returns:
+            The last edges; None if none is captured in time.
+
+        Raises:
+            OSError: the source is lost.
         """
         seconds, nanoseconds = divmod(round(timeout_s * 1e9), 1_000_000_000)
         zeros = (0,) * 9
@@ -86,17 +110,29 @@ class KernelPps:
         return edges_of(bytes(data))
 
     def latest(self) -> Edges | None:
-        """The last edges, without waiting: with a time-out of 0, the kernel returns at once."""
+        """The last edges, without waiting: with a time-out of 0, the kernel returns at once.
+
+        Returns:
+            The last edges.
+
+        Raises:
+            OSError: the source is lost.
+        """
         return self.fetch(0.0)
 
     def is_there(self) -> bool:
-        """Whether the path still leads to this device; a wait for an edge does not report that."""
+        """Whether the path still leads to this device; a wait for an edge does not report that.
+
+        Returns:
+            False if the path is gone or leads to another device.
+        """
         try:
             return os.path.samestat(Path(self._path).stat(), os.fstat(self._fd))
         except FileNotFoundError:
             return False
 
     def close(self) -> None:
+        """Close the device; may be called twice."""
         fd, self._fd = self._fd, -1
         if fd >= 0:
             os.close(fd)
@@ -108,6 +144,15 @@ class KernelPps:
 
 
 def edges_of(data: bytes) -> Edges:
-    """The edges in a struct pps_fdata."""
+    """The edges in a struct pps_fdata.
+
+    Args:
+        data: its bytes, FDATA.size of them.
+
+    Returns:
+        Sequence numbers and times of the last edges.
+
+    Source: Linux, include/uapi/linux/pps.h.
+    """
     asserts, clears, a_s, a_ns, _, c_s, c_ns, *_ = FDATA.unpack(data)
     return Edges(asserts, clears, a_s * 1_000_000_000 + a_ns, c_s * 1_000_000_000 + c_ns)

@@ -31,28 +31,85 @@ MAX_EDGE_AGE_NS: Final = 2_000_000_000
 class PpsBackend(Protocol):
     """A source of edges."""
 
-    def capabilities(self) -> int: ...
+    def capabilities(self) -> int:
+        """What the source can do.
 
-    def mode(self) -> int: ...
+        Returns:
+            CAPTURE_* and CAN_* bits of `drivers.triggers.pps.binding`.
+        """
 
-    def set_mode(self, mode: int) -> None: ...
+    def mode(self) -> int:
+        """The edges that are captured at present.
 
-    def fetch(self, timeout_s: float) -> Edges | None: ...
+        Returns:
+            CAPTURE_* bits.
+        """
 
-    def latest(self) -> Edges | None: ...
+    def set_mode(self, mode: int) -> None:
+        """Capture these edges.
 
-    def is_there(self) -> bool: ...
+        Args:
+            mode: CAPTURE_* bits.
 
-    def close(self) -> None: ...
+        Raises:
+            OSError: not permitted or not possible.
+        """
+
+    def fetch(self, timeout_s: float) -> Edges | None:
+        """Wait for the next edge.
+
+        Args:
+            timeout_s: longest wait, s.
+
+        Returns:
+            The last edges; None if none is captured in time.
+
+        Raises:
+            OSError: the source is lost.
+        """
+
+    def latest(self) -> Edges | None:
+        """The last edges, without waiting.
+
+        Returns:
+            The last edges; None if the source does not remember them.
+
+        Raises:
+            OSError: the source is lost.
+        """
+
+    def is_there(self) -> bool:
+        """Whether the source still exists.
+
+        Returns:
+            False if it was removed or replaced.
+        """
+
+    def close(self) -> None:
+        """Release the source; may be called twice."""
 
 
 def open_source(device: str) -> PpsBackend:
-    """The kernel's device, or an emulated one if the name is tcp://host:port."""
+    """Open a source by its name.
+
+    Args:
+        device: path of a kernel device, or tcp://host:port of an emulated one.
+
+    Returns:
+        The open source.
+
+    Raises:
+        OSError: it does not exist or may not be opened.
+    """
     return EmulatedPps(device) if device.startswith(SCHEME) else KernelPps(device)
 
 
 def wall_clock() -> tuple[int, int]:
-    """CLOCK_MONOTONIC, and CLOCK_REALTIME minus CLOCK_MONOTONIC at about the same instant."""
+    """The host's wall clock relative to its monotonic clock, from the shortest of several readings.
+
+    Returns:
+        CLOCK_MONOTONIC, ns, and CLOCK_REALTIME minus CLOCK_MONOTONIC at about that instant, ns.
+    """
     best: tuple[int, int, int] | None = None
     for _ in range(OFFSET_ATTEMPTS):
         before = time.monotonic_ns()
@@ -125,7 +182,15 @@ class PpsDevice(DeviceDriver):
         self._last_wall: tuple[int, int] | None = None
 
     def bind(self) -> Mapping[str, str]:
-        """Open the source and wait for an edge. See `drivers.contract.Device`."""
+        """Open the source and wait for an edge. See `drivers.contract.Device`.
+
+        Returns:
+            device, edge, count and, where the kernel states it, source.
+
+        Raises:
+            DeviceError: the source cannot be opened, cannot capture the edge, or sends none within
+                `silence_s`.
+        """
         source = self._source = self._source or self._open()
         deadline_ns = self.clock.mono_ns() + round(self.silence_s * 1e9)
         while self.clock.mono_ns() < deadline_ns and not self._closing.is_set():
@@ -148,7 +213,15 @@ class PpsDevice(DeviceDriver):
         )
 
     def edge_of(self, edges: Edges) -> PpsEdge | None:
-        """An edge on the monotonic clock; None if it is not new or not valid."""
+        """An edge on the monotonic clock.
+
+        Args:
+            edges: last edges of the source, just fetched.
+
+        Returns:
+            The configured edge with its latency subtracted; None if it is not new, is older than
+            MAX_EDGE_AGE_NS, or the wall clock was set since the previous one.
+        """
         mono_ns, offset_ns = wall = self._wall()
         last, self._last_wall = self._last_wall, wall
         if last is not None:

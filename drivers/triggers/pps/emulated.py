@@ -27,18 +27,39 @@ class EmulatedPps:
         self._received = b""
 
     def capabilities(self) -> int:
+        """What the source can do.
+
+        Returns:
+            It captures assert edges, and a wait for them is possible.
+        """
         return CAPTURE_ASSERT | CAN_WAIT
 
     def mode(self) -> int:
+        """The edges that are captured at present.
+
+        Returns:
+            Assert edges, always.
+        """
         return CAPTURE_ASSERT
 
     def set_mode(self, mode: int) -> None:
-        """No effect: the source captures all its edges."""
+        """No effect: the source captures all its edges.
+
+        Args:
+            mode: not used.
+        """
 
     def fetch(self, timeout_s: float) -> Edges | None:
-        """The next edge, as from the kernel; None if none is received in time.
+        """The next edge, as from the kernel. Invalid lines are skipped.
 
-        Invalid lines are skipped.
+        Args:
+            timeout_s: longest wait, s.
+
+        Returns:
+            The edge as assert edge; None if none is received in time.
+
+        Raises:
+            OSError: the source closed the connection.
         """
         deadline = time.monotonic() + timeout_s
         while (left_s := deadline - time.monotonic()) > 0:
@@ -62,12 +83,21 @@ class EmulatedPps:
         return None
 
     def latest(self) -> Edges | None:
-        """None: edges are buffered until they are fetched."""
+        """Nothing: edges are buffered until they are fetched.
+
+        Returns:
+            None.
+        """
         return None
 
     def is_there(self) -> bool:
-        """True: `fetch` raises if the source closed the connection."""
+        """Whether the source exists; `fetch` raises if it closed the connection.
+
+        Returns:
+            True.
+        """
         return True
 
     def close(self) -> None:
+        """End the connection."""
         self._socket.close()
