@@ -16,7 +16,14 @@ from serial.tools import list_ports
 
 from drivers.contract import DeviceError
 from drivers.detection.protocol_detection import DetectedDevice, ProtocolDetector
-from drivers.thermometers.modbus_rtu.frames import find_reply, read_request
+from drivers.thermometers.modbus_rtu.frames import (
+    ILLEGAL_FUNCTION,
+    READ_HOLDING_REGISTERS,
+    READ_INPUT_REGISTERS,
+    Reply,
+    find_reply,
+    read_request,
+)
 from drivers.timescales.clock import Clock, MonotonicClock
 from drivers.transport.serial_device import LineLostError, PortOpener, SerialLine, open_serial_port
 
@@ -207,8 +214,14 @@ class _Search:
             line = SerialLine(port, lambda _: None)
             try:
                 for unit in MODBUS_UNITS:
-                    if self._modbus_unit_answers(line, unit):
-                        settings = {"unit": unit, "first_register": 0, "channels": ["0"]}
+                    kind = self._register_kind(line, unit)
+                    if kind is not None:
+                        settings = {
+                            "unit": unit,
+                            "register_kind": kind,
+                            "first_register": 0,
+                            "channels": ["0"],
+                        }
                         detected = DetectedDevice(
                             "thermometer",
                             "modbus-rtu",
@@ -225,12 +238,23 @@ class _Search:
                 line.close()
         return None
 
-    def _modbus_unit_answers(self, line: SerialLine, unit: int) -> bool:
-        line.write(read_request(unit, 0, 1))
+    def _register_kind(self, line: SerialLine, unit: int) -> str | None:
+        """The kind of registers that a Modbus unit has; None if it does not answer."""
+        reply = self._modbus_reply(line, unit, READ_INPUT_REGISTERS)
+        if reply is None:
+            return None
+        if reply.exception != ILLEGAL_FUNCTION:
+            return "input"
+        holding = self._modbus_reply(line, unit, READ_HOLDING_REGISTERS)
+        return "input" if holding is None or holding.exception == ILLEGAL_FUNCTION else "holding"
+
+    def _modbus_reply(self, line: SerialLine, unit: int, function: int) -> Reply | None:
+        line.write(read_request(unit, 0, 1, function))
         received = b""
         deadline_ns = self._clock.mono_ns() + round(MODBUS_ANSWER_S * 1e9)
         while (left_ns := deadline_ns - self._clock.mono_ns()) > 0:
             received += line.read(left_ns * 1e-9)
-            if find_reply(received, unit, 1) is not None:
-                return True
-        return False
+            reply = find_reply(received, unit, 1, function)
+            if reply is not None:
+                return reply
+        return None

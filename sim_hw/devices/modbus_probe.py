@@ -32,8 +32,9 @@ class ModbusProbe(LineDevice):
     """The module, from `start()` to `close()`; a host opens `port`.
 
     Register `first_register + i` is channel i in signed 0.1 degC, 0x7FFF where the channel gives
-    None: an open sensor. Functions 3 and 4 read the same registers. Requests for other slaves, and
-    damaged ones, are met with silence.
+    None: an open sensor. With `float_word_order` each channel has two registers with a 32-bit float
+    in degC, not a number for an open sensor; "little" sends the lower half first. Registers are read
+    by the `functions`, 3 and 4. Requests for other slaves, and damaged ones, are met with silence.
     """
 
     def __init__(
@@ -42,6 +43,8 @@ class ModbusProbe(LineDevice):
         unit: int = 1,
         first_register: int = 0,
         line: DeviceLine | None = None,
+        float_word_order: str = "",
+        functions: Sequence[int] = (READ_HOLDING_REGISTERS, READ_INPUT_REGISTERS),
     ) -> None:
         if not 1 <= unit <= 247:
             raise ValueError(f"unit is {unit}; a Modbus slave has an address from 1 to 247")
@@ -49,6 +52,8 @@ class ModbusProbe(LineDevice):
         self._channels = tuple(channels)
         self._unit = unit
         self._first_register = first_register
+        self._float_word_order = float_word_order
+        self._functions = tuple(functions)
         self._frame = b""
 
     def statistics(self) -> Mapping[str, int]:
@@ -66,7 +71,7 @@ class ModbusProbe(LineDevice):
             self.counts["other_slaves"] += 1
             return None
         self.counts["requests"] += 1
-        if function not in (READ_HOLDING_REGISTERS, READ_INPUT_REGISTERS):
+        if function not in self._functions:
             return self._exception(function, ILLEGAL_FUNCTION)
         if len(frame) != _REQUEST_BYTES:
             return self._exception(function, ILLEGAL_DATA_VALUE)
@@ -74,10 +79,21 @@ class ModbusProbe(LineDevice):
         if not 1 <= count <= _REGISTERS_MAX:
             return self._exception(function, ILLEGAL_DATA_VALUE)
         first = start - self._first_register
-        if first < 0 or first + count > len(self._channels):
+        words = 2 if self._float_word_order else 1
+        if first < 0 or first + count > words * len(self._channels):
             return self._exception(function, ILLEGAL_DATA_ADDRESS)
-        registers = [_register(channel()) for channel in self._channels[first : first + count]]
+        held = range(first // words, (first + count - 1) // words + 1)
+        registers = [word for number in held for word in self._words(self._channels[number]())]
+        registers = registers[first % words :][:count]
         return _framed(struct.pack(f">BBB{count}H", unit, function, 2 * count, *registers))
+
+    def _words(self, value_c: float | None) -> tuple[int, ...]:
+        if not self._float_word_order:
+            return (_register(value_c),)
+        upper, lower = struct.unpack(
+            ">HH", struct.pack(">f", math.nan if value_c is None else value_c)
+        )
+        return (upper, lower) if self._float_word_order == "big" else (lower, upper)
 
     def _exception(self, function: int, code: int) -> bytes:
         self.counts["exceptions"] += 1

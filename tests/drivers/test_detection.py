@@ -117,6 +117,7 @@ def test_every_device_is_found_with_its_protocol_and_its_speed() -> None:
             own = {key: value for key, value in section.items() if key not in ("name", "driver")}
             assert registry.problems(kind, section["driver"], own) == []
     assert by_kind["modbus"].detected.settings["unit"] == 2
+    assert by_kind["modbus"].detected.settings["register_kind"] == "input"
     assert by_kind["ascii"].detected.settings["channels"] == ["0", "1"]
 
 

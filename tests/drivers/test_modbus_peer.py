@@ -7,6 +7,7 @@ import threading
 from collections.abc import Iterator
 
 import pytest
+from pymodbus.client.mixin import ModbusClientMixin
 
 from drivers.contract import DeviceError, TemperatureSample
 from drivers.thermometers.modbus_rtu.thermometer import ModbusThermometer
@@ -20,6 +21,16 @@ pytestmark = pytest.mark.peer
 UNIT = 3
 REGISTERS = [215, 65484, 0x7FFF, 301]
 """From register 10: 21.5 degC, -5.2 degC, open, 30.1 degC."""
+FLOATS_C = [21.5, -5.25, 30.125]
+FLOAT_REGISTERS = [
+    register
+    for order in ("big", "little")
+    for value in FLOATS_C
+    for register in ModbusClientMixin.convert_to_registers(
+        value, ModbusClientMixin.DATATYPE.FLOAT32, word_order=order
+    )
+]
+"""From holding register 10 with the upper half first, from 16 with the lower half first."""
 
 
 @pytest.fixture
@@ -39,7 +50,8 @@ def line() -> Iterator[PtyLine]:
 def _serve(loop: asyncio.AbstractEventLoop, port: str, listening: threading.Event) -> None:
     async def serve() -> None:
         block = pymodbus_datastore.ModbusSequentialDataBlock(11, REGISTERS)
-        device = pymodbus_datastore.ModbusDeviceContext(ir=block)
+        floats = pymodbus_datastore.ModbusSequentialDataBlock(11, FLOAT_REGISTERS)
+        device = pymodbus_datastore.ModbusDeviceContext(ir=block, hr=floats)
         context = pymodbus_datastore.ModbusServerContext(devices={UNIT: device}, single=False)
         loop.call_later(0.2, listening.set)
         await pymodbus_server.StartAsyncSerialServer(context, port=port, baudrate=19200, parity="N")
@@ -91,6 +103,19 @@ def test_pymodbus_registers_come_out_as_degrees(line: PtyLine) -> None:
     samples = [(r.probe, r.value_c) for r in recorder.records if isinstance(r, TemperatureSample)]
     assert samples[:4] == [("0", 21.5), ("1", -5.2), ("2", None), ("G", 30.1)]
     assert thermometer.statistics()["bad_bytes"] == 0
+
+
+@pytest.mark.parametrize(("order", "first_register"), [("big", 10), ("little", 16)])
+def test_pymodbus_floats_in_holding_registers_come_out_as_degrees(
+    line: PtyLine, order: str, first_register: int
+) -> None:
+    thermometer = _thermometer(
+        line, register_kind="holding", value_type="float32", word_order=order, scale_c=1.0,
+        first_register=first_register, channels=["0", "1", "G"],
+    )  # fmt: skip
+    recorder = _run(thermometer, 3)
+    samples = [(r.probe, r.value_c) for r in recorder.records if isinstance(r, TemperatureSample)]
+    assert samples[:3] == list(zip(["0", "1", "G"], FLOATS_C, strict=True))
 
 
 def test_registers_that_pymodbus_does_not_have_are_an_exception_2(line: PtyLine) -> None:

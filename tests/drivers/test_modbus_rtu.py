@@ -106,7 +106,19 @@ def test_registers_are_signed_tenths_of_a_degree_in_the_order_of_the_channels() 
 def test_an_open_sensor_gives_a_sample_without_a_value() -> None:
     clock = FakeClock()
     recorder = _run(_thermometer(clock, _answers(reply(1, [0x7FFF, 0x8000, 1]))), 5)
-    assert _samples(recorder)[:3] == [("0", None), ("1", -3276.8), ("G", 0.1)]
+    assert _samples(recorder)[:2] == [("0", None), ("G", 0.1)]
+
+
+def test_a_number_that_is_no_temperature_is_reported_and_not_given() -> None:
+    clock = FakeClock()
+    thermometer = _thermometer(clock, _answers(reply(1, [215, 0x8000, 1])))
+    recorder = _run(thermometer, 8)
+    assert {probe for probe, _ in _samples(recorder)} == {"0", "G"}
+    (event,) = [event for event in recorder.events if event.name == "implausible"]
+    assert "Probe 1" in event.sentence and "-3276.8 degC" in event.sentence
+    assert thermometer.statistics()["implausible"] >= 2
+    found = _thermometer(clock, _answers(reply(1, [215, 0x8000, 1]))).bind()
+    assert found["probe 1"].startswith("-3276.8 degC is no temperature; check value_type")
 
 
 def test_it_reads_once_a_second() -> None:

@@ -1,6 +1,9 @@
-"""Modbus RTU frames of function 4, read input registers: bytes in, numbers out, no I/O.
+"""Modbus RTU frames that read registers: bytes in, numbers out, no I/O.
 
-Source: Modbus Application Protocol V1.1b3, sections 6.4 and 7; Modbus over Serial Line V1.02,
+Function 3 reads holding registers, function 4 input registers. The meaning of registers is in
+`drivers.thermometers.modbus_rtu.readings`.
+
+Source: Modbus Application Protocol V1.1b3, sections 6.3, 6.4 and 7; Modbus over Serial Line V1.02,
 section 2.5.1.
 """
 
@@ -10,11 +13,13 @@ import struct
 from dataclasses import dataclass
 from typing import Final
 
+READ_HOLDING_REGISTERS: Final = 3
 READ_INPUT_REGISTERS: Final = 4
+ILLEGAL_FUNCTION: Final = 1
 MAX_REGISTERS: Final = 125
 EXCEPTIONS: Final = {
-    1: "function 4 is not supported; the module is of another type",
-    2: "it has no such registers; check first_register and the number of channels",
+    1: "it does not have this kind of registers; change register_kind",
+    2: "it has no such registers; check first_register, register_kind and the number of channels",
     3: "it refuses the number of registers; configure fewer channels",
     4: "internal device failure; check the status lamp of the module",
     5: "the request is accepted and needs more time",
@@ -46,29 +51,53 @@ def crc16(data: bytes) -> int:
     return crc
 
 
-def read_request(unit: int, first_register: int, count: int) -> bytes:
-    """The request for `count` input registers.
+def read_request(
+    unit: int, first_register: int, count: int, function: int = READ_INPUT_REGISTERS
+) -> bytes:
+    """The request for consecutive registers.
+
+    Args:
+        unit: address of the module, 1 to 247.
+        first_register: address of the first register as sent, from 0.
+        count: number of registers, 1 to 125.
+        function: 3 for holding registers, 4 for input registers.
+
+    Returns:
+        The frame with its CRC.
 
     Example:
         >>> read_request(1, 0, 2).hex(" ")
         '01 04 00 00 00 02 71 cb'
+        >>> read_request(0x11, 0x6B, 3, READ_HOLDING_REGISTERS).hex(" ")
+        '11 03 00 6b 00 03 76 87'
     """
-    body = struct.pack(">BBHH", unit, READ_INPUT_REGISTERS, first_register, count)
+    body = struct.pack(">BBHH", unit, function, first_register, count)
     return body + struct.pack("<H", crc16(body))
 
 
-def find_reply(received: bytes, unit: int, count: int) -> Reply | None:
-    """The first complete and valid reply in the received bytes; None if there is none.
+def find_reply(
+    received: bytes, unit: int, count: int, function: int = READ_INPUT_REGISTERS
+) -> Reply | None:
+    """The first complete and valid reply in the received bytes.
 
     Noise before the reply, such as the echo of a two-wire line, is skipped.
+
+    Args:
+        received: bytes since the request.
+        unit: address of the module that was asked.
+        count: number of registers that were requested.
+        function: function of the request; a reply to another one is not taken.
+
+    Returns:
+        The reply; None if there is none yet.
     """
     for start in range(len(received) - 4):
         if received[start] != unit:
             continue
-        function = received[start + 1]
-        if function == READ_INPUT_REGISTERS | 0x80:
+        replied = received[start + 1]
+        if replied == function | 0x80:
             end = start + 5
-        elif function == READ_INPUT_REGISTERS and received[start + 2] == 2 * count:
+        elif replied == function and received[start + 2] == 2 * count:
             end = start + 5 + 2 * count
         else:
             continue
@@ -76,7 +105,7 @@ def find_reply(received: bytes, unit: int, count: int) -> Reply | None:
         if len(frame) < end - start or crc16(frame) != 0:
             continue
         skipped = len(received) - len(frame)
-        if function & 0x80:
+        if replied & 0x80:
             return Reply((), frame[2], skipped)
         return Reply(struct.unpack_from(f">{count}H", frame, 3), None, skipped)
     return None

@@ -1,6 +1,7 @@
 """Resistance thermometers behind a Modbus RTU module.
 
-The frames are in `drivers.thermometers.modbus_rtu.frames`; opening, reconnecting and counting in
+The frames are in `drivers.thermometers.modbus_rtu.frames`, the meaning of registers in
+`drivers.thermometers.modbus_rtu.readings`; opening, reconnecting and counting in
 `drivers.transport.serial_device`.
 """
 
@@ -14,13 +15,27 @@ from drivers.contract import DeviceError, TemperatureSample
 from drivers.thermometers.modbus_rtu.frames import (
     EXCEPTIONS,
     MAX_REGISTERS,
+    READ_HOLDING_REGISTERS,
+    READ_INPUT_REGISTERS,
     Reply,
     find_reply,
     read_request,
 )
-from drivers.transport.serial_device import READ_TIMEOUT_S, SerialDevice, SerialLine
+from drivers.thermometers.modbus_rtu.readings import (
+    WORDS,
+    ImplausibleReadingError,
+    ReadingFormat,
+)
+from drivers.timescales.clock import Clock
+from drivers.transport.serial_device import (
+    READ_TIMEOUT_S,
+    PortOpener,
+    SerialDevice,
+    SerialLine,
+    open_serial_port,
+)
 
-OPEN_SENSOR: Final = 0x7FFF
+FUNCTIONS: Final = {"input": READ_INPUT_REGISTERS, "holding": READ_HOLDING_REGISTERS}
 DRAIN_STEPS: Final = 50
 """Maximum number of reads before a request, for a line that sends without end."""
 
@@ -28,8 +43,10 @@ DRAIN_STEPS: Final = 50
 class ModbusThermometer(SerialDevice):
     """Resistance thermometers behind one Modbus RTU slave.
 
-    Reads one input register per channel, consecutive, signed, in units of 0.1 degC. The value
-    0x7FFF means an open sensor and yields a sample with `value_c=None`.
+    Reads consecutive registers, one or two per channel: 16 bit scaled, or 32-bit floats. An open
+    sensor (the register `open_sensor`, or a float that is not a number) yields a sample with
+    `value_c=None`. A number that is no temperature yields nothing and is reported. Floats yield
+    nothing until one has shown the word order: about one in eight is a temperature in both.
 
     Source: the module's register map; Modbus over Serial Line V1.02, section 2.5.1.
     """
@@ -40,7 +57,33 @@ class ModbusThermometer(SerialDevice):
     baudrate = Setting(19200, minimum=300, maximum=4_000_000, help="speed of the line, bit/s")
     parity = Setting("E", choices=("N", "E", "O"), help="parity on the wire")
     unit = Setting(1, minimum=1, maximum=247, help="unit identifier of the module")
-    first_register = Setting(0, minimum=0, maximum=65535, help="address of the first channel")
+    register_kind = Setting(
+        "input", choices=tuple(FUNCTIONS), help="registers to read: function 4 or function 3"
+    )
+    first_register = Setting(
+        0,
+        minimum=0,
+        maximum=65535,
+        help="address of the first channel as sent, from 0 (30001 and 40001 of a manual are 0)",
+    )
+    value_type = Setting("int16", choices=tuple(WORDS), help="type of a channel's value")
+    word_order = Setting(
+        "big",
+        choices=("big", "little"),
+        help="big: the first register of a float is its upper half",
+    )
+    scale_c = Setting(
+        0.1,
+        minimum=1e-4,
+        maximum=100,
+        help="degC per unit of the value; floats are mostly in degC: 1",
+    )
+    offset_c = Setting(
+        0.0, minimum=-1000, maximum=1000, help="degC of the value 0; -273.15 if it is in kelvin"
+    )
+    open_sensor = Setting(
+        0x7FFF, minimum=0, maximum=0xFFFF, help="16-bit register that means an open sensor"
+    )
     channels: Setting[tuple[str, ...]] = Setting(
         (),
         required=True,
@@ -51,7 +94,23 @@ class ModbusThermometer(SerialDevice):
     interval_s = Setting(1.0, minimum=0.05, maximum=3600, help="time from reading to reading")
     answer_timeout_s = Setting(0.5, minimum=0.01, maximum=1, help="longest wait for an answer")
 
-    _next_poll_ns = 0
+    def __init__(
+        self,
+        name: str,
+        settings: Mapping[str, object],
+        *,
+        clock: Clock | None = None,
+        open_port: PortOpener = open_serial_port,
+    ) -> None:
+        super().__init__(name, settings, clock=clock, open_port=open_port)
+        self._next_poll_ns = 0
+        self._format = ReadingFormat(
+            self.value_type, self.word_order, self.scale_c, self.offset_c, self.open_sensor
+        )
+        self._function = FUNCTIONS[self.register_kind]
+        self._count = len(self.channels) * self._format.words
+        self._is_word_order_confirmed = self.value_type != "float32"
+        self.counters.update(implausible=0, unconfirmed=0)
 
     @classmethod
     def setting_conflicts(cls, values: Mapping[str, Any]) -> list[str]:
@@ -60,11 +119,16 @@ class ModbusThermometer(SerialDevice):
         twice = sorted({name for name in channels if channels.count(name) > 1})
         if twice:
             found.append(f"channels names {', '.join(twice)} twice; every probe has its own name")
-        last = values["first_register"] + len(channels) - 1
-        if last > 65535:
+        count = len(channels) * WORDS[values["value_type"]]
+        if count > MAX_REGISTERS:
+            found.append(
+                f"channels has {len(channels)} names; at most "
+                f"{MAX_REGISTERS // WORDS[values['value_type']]} of {values['value_type']}"
+            )
+        if values["first_register"] + count > 65536:
             found.append(
                 f"first_register is {values['first_register']}; with {len(channels)} channels at "
-                f"most {65536 - len(channels)}"
+                f"most {65536 - count}"
             )
         if values["silence_s"] < values["interval_s"] + values["answer_timeout_s"]:
             found.append(
@@ -88,8 +152,12 @@ class ModbusThermometer(SerialDevice):
         if reply.exception is not None:
             raise DeviceError(f"{self.name}: {self._exception(reply.exception)}")
         found = {"unit": str(self.unit)}
-        for probe, register in zip(self.channels, reply.registers, strict=True):
-            value_c = _celsius(register)
+        for probe, registers in self._by_probe(reply):
+            try:
+                value_c = self._format.temperature_c(registers)
+            except ImplausibleReadingError as error:
+                found[f"probe {probe}"] = f"{error}; check value_type, word_order and scale_c"
+                continue
             found[f"probe {probe}"] = "open" if value_c is None else f"{value_c:.1f} degC"
         return found
 
@@ -111,20 +179,55 @@ class ModbusThermometer(SerialDevice):
             self.emitter.emit_throttled("exception", self._exception(reply.exception))
             return []
         now_ns = self.clock.mono_ns()
-        return [
-            TemperatureSample(probe, _celsius(register), now_ns)
-            for probe, register in zip(self.channels, reply.registers, strict=True)
-        ]
+        if not self._confirm_word_order(reply):
+            return []
+        samples = []
+        for probe, registers in self._by_probe(reply):
+            try:
+                samples.append(
+                    TemperatureSample(probe, self._format.temperature_c(registers), now_ns)
+                )
+            except ImplausibleReadingError as error:
+                self.counters["implausible"] += 1
+                self.emitter.emit_throttled(
+                    "implausible",
+                    f"Probe {probe} of the thermometer {self.name} reads {error.value_c:g} degC, "
+                    "which is no temperature. Check value_type, word_order, scale_c and the probe.",
+                )
+        return samples
+
+    def _confirm_word_order(self, reply: Reply) -> bool:
+        """Whether the floats of a module are temperatures in the configured word order only."""
+        if self.value_type != "float32":
+            return True
+        evidence = sum(
+            self._format.word_order_evidence(registers) for _, registers in self._by_probe(reply)
+        )
+        if evidence:
+            self._is_word_order_confirmed = evidence > 0
+        if not self._is_word_order_confirmed:
+            self.counters["unconfirmed"] += len(self.channels)
+            self.emitter.emit_throttled(
+                "word-order",
+                f"The readings of the thermometer {self.name} are no temperatures in the word order "
+                f'"{self.word_order}" and are left out. Check word_order, scale_c and first_register.',
+            )
+        return self._is_word_order_confirmed
+
+    def _by_probe(self, reply: Reply) -> Iterable[tuple[str, tuple[int, ...]]]:
+        words = self._format.words
+        for number, probe in enumerate(self.channels):
+            yield probe, reply.registers[number * words : (number + 1) * words]
 
     def _read_registers(self, line: SerialLine) -> Reply | None:
         """Send one request; None if no valid reply came in time."""
         self.counters["bad_bytes"] += line.drain(DRAIN_STEPS)
-        line.write(read_request(self.unit, self.first_register, len(self.channels)))
+        line.write(read_request(self.unit, self.first_register, self._count, self._function))
         received = b""
         deadline_ns = self.clock.mono_ns() + round(self.answer_timeout_s * 1e9)
         while (left_ns := deadline_ns - self.clock.mono_ns()) > 0 and not self._closing.is_set():
             received += line.read(min(left_ns * 1e-9, READ_TIMEOUT_S))
-            reply = find_reply(received, self.unit, len(self.channels))
+            reply = find_reply(received, self.unit, self._count, self._function)
             if reply is not None:
                 self.counters["bad_bytes"] += reply.skipped
                 self.count_messages()
@@ -144,12 +247,6 @@ class ModbusThermometer(SerialDevice):
         meaning = EXCEPTIONS.get(code, "an exception that the standard does not define")
         return (
             f"The thermometer {self.name}, unit {self.unit} at {self.port}, refuses registers "
-            f"{self.first_register} to {self.first_register + len(self.channels) - 1} with "
+            f"{self.first_register} to {self.first_register + self._count - 1} with "
             f"exception {code}: {meaning}."
         )
-
-
-def _celsius(register: int) -> float | None:
-    if register == OPEN_SENSOR:
-        return None
-    return (register - 0x10000 if register & 0x8000 else register) / 10

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import select
 import struct
@@ -12,6 +13,7 @@ from collections.abc import Iterator
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pymodbus.client.mixin import ModbusClientMixin
 
 from sim_hw.devices.modbus_probe import ModbusProbe, crc16
 
@@ -54,6 +56,33 @@ def test_channels_are_tenths_of_a_degree_and_an_open_sensor_is_7fff(function: in
     assert answer[:3] == bytes((3, function, 12))
     assert struct.unpack(">6H", answer[3:15]) == REGISTERS
     assert crc16(answer) == 0
+
+
+@pytest.mark.parametrize("order", ["big", "little"])
+def test_floats_are_those_of_pymodbus_in_both_word_orders(order: str) -> None:
+    channels = [lambda value=value: value for value in TEMPERATURES_C]
+    floats = ModbusProbe(channels, unit=3, float_word_order=order)
+    answer = floats.answer(request(0, 12, function=3))
+    assert answer is not None
+    registers = list(struct.unpack(">12H", answer[3:27]))
+    kind = ModbusClientMixin.DATATYPE.FLOAT32
+    for number, value_c in enumerate(TEMPERATURES_C):
+        read = ModbusClientMixin.convert_from_registers(
+            registers[2 * number : 2 * number + 2], kind, word_order=order
+        )
+        if value_c is None:
+            assert math.isnan(read)
+        else:
+            assert read == pytest.approx(value_c, abs=1e-5)
+    odd = floats.answer(request(1, 2, function=3))
+    assert odd is not None
+    assert list(struct.unpack(">2H", odd[3:7])) == registers[1:3]
+
+
+def test_a_module_with_holding_registers_only_refuses_function_4() -> None:
+    holding = ModbusProbe([lambda: 21.5], unit=3, functions=(3,))
+    assert holding.answer(request(0, 1)) == framed(3, 0x84, 1)
+    assert holding.answer(request(0, 1, function=3)) == framed(3, 3, 2, 0, 215)
 
 
 def test_part_of_the_channels_may_be_read() -> None:
