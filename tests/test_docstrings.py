@@ -19,6 +19,7 @@ COMPLETE: tuple[str, ...] = (
     "processing/errors.py",
     "processing/image",
     "processing/matching",
+    "processing/mosaic",
 )
 """Packages whose docstrings are complete."""
 

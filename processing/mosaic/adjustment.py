@@ -55,7 +55,15 @@ class ConstrainedSolution:
 
 
 def normal_equations(blocks: Sequence[ObservationBlock], unknowns: int) -> tuple[Array, Array]:
-    """Normal matrix (u, u) and right-hand side (u,) of all blocks."""
+    """Normal equations of all blocks.
+
+    Args:
+        blocks: observation equations.
+        unknowns: number u of all unknowns.
+
+    Returns:
+        Normal matrix (u, u) and right-hand side (u,).
+    """
     normal = np.zeros((unknowns, unknowns))
     right = np.zeros(unknowns)
     for block in blocks:
@@ -79,8 +87,8 @@ def solve(
 ) -> ConstrainedSolution:
     """Solve the normal equations, bordered with constraints @ dp = misclosure.
 
-    Unknowns must have one scale. Directions with less information (eigenvalue of the normal
-    matrix, constraints included) than `min_information` count as undetermined: these alone get a
+    Unknowns must have one scale. Directions with less information (eigenvalue of the normal matrix,
+    constraints included) than `min_information` count as undetermined: these alone get a
     pseudo-observation of that information that draws them to `fixed_at` (as a correction dp).
 
     Args:
@@ -91,8 +99,14 @@ def solve(
         fixed_at: (u,).
         min_information: in units of the normal matrix.
 
+    Returns:
+        Corrections, cofactor, ranks and undetermined directions.
+
     Raises:
         ValueError: constraints that depend on each other.
+
+    Source: docs/explanation/mathematics/mosaicking.md#datum-by-inner-constraints and
+        #undetermined-directions.
     """
     unknowns, conditions = len(right), len(constraints)
     rows = constraints / np.linalg.norm(constraints, axis=1, keepdims=True)
@@ -126,7 +140,15 @@ def solve(
 
 
 def redundancy_numbers(block: ObservationBlock, cofactor: Array) -> Array:
-    """r_i = 1 - p_i a_i Q a_i' of each observation of a block, weightless ones too (r_i = 1)."""
+    """r_i = 1 - p_i a_i Q a_i' of each observation of a block, weightless ones too (r_i = 1).
+
+    Args:
+        block: m observation equations.
+        cofactor: Q, (u, u), of unit weight.
+
+    Returns:
+        (m,), 0 to 1.
+    """
     q = cofactor[np.ix_(block.columns, block.columns)]
     numbers = np.empty(len(block.weight))
     for part in _parts(block):

@@ -62,7 +62,17 @@ def weakly_determined_sensors(
     *,
     settings: SupportSettings | None = None,
 ) -> tuple[str, ...]:
-    """PAN sensors of those `present` that tie points alone do not place well enough."""
+    """PAN sensors that tie points alone do not place well enough.
+
+    Args:
+        rig: the camera.
+        mosaic: adjusted by tie points alone.
+        present: sensors with a frame; the others are not looked at.
+        settings: None takes the defaults.
+
+    Returns:
+        Names of sensors in the order of the rig.
+    """
     settings = settings or SupportSettings()
     weak = []
     for cone in rig.pan_cones:
@@ -80,11 +90,20 @@ def weakly_determined_sensors(
 def contradicted_colour(
     rig: Rig, tie_points: TiePoints, mosaic: Mosaic, validity: Validity
 ) -> NDArray[np.bool_]:
-    """Which tie points (n,) are P/C points that may put a sensor where it is not.
+    """Mark P/C points that may put a sensor where it is not.
 
     Those of a sensor found off its calibrated place that P/P points do not hold on every side. A
     cloud under the camera is nearer than the ground, and the colour master is next to the PAN
     cones: all P/C points of a sensor that sees the cloud have a common error, and hide P/P points.
+
+    Args:
+        rig: the camera.
+        tie_points: n points, those `mosaic` is of.
+        mosaic: adjusted by tie points alone.
+        validity: test of that mosaic.
+
+    Returns:
+        True for such points, (n,).
     """
     affected = {
         h.sensor for h in (validity.displaced, validity.insignificant_displacement) if h is not None

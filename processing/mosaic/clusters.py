@@ -44,8 +44,8 @@ def clustered_cofactor(
     """The cofactor of unknowns whose observations are not independent: Q + sum (k - 1) Q N_c Q.
 
     N_c are the normal equations of a class of points, k how many times larger than for independent
-    points the variance of sums over neighbours is, one at least. Cells of a few points determine it from
-    one exposure; unknowns are sums over whole sensors, and to these it is carried on.
+    points the variance of sums over neighbours is, one at least. Cells of a few points determine it
+    from one exposure; unknowns are sums over whole sensors, and to these it is carried on.
 
     Args:
         groups: the points, with the residuals of the last adjustment.
@@ -54,6 +54,9 @@ def clustered_cofactor(
         scale: (groups,) factor of its class on the sigmas of a group.
         sigma0: of that adjustment.
         pitch_mm: of the pixels; those of colour heads are as large.
+
+    Returns:
+        (u, u), Q itself where no class has correlated errors.
     """
     reach_mm = {PAN_TO_COLOUR: _REACH_PX * pitch_mm}
     result = cofactor

@@ -28,14 +28,28 @@ class DatumConstraint:
 
 
 def datum_candidates(rig: Rig) -> tuple[Sensor, ...]:
-    """The sensors a datum may rest on: the master's, or of all PAN heads where there is none."""
+    """The sensors a datum may rest on.
+
+    Args:
+        rig: the camera.
+
+    Returns:
+        The master's sensors, or those of all PAN heads where there is no master.
+    """
     if rig.master_cone is not None:
         return rig.master_sensors
     return tuple(sensor for cone in rig.pan_cones for sensor in cone.sensors)
 
 
 def mounting_constraints(cones: Collection[str]) -> list[DatumConstraint]:
-    """The mean turn of the heads against their construction is zero, about each axis."""
+    """The mean turn of the heads against their construction is zero, about each axis.
+
+    Args:
+        cones: heads with free mountings.
+
+    Returns:
+        Three constraints; none without heads.
+    """
     if not cones:
         return []
     return [DatumConstraint({f"{cone}.{axis}": 1.0 for cone in cones}) for axis in ROTATION_NAMES]
@@ -48,6 +62,13 @@ def datum_constraints(
 
     One sensor alone gives neither scale nor rotation by its place: its own are held instead. The
     lever arms count from the sensors' mean, which with eq. 6a comes to the same.
+
+    Args:
+        start: placements by calibration + TDM, by sensor name.
+        sensors: the sensors the datum rests on.
+
+    Returns:
+        Four constraints; none without sensors.
     """
     if not sensors:
         return []
@@ -67,5 +88,12 @@ def datum_constraints(
 
 
 def layer_constraints(sensors: Sequence[str]) -> list[DatumConstraint]:
-    """Eq. 6a, 7a, 7b over the sensors of one other cone: they separate S from P."""
+    """Eq. 6a, 7a, 7b over the sensors of one other cone: they separate S from P.
+
+    Args:
+        sensors: all of the cone that are adjusted.
+
+    Returns:
+        Four constraints.
+    """
     return [DatumConstraint({f"{name}.{what}": 1.0 for name in sensors}) for what in _SIMILARITY]

@@ -83,6 +83,11 @@ def estimate_dc(
         measured: those of them that were read and not bridged; None is all.
         displaced: sensors left out, whose place carries no information on temperature.
         settings: None takes the defaults.
+
+    Returns:
+        One estimate for each such cone, in the order of the rig.
+
+    Source: docs/explanation/mathematics/drift.md#estimated-dc.
     """
     settings = settings or EstimateSettings()
     return tuple(
@@ -101,7 +106,14 @@ def estimate_dc(
 
 
 def combined_dc(estimates: Sequence[EstimatedDc]) -> tuple[float, float] | None:
-    """Weighted mean of the cones' estimates and its standard deviation, K; None where none is."""
+    """Weighted mean of the cones' estimates.
+
+    Args:
+        estimates: from `estimate_dc`.
+
+    Returns:
+        dC and its standard deviation, K; None where no cone has an estimate.
+    """
     known = [
         (e.estimated_k, e.sigma_k)
         for e in estimates
@@ -114,7 +126,14 @@ def combined_dc(estimates: Sequence[EstimatedDc]) -> tuple[float, float] | None:
 
 
 def estimated_dc_figures(estimates: Sequence[EstimatedDc]) -> EstimatedDcFigures:
-    """dC by stitching over all cones with an estimate, and the cones whose probes disagree."""
+    """dC by stitching in figures of the quality report.
+
+    Args:
+        estimates: from `estimate_dc`.
+
+    Returns:
+        dC over all cones with an estimate, and the cones whose probes disagree.
+    """
     combined = combined_dc(estimates)
     return EstimatedDcFigures(
         dc_estimated_k=None if combined is None else combined[0],
@@ -124,9 +143,13 @@ def estimated_dc_figures(estimates: Sequence[EstimatedDc]) -> EstimatedDcFigures
 
 
 def expansion_rate(sensors: Sequence[Sensor]) -> tuple[float, float]:
-    """Expansion of the constellation relative to its sensors by the rig file, and its sigma, ppm/K.
+    """Expansion of the constellation relative to its sensors by the rig file.
 
-    The sigma is that of the drift coefficients (`sigma_um_per_k`).
+    Args:
+        sensors: of one cone, two at least.
+
+    Returns:
+        The rate, and its sigma by that of the drift coefficients (`sigma_um_per_k`), ppm/K.
     """
     lever = _levers(sensors)
     moved = np.array([[s.drift.x_um_per_k, s.drift.y_um_per_k] for s in sensors])

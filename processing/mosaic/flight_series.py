@@ -29,11 +29,11 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class ConeContrasts:
-    """Contrasts (c, n) of what records call `names` (n,), and what is known of them.
+    """Contrasts (c, n) of what records call `names` (n,), and what is known of them, px and ppm.
 
-    `moved` (c, 2 m) is what a px of each sensor's x and y makes of them, `thermal_design` (c,) what a
-    kelvin, by probe; `place`, `drift` (c, c) are covariances of what calibration leaves, and of
-    what coefficients leave of a kelvin.
+    `displacement` (c, 2 m) is what a px of each sensor's x and y makes of them, `thermal_design`
+    (c,) what a kelvin, by probe; `place`, `drift` (c, c) are covariances of what calibration
+    leaves, and of what coefficients leave of a kelvin.
     """
 
     sensors: tuple[Sensor, ...]
@@ -60,11 +60,29 @@ class ContrastSeries:
 
 
 def is_master(rig: Rig, cone: Cone) -> bool:
+    """Whether a cone is the rig's master cone.
+
+    Args:
+        rig: the camera.
+        cone: one of its cones.
+
+    Returns:
+        False for all cones of a rig without a master.
+    """
     return cone.name == rig.master_cone
 
 
 def contrasts_of(rig: Rig, cone: Cone, *, quantities: Sequence[str] = POSITION) -> ConeContrasts:
-    """The master's sensors up to a common similarity, two sensors of others by difference."""
+    """The master's sensors up to a common similarity, two sensors of others by difference.
+
+    Args:
+        rig: the camera.
+        cone: a PAN cone of two sensors or more, three of the master.
+        quantities: `POSITION` or, of the master, `POSITION_AND_SCALE`.
+
+    Returns:
+        Contrasts of the records' values, and their covariances.
+    """
     relative = not is_master(rig, cone)
     sensors = cone.sensors[:2] if relative else cone.sensors
     pitch_um = sensors[0].pitch_um if rig.virtual_image is None else rig.virtual_image.pitch_um
@@ -120,7 +138,16 @@ def _of_layer(sensors: Sequence[Sensor], own: Sequence[bool]) -> Array:
 
 
 def series_of(rig: Rig, view: ConeContrasts, records: Mapping[int, StitchRecord]) -> ContrastSeries:
-    """The exposures with all of the contrasts' sensors, with the rig's own calibration."""
+    """The exposures with all of the contrasts' sensors, with the rig's own calibration.
+
+    Args:
+        rig: the camera, as calibrated.
+        view: contrasts of one cone.
+        records: by number of the exposure.
+
+    Returns:
+        Contrasts by exposure, in the order of their numbers.
+    """
     numbers, y, covariance, dc = [], [], [], []
     for number in sorted(records):
         record = records[number]
@@ -141,7 +168,16 @@ def series_of(rig: Rig, view: ConeContrasts, records: Mapping[int, StitchRecord]
 
 
 def variance_factor(series: ContrastSeries) -> float:
-    """Variance of differences between neighbouring exposures over that of their covariance; >= 1."""
+    """Variance of differences between neighbouring exposures over that of their covariance.
+
+    Args:
+        series: contrasts of one cone.
+
+    Returns:
+        At least 1; 1 for less than four exposures.
+
+    Source: docs/explanation/mathematics/validity.md#over-a-flight.
+    """
     size = series.y.shape[1]
     if len(series.numbers) < 4:
         return 1.0
@@ -152,7 +188,18 @@ def variance_factor(series: ContrastSeries) -> float:
 
 
 def probe_bias_series(view: ConeContrasts, series: ContrastSeries, probe: str) -> Array:
-    """Bias of a probe in each exposure (t,), K, from places and scales."""
+    """Bias of a probe in each exposure, from places and scales.
+
+    Args:
+        view: contrasts of positions and scales.
+        series: those contrasts by exposure.
+        probe: name of a probe of the cone.
+
+    Returns:
+        How much too large the probe reads, (t,), K.
+
+    Source: docs/explanation/mathematics/validity.md#probe-that-misreads.
+    """
     design = -view.thermal_design[probe]
     weight = np.linalg.inv(series.covariance + view.place)
     normal_vector = np.einsum("i,tij,tj->t", design, weight, series.y)
@@ -162,7 +209,18 @@ def probe_bias_series(view: ConeContrasts, series: ContrastSeries, probe: str) -
 def with_probe_ignored(
     view: ConeContrasts, series: ContrastSeries, probe: str, *, bias_k: Array, sigma_k: float
 ) -> ContrastSeries:
-    """The series where a probe's readings, found `bias_k` (t,) too large, count for nothing."""
+    """The series where a probe's readings count for nothing.
+
+    Args:
+        view: contrasts of one cone.
+        series: those contrasts by exposure.
+        probe: name of the probe.
+        bias_k: how much too large it reads, (t,), K.
+        sigma_k: standard deviation of the temperature without it, K.
+
+    Returns:
+        The series with the bias taken out of dC, and a larger covariance.
+    """
     thermal_design = view.thermal_design[probe]
     share = sum(s.probe == probe for s in view.sensors) / len(view.sensors)
     return replace(

@@ -90,6 +90,7 @@ class FlightDisplacement:
 
     @property
     def length_px(self) -> float:
+        """Length of the displacement, PAN px."""
         return math.hypot(self.dx_px, self.dy_px)
 
     @property
@@ -149,6 +150,11 @@ def evaluate_flight(
         rig: the camera, as calibrated.
         records: by number of the exposure; those of other calibrations are skipped.
         settings: None takes the defaults.
+
+    Returns:
+        Displacements cone by cone, the exposures used and those left out as outliers.
+
+    Source: docs/explanation/mathematics/validity.md#over-a-flight.
     """
     settings = settings or FlightSettings()
     evaluated = [c for c in rig.pan_cones if len(c.sensors) >= (3 if is_master(rig, c) else 2)]

@@ -113,14 +113,29 @@ class Mosaic:
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
+        """Names of the unknowns, (u,), in the order of `values`."""
         return self.model.names
 
     def value(self, name: str) -> float:
-        """The correction of one unknown by name, such as `SU00.x` (mm)."""
+        """The correction of one unknown.
+
+        Args:
+            name: such as `SU00.x`.
+
+        Returns:
+            The correction in the unknown's own unit (see `MosaicModel`), such as mm.
+        """
         return float(self.values[self.model.names.index(name)])
 
     def sigma(self, name: str) -> float:
-        """The standard deviation of one unknown by name."""
+        """The standard deviation of one unknown.
+
+        Args:
+            name: such as `SU00.x`.
+
+        Returns:
+            A posteriori, in the unknown's own unit.
+        """
         i = self.model.names.index(name)
         return math.sqrt(max(float(self.covariance[i, i]), 0.0))
 
@@ -215,12 +230,28 @@ def adjust_mosaic(
     Each round linearises (but after a step too small to matter), weighs (a soft weight while the
     model is still far off, then points whose normalised residual exceeds `outlier_limit` are left
     out), solves, and estimates what the two classes of points are worth, until corrections and
-    outliers come to rest. From `begin` on, an adjustment of the same points and unknowns, nothing
-    needs a first look or soft weights.
+    outliers come to rest.
 
-    `prior` (u, u) is information that draws the unknowns to their start, in the inverse square of
-    `MosaicModel.units` and of a weight like that of the points. With it nothing else is held: what
-    is known of every unknown is in it, and is not to be taken for better known.
+    Args:
+        rig: the camera.
+        start: placements by calibration + TDM, by sensor name.
+        tie_points: matched points.
+        model: the unknowns.
+        constraints: the datum.
+        settings: a-priori accuracy and limits.
+        method: name of the method, for the result.
+        datum_sensors: names of the sensors the datum rests on, for the result.
+        kinds: classes of tie points that take part, `PAN_TO_PAN` or `PAN_TO_COLOUR`.
+        begin: an adjustment of the same points and unknowns to go on from, without a first look or
+            soft weights.
+        prior: information (u, u) that draws the unknowns to their start, in the inverse square of
+            `MosaicModel.units` and of a weight like that of the points. With it nothing else is
+            held: what is known of every unknown is in it, and is not to be taken for better known.
+
+    Returns:
+        The mosaic.
+
+    Source: docs/explanation/mathematics/mosaicking.md#observation-equations and #weights.
     """
     groups = groups_of(rig, start, tie_points, settings, kinds)
     for group in groups:
@@ -401,9 +432,19 @@ def _named(model: MosaicModel, undetermined: Array) -> tuple[str, ...]:
 
 
 def vip_precision_px(mosaic: Mosaic, sensor: str, colrow: Array) -> Array:
-    """Standard deviation of where raw pixels (n, 2) fall, (n, 2) px, by the tie points alone.
+    """Standard deviation of where raw pixels fall, by the tie points alone.
 
     It holds in the mosaic's datum; calibration and TDM are not part of it.
+
+    Args:
+        mosaic: the adjustment.
+        sensor: name of the sensor.
+        colrow: raw column and row, (n, 2).
+
+    Returns:
+        x and y in the virtual image, (n, 2), px.
+
+    Source: docs/explanation/mathematics/mosaicking.md#accuracy.
     """
     start = mosaic.start[sensor]
     _, columns, design = vip_and_design(

@@ -49,12 +49,28 @@ class HeldPart:
     layers: Mapping[str, Array] = field(default_factory=dict)
 
     def times(self, factor: float) -> HeldPart:
-        """The pattern, so many times as large."""
+        """The pattern, so many times as large.
+
+        Args:
+            factor: without unit, any sign.
+
+        Returns:
+            A copy, scaled.
+        """
         layers = {cone: layer * factor for cone, layer in self.layers.items()}
         return HeldPart(self.unknowns * factor, layers)
 
     def at(self, mosaic: Mosaic, sensor: str, colrow: Array) -> Array:
-        """Errors (n, 2), px, x right and y up, of where raw pixels (n, 2) of a sensor lie."""
+        """Errors of where raw pixels of a sensor lie.
+
+        Args:
+            mosaic: the adjustment the pattern is of.
+            sensor: name of the sensor.
+            colrow: raw column and row, (n, 2).
+
+        Returns:
+            x right and y up in the virtual image, (n, 2), px.
+        """
         start = mosaic.start[sensor]
         corrected = corrected_mm_from_raw(start, colrow)
         _, columns, design = vip_and_design(mosaic.model, start, corrected, mosaic.values)
@@ -138,7 +154,10 @@ def calibrated_parts(
         rig: the camera.
         held: its patterns.
         temperatures_c: temperatures that were read, by probe name.
-        sigma_k: how well the temperature of every probe is known.
+        sigma_k: how well the temperature of every probe is known, by its name, K.
+
+    Returns:
+        Patterns of one standard deviation, independent of each other.
     """
     found = []
     for name in held.cones:
@@ -183,6 +202,12 @@ def scale_figures(held: HeldQuantities | None) -> HeadScaleFigures | None:
 
     Against `processing.mosaic.mounting.platform_figures`, which compare each head with its
     neighbours alone, all heads are weighed together: the one that bends the others is named.
+
+    Args:
+        held: None for a rig with a master cone.
+
+    Returns:
+        Scale, ppm, and name of the head; None where no scale differs significantly.
     """
     if held is None or not _significant(held).any():
         return None

@@ -154,7 +154,14 @@ def check_layers(
 
 
 def layer_figures(check: LayerCheck | None) -> tuple[FigureGroup, ...]:
-    """The check in figures of the quality report."""
+    """The check in figures of the quality report.
+
+    Args:
+        check: None where the layers were not tested.
+
+    Returns:
+        Groups of figures; empty without a check.
+    """
     if check is None:
         return ()
     farthest = max(check.layers, key=lambda layer: layer.shift_px)

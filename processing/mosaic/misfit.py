@@ -82,26 +82,56 @@ class Misfit:
         return float(self.y @ self.weight @ self.y)
 
     def displacement(self, index: int) -> Array:
-        """Design (c, 2) of a displacement, px, of one of the sensors."""
+        """Design of a displacement of one sensor.
+
+        Args:
+            index: of the sensor in `sensors`.
+
+        Returns:
+            What a px of x and of y makes of the contrasts, (c, 2).
+        """
         first = index * len(self.quantities)
         return self.contrasts[:, first : first + 2]
 
     def probe_bias(self, probe: str) -> Array:
-        """Design (c, 1) of what one kelvin read too much makes of the sensors of a probe."""
+        """Design of a probe that reads one kelvin too much.
+
+        Args:
+            probe: name of the probe.
+
+        Returns:
+            What it makes of the contrasts, (c, 1).
+        """
         warmed = [
             per_kelvin(s, self.quantities, self.pitch_um) * (s.probe == probe) for s in self.sensors
         ]
         return -self.contrasts @ np.concatenate(warmed)[:, None]
 
     def fit(self, design: Array) -> CauseFit:
-        """The best size of a cause with the given design (c, k)."""
+        """The best size of a cause.
+
+        Args:
+            design: of the cause, (c, k).
+
+        Returns:
+            Size, cofactor and the chi-square it explains.
+
+        Source: docs/explanation/mathematics/validity.md#one-displaced-sensor.
+        """
         cofactor = np.asarray(np.linalg.inv(design.T @ self.weight @ design), np.float64)
         normal_vector = design.T @ self.weight @ self.y
         size = cofactor @ normal_vector
         return CauseFit(size, cofactor, float(size @ normal_vector))
 
     def with_free_cause(self, design: Array) -> Misfit:
-        """The same where a cause with this design may have any size."""
+        """The same where a cause may have any size.
+
+        Args:
+            design: of the cause, (c, k).
+
+        Returns:
+            A copy whose weight leaves the cause out.
+        """
         weighted = self.weight @ design
         taken = weighted @ np.linalg.inv(design.T @ weighted) @ weighted.T
         return replace(self, weight=self.weight - taken)
@@ -123,8 +153,13 @@ def misfit(
         mosaic: a free mosaic, in any datum.
         sensors: by name; the stitching has found them.
         temperatures_c: temperature by probe name, as the mosaic's start was made with.
-        quantities: `PLACE` or `POSITION_AND_SCALE`.
-        knowledge: None takes the defaults.
+        quantities: `POSITION` or `POSITION_AND_SCALE`.
+        prior_sigmas: None takes the defaults.
+
+    Returns:
+        Contrasts and their weight.
+
+    Source: docs/explanation/mathematics/validity.md#contrasts.
     """
     found, stitching = found_quantities(mosaic, sensors, quantities)
     expected = expected_covariance(
@@ -148,7 +183,16 @@ def misfit(
 def found_quantities(
     mosaic: Mosaic, sensors: Sequence[str], quantities: Sequence[str] = POSITION
 ) -> tuple[Array, Array]:
-    """Corrections of sensors one after the other (n,), and their stitching covariance (n, n)."""
+    """Corrections of sensors by stitching, one sensor after the other.
+
+    Args:
+        mosaic: a free mosaic, in any datum.
+        sensors: names of adjusted sensors.
+        quantities: `POSITION` or `POSITION_AND_SCALE`.
+
+    Returns:
+        Corrections (n,), px and for scales ppm, and their covariance (n, n).
+    """
     rows = [mosaic.model.sensors[name] + _UNKNOWN[q] for name in sensors for q in quantities]
     unit = np.tile([_per_unknown(q, mosaic) for q in quantities], len(sensors))
     return mosaic.values[rows] * unit, mosaic.covariance[np.ix_(rows, rows)] * np.outer(unit, unit)
@@ -163,9 +207,22 @@ def expected_covariance(
     quantities: Sequence[str] = POSITION,
     prior_sigmas: PriorSigmas | None = None,
 ) -> Array:
-    """Covariance (n, n) of where calibration + TDM expect the sensors.
+    """Covariance of where calibration + TDM expect the sensors.
 
     A calibrated scale is as good as places of the same sigma half a diagonal from the centre.
+
+    Args:
+        rig: the camera.
+        mosaic: gives the pixel pitch.
+        sensors: by name, of one cone.
+        temperatures_c: temperature by probe name.
+        quantities: `POSITION` or `POSITION_AND_SCALE`.
+        prior_sigmas: None takes the defaults.
+
+    Returns:
+        (n, n), quantities of one sensor after the other, px and for scales ppm, squared.
+
+    Source: docs/explanation/mathematics/validity.md#contrasts.
     """
     prior_sigmas = prior_sigmas or PriorSigmas()
     pitch_um = mosaic.model.pitch_mm * 1e3
@@ -191,7 +248,16 @@ def expected_covariance(
 
 
 def per_kelvin(sensor: Sensor, quantities: Sequence[str], pitch_um: float) -> Array:
-    """What a kelvin does to a sensor."""
+    """What a kelvin does to a sensor.
+
+    Args:
+        sensor: its drift coefficients count.
+        quantities: `POSITION` or `POSITION_AND_SCALE`.
+        pitch_um: pixel pitch of the virtual image, um.
+
+    Returns:
+        One value for each quantity, px/K, of the scale ppm/K.
+    """
     drift = sensor.drift
     known = {
         "x": drift.x_um_per_k / pitch_um,
@@ -204,7 +270,17 @@ def per_kelvin(sensor: Sensor, quantities: Sequence[str], pitch_um: float) -> Ar
 def similarity_directions(
     places_mm: Sequence[tuple[float, float]], pitch_mm: float, quantities: Sequence[str] = POSITION
 ) -> Array:
-    """How a common shift, scale and rotation moves the sensors at these places: (n, 4)."""
+    """How a common shift, scale and rotation moves sensors.
+
+    Args:
+        places_mm: x, y of each sensor in its layer, mm.
+        pitch_mm: pixel pitch of the virtual image, mm.
+        quantities: `POSITION` or `POSITION_AND_SCALE`.
+
+    Returns:
+        Columns of shift x, shift y, scale and rotation, (n, 4), px and for scales ppm, by px and by
+        px per mm.
+    """
     rows = []
     for x_mm, y_mm in places_mm:
         moves = {
@@ -218,7 +294,14 @@ def similarity_directions(
 
 
 def orthogonal_complement(directions: Array) -> Array:
-    """An orthonormal basis of what the directions cannot produce, as rows."""
+    """An orthonormal basis of what directions cannot produce.
+
+    Args:
+        directions: independent columns, (n, d).
+
+    Returns:
+        Basis as rows, (n - d, n).
+    """
     full, _, _ = np.linalg.svd(directions, full_matrices=True)
     return np.asarray(full[:, directions.shape[1] :].T)
 

@@ -64,8 +64,20 @@ def build_model(
 ) -> MosaicModel:
     """Lay out the unknowns: of each free sensor, of each free mounting, of each free layer.
 
+    Args:
+        rig: the camera.
+        placements: of the free sensors, by name.
+        free_sensors: sensors whose similarity S is adjusted.
+        free_layers: cones whose layer transformation P is adjusted.
+        free_mountings: cones whose mounting is adjusted.
+
+    Returns:
+        Names, places and units of the unknowns.
+
     Raises:
         ValueError: the rig has no virtual image.
+
+    Source: docs/explanation/mathematics/mosaicking.md#parameters-and-degrees-of-freedom.
     """
     image = rig.virtual_image
     if image is None:
@@ -96,7 +108,16 @@ def build_model(
 
 
 def placement_at(model: MosaicModel, start: SensorPlacement, values: Array) -> SensorPlacement:
-    """The placement of a sensor with the unknowns at `values` (u,)."""
+    """The placement of a sensor with given unknowns.
+
+    Args:
+        model: the unknowns.
+        start: the sensor's placement at calibration + TDM.
+        values: the unknowns, (u,).
+
+    Returns:
+        A copy of `start` with adjusted S and P.
+    """
     return dataclasses.replace(
         start,
         similarity=_similarity(model, start, values),
@@ -181,7 +202,16 @@ def vip_and_design(
 def residuals_px(
     model: MosaicModel, placements: Mapping[str, SensorPlacement], tie_points: TiePoints
 ) -> Array:
-    """Place of a less place of b in the VIP, (n, 2) px, of tie points, adjusted ones or others."""
+    """Place of a less place of b in the VIP, of tie points, adjusted ones or others.
+
+    Args:
+        model: gives the pixel pitch.
+        placements: by sensor name.
+        tie_points: n points.
+
+    Returns:
+        x right, y up, (n, 2), px.
+    """
     residuals = np.full((len(tie_points), 2), np.nan)
     for number, (a, b) in enumerate(tie_points.pairs):
         rows = np.flatnonzero(tie_points.overlap == number)
@@ -214,9 +244,16 @@ def _layer_correction(model: MosaicModel, start: SensorPlacement, values: Array)
 
 
 def small_rotation_design(vip_mm: Array, f_mm: float) -> Array:
-    """How points (n, 2) of the virtual image move by a small turn of their rays, (2, 3, n), mm/rad.
+    """How points of the virtual image move by a small turn of their rays.
 
     The ray (x, y, -f) turned by w moves by w x (x, y, -f).
+
+    Args:
+        vip_mm: points, (n, 2), mm.
+        f_mm: principal distance of the virtual image.
+
+    Returns:
+        Derivatives of x and y by the three components of w, (2, 3, n), mm/rad.
     """
     x, y = vip_mm[:, 0], vip_mm[:, 1]
     return np.array(

@@ -39,6 +39,12 @@ def focal_planes_svg(rig: Rig) -> str:
 
     The focal planes are looked at as the layers are: x right, y up in flight direction, mm. A rig
     without a virtual image has its focal planes only.
+
+    Args:
+        rig: the camera.
+
+    Returns:
+        Text of an SVG document.
     """
     columns = min(len(rig.cones), 4)
     cell, gap, top = 200.0, 20.0, 64.0
@@ -70,6 +76,18 @@ def residuals_svg(
 
     Vectors are enlarged; the bar in each panel shows the scale. Points left out by data snooping
     are orange. At most a few thousand vectors are drawn, evenly thinned.
+
+    Args:
+        rig: the camera.
+        tie_points: those the mosaic is of.
+        mosaic: the adjustment.
+        validity: its test; None or one without residuals leaves out the panel of the master cone.
+
+    Returns:
+        Text of an SVG document.
+
+    Raises:
+        ValueError: the rig has no virtual image.
     """
     image = rig.virtual_image
     if image is None:

@@ -111,6 +111,7 @@ class PlatformCheck:
 
     @property
     def is_expired(self) -> bool:
+        """True where the test is failed."""
         return self.degrees_of_freedom > 0 and self.statistic > self.limit
 
     @property
@@ -140,6 +141,16 @@ def verified_mosaic(rig: Rig, mosaic: Mosaic, tie_points: TiePoints) -> Mosaic:
     Each head's tie points are compared with its neighbours' by an affine transformation; as a rule
     the adjustment has left no shift. Where one is left (over three standard deviations and
     `MIN_SHIFT_PX`), the head goes half of the way: its neighbour is found as far off.
+
+    Args:
+        rig: the camera.
+        mosaic: of converging heads; others are returned as they are.
+        tie_points: those the mosaic is of.
+
+    Returns:
+        The mosaic, the same where no shift is left.
+
+    Source: docs/explanation/mathematics/virtual-camera.md#verification-by-affine-transformation.
     """
     if not mosaic.model.mountings:
         return mosaic
@@ -168,6 +179,14 @@ def has_scaled_head(rig: Rig, mosaic: Mosaic, tie_points: TiePoints) -> bool:
     """Whether a converging head differs from its neighbours in scale, equally along both axes.
 
     That is a principal distance; lines lost in read-out change one axis.
+
+    Args:
+        rig: the camera.
+        mosaic: of converging heads.
+        tie_points: those the mosaic is of.
+
+    Returns:
+        True where one does by more than `SCALED_PPM`; False for rigs with a master cone.
     """
     for name in mosaic.model.mountings:
         _, _, affine, points = _affine_shift(rig, mosaic, tie_points, name)
@@ -223,7 +242,14 @@ def check_platform(
 
 
 def platform_figures(check: PlatformCheck | None) -> tuple[FigureGroup, ...]:
-    """The check in figures of the quality report."""
+    """The check in figures of the quality report.
+
+    Args:
+        check: None where the mountings were not tested.
+
+    Returns:
+        Groups of figures; empty without a check.
+    """
     if check is None:
         return ()
     farthest, scaled = check.farthest, check.scaled
@@ -240,10 +266,18 @@ def platform_figures(check: PlatformCheck | None) -> tuple[FigureGroup, ...]:
 
 
 def rotation_of_layer(rig: Rig, mosaic: Mosaic, cone: Cone) -> Array | None:
-    """How the unknowns make the turn of a cone, (3, u), rad per unknown's own unit.
+    """How the unknowns make the turn of a cone.
 
     Of a mounting it is the unknowns themselves; of a projective layer the rotation nearest to it
-    over the cone's sensors. None where the cone has neither.
+    over the cone's sensors.
+
+    Args:
+        rig: the camera.
+        mosaic: the adjustment.
+        cone: one of the rig's cones.
+
+    Returns:
+        (3, u), rad per unknown's own unit; None where the cone has neither.
     """
     model = mosaic.model
     rows = np.zeros((3, len(model.names)))
@@ -273,10 +307,18 @@ def rotation_of_layer(rig: Rig, mosaic: Mosaic, cone: Cone) -> Array | None:
 
 
 def rotation_of_band(rig: Rig, mosaic: Mosaic, band: BandRegistration) -> tuple[Array, Array]:
-    """The rotation of a colour head by its registration to green, and its sigma, (3,) rad each.
+    """The rotation of a colour head by its registration to green, and its sigma.
 
     The rotation nearest to the projective transformation over the head's sensor; green itself has
     its place by the adjustment.
+
+    Args:
+        rig: the camera.
+        mosaic: the adjustment.
+        band: a registered band of the head.
+
+    Returns:
+        Rotation vector and standard deviations, about the axes of the virtual image, (3,) rad each.
     """
     model, sensor = mosaic.model, rig.sensor(band.sensor)
     seen = vip_mm_from_raw(mosaic.start[band.sensor], _grid(sensor))
@@ -319,16 +361,32 @@ def _mounting(
 
 
 def rotated_mounting(cone: Cone, correction_rad: Array) -> Array:
-    """virtual_from_head (3, 3) of a cone turned further about the axes of the virtual image."""
+    """Mounting of a cone turned further about the axes of the virtual image.
+
+    Args:
+        cone: with its calibrated mounting.
+        correction_rad: rotation vector, (3,).
+
+    Returns:
+        virtual_from_head, (3, 3).
+    """
     return np.asarray(rotations_from_vectors(correction_rad) @ rotation_matrix(*cone.rotation_rad))
 
 
 def place_covariance(cone: Cone, dc_k: Mapping[str, float], *, is_datum: bool = False) -> Array:
-    """Turns (3, 3), rad squared, that the sensors' places in the head pass for.
+    """Turns that the sensors' places in the head pass for.
 
-    A shift in the layer, by calibration and drift at `dc_k` by sensor, looks like a turn about its
-    x and y axes; of a cone with several sensors the mean shift does. Where the places of three or
-    more are the datum (eq. 6), their rotation about each other looks like a turn about z.
+    A shift in the layer, by calibration and drift, looks like a turn about its x and y axes; of a
+    cone with several sensors the mean shift does. Where the places of three or more are the datum
+    (eq. 6), their rotation about each other looks like a turn about z.
+
+    Args:
+        cone: one of the rig's cones.
+        dc_k: dC by sensor name, K; a sensor without one has none.
+        is_datum: the places of the cone's sensors are the datum.
+
+    Returns:
+        Covariance about the axes of the virtual image, (3, 3), rad squared.
     """
     sensors = cone.sensors
     tdm_um = [s.drift.sigma_um_per_k * dc_k.get(s.name, 0.0) for s in sensors]

@@ -27,7 +27,7 @@ from processing.mosaic.model import build_model
 from processing.rig import Rig
 
 
-def without_precorrection(
+def _without_precorrection(
     rig: Rig, placements: Mapping[str, SensorPlacement]
 ) -> dict[str, SensorPlacement]:
     """Placements whose PAN layers know nothing of the cones' calibrated rotations.
@@ -71,12 +71,18 @@ def pan_only_mosaic(
         tie_points: matched points; those with the colour master are not looked at.
         precorrected: keep the calibrated rotations of the PAN cones; the experiment did not.
         settings: None takes the defaults.
+
+    Returns:
+        The mosaic, its method "pan-only".
+
+    Raises:
+        ValueError: the rig has no virtual image.
     """
     keeps_precorrection = precorrected or rig.master_cone is None
-    start = dict(placements) if keeps_precorrection else without_precorrection(rig, placements)
+    start = dict(placements) if keeps_precorrection else _without_precorrection(rig, placements)
     mountings = free_cones(rig)[1]
     layers = [c.name for c in rig.pan_cones if c.name not in (rig.master_cone, *mountings)]
-    constraints = [c for name in layers for c in similarity_constraints(name)]
+    constraints = [c for name in layers for c in _similarity_constraints(name)]
     return adjust_mosaic(
         rig,
         start,
@@ -92,7 +98,7 @@ def pan_only_mosaic(
     )
 
 
-def similarity_constraints(layer: str) -> list[DatumConstraint]:
+def _similarity_constraints(layer: str) -> list[DatumConstraint]:
     """What makes a layer transformation of eight parameters one of four."""
     return [
         DatumConstraint({f"{layer}.p11": 1.0, f"{layer}.p22": -1.0}),

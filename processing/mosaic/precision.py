@@ -62,7 +62,10 @@ def precision_figures(
         mosaic: what the image was made with.
         present: sensors with a frame.
         measured_c: temperatures that were read, by probe name.
-        disturbance: what findings add; None is nothing.
+        uncertainty_contribution: what findings add; None is nothing.
+
+    Returns:
+        Root mean square over the sensors, and the worst of them; None without a sensor.
     """
     by_sensor: dict[str, float] = {}
     for cone in rig.pan_cones:
@@ -94,9 +97,22 @@ def placed_sigma_px(
     measured_c: Mapping[str, float],
     uncertainty_contribution: UncertaintyContribution | None = None,
 ) -> Array:
-    """Standard deviation (n, 2), px, of the positions of raw pixels (n, 2) in the virtual image.
+    """Standard deviation of the positions of raw pixels in the virtual image.
 
     What tie points do not determine counts with the a-priori accuracy it is held with.
+
+    Args:
+        rig: the camera.
+        mosaic: what the image was made with.
+        sensor: name of the sensor.
+        colrow: raw column and row, (n, 2).
+        measured_c: temperatures that were read, by probe name.
+        uncertainty_contribution: what findings add; None is nothing.
+
+    Returns:
+        x and y, (n, 2), px.
+
+    Source: docs/explanation/mathematics/mosaicking.md#accuracy-of-the-image.
     """
     tie_points = vip_precision_px(mosaic, sensor, colrow)
     held = {name.split(".")[0] for name in mosaic.undetermined}
@@ -154,7 +170,17 @@ def disturbance_covariance_px(
     points: Mapping[str, Array],
     uncertainty_contribution: UncertaintyContribution,
 ) -> Array:
-    """Covariance (2 n, 2 n) that a disturbance adds, px squared, as in `placed_covariance_px`."""
+    """Covariance that findings add to the positions of raw pixels.
+
+    Args:
+        rig: the camera.
+        mosaic: what the image was made with.
+        points: raw column and row (n, 2) by sensor name.
+        uncertainty_contribution: what findings add.
+
+    Returns:
+        (2 n, 2 n), px squared, in the order of `placed_covariance_px`.
+    """
     designs = [
         moved_datum_design(rig, mosaic, vip_mm_from_raw(mosaic.placements[name], colrow))
         for name, colrow in points.items()
@@ -173,12 +199,22 @@ def disturbance_covariance_px(
 
 
 def datum_covariance(rig: Rig, mosaic: Mosaic, measured_c: Mapping[str, float]) -> Array:
-    """Covariance (4, 4) of the datum: shift x, y (px), scale and rotation (px per mm).
+    """Covariance of the datum.
 
     The datum is the best similarity over the master sensors it rests on (eq. 6), so what their
     places are off by, each on its own or all with their probe, carries over by that fit. Of
     converging heads the mean turn is held at the platform calibration: it is known as well as one
     head's turn over the root of their number.
+
+    Args:
+        rig: the camera.
+        mosaic: what the image was made with.
+        measured_c: temperatures that were read, by probe name.
+
+    Returns:
+        Shift x, y (px), scale and rotation (px per mm), (4, 4).
+
+    Source: docs/explanation/mathematics/mosaicking.md#accuracy-of-the-image.
     """
     sensors, place_mm, fit = _datum_fit(rig, mosaic)
     own_um2 = np.array(
@@ -205,7 +241,15 @@ def datum_covariance(rig: Rig, mosaic: Mosaic, measured_c: Mapping[str, float]) 
 
 
 def datum_per_kelvin_px(rig: Rig, mosaic: Mosaic) -> Array:
-    """How one kelvin that no probe has read moves the datum, (4,): px, px, px per mm, px per mm."""
+    """How one kelvin that no probe has read moves the datum.
+
+    Args:
+        rig: the camera.
+        mosaic: what the image was made with.
+
+    Returns:
+        Shift x, y (px), scale and rotation (px per mm), per K, (4,).
+    """
     sensors, place_mm, fit = _datum_fit(rig, mosaic)
     moved = sum(_moved_um_per_kelvin(rig, sensors, place_mm).values(), np.zeros(2 * len(place_mm)))
     return np.asarray(fit @ moved / (mosaic.model.pitch_mm * 1e3))
@@ -265,9 +309,17 @@ def _place_mm(rig: Rig, mosaic: Mosaic, sensor: Sensor) -> tuple[float, float]:
 
 
 def moved_datum_design(rig: Rig, mosaic: Mosaic, xy_mm: Array) -> Array:
-    """How the datum moves points of the image: (2 n, 4), x and y of each in turn.
+    """How the datum moves points of the image.
 
     Of converging heads it is a rotation of the virtual camera: its shift grows towards the edges.
+
+    Args:
+        rig: the camera.
+        mosaic: gives the principal distance.
+        xy_mm: points of the virtual image, (n, 2), mm.
+
+    Returns:
+        As of `datum_design`, (2 n, 4).
     """
     design = datum_design(xy_mm)
     if rig.master_cone is None:
@@ -280,7 +332,14 @@ def moved_datum_design(rig: Rig, mosaic: Mosaic, xy_mm: Array) -> Array:
 
 
 def datum_design(xy_mm: Array) -> Array:
-    """How shift, scale and rotation move points: (2 n, 4), x and y of each in turn."""
+    """How shift, scale and rotation move points.
+
+    Args:
+        xy_mm: points of the virtual image, (n, 2), mm.
+
+    Returns:
+        (2 n, 4), rows x and y of each point in turn, columns shift x, shift y, scale, rotation.
+    """
     design = np.zeros((2 * len(xy_mm), 4))
     design[0::2, 0], design[1::2, 1] = 1.0, 1.0
     design[0::2, 2], design[1::2, 2] = xy_mm[:, 0], xy_mm[:, 1]

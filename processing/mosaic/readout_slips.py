@@ -53,7 +53,16 @@ class SlipSettings:
     max_rounds: int = 4
 
     def min_shift_px(self, points: int) -> float:
-        """The smallest shift of a band of so many points that is a slip, PAN pixels."""
+        """The smallest shift of a band that is a slip.
+
+        Args:
+            points: tie points in the band.
+
+        Returns:
+            PAN pixels.
+
+        Source: docs/explanation/mathematics/validity.md#read-out-slips.
+        """
         return 0.15 + 1.7 / math.sqrt(points)
 
 
@@ -80,6 +89,7 @@ class Slip:
 
     @property
     def length_px(self) -> float:
+        """Length of the shift, PAN pixels."""
         return math.hypot(self.dx_px, self.dy_px)
 
 
@@ -131,13 +141,29 @@ def find_slips(
 
 
 def of_sensor(tie_points: TiePoints, sensor: str) -> NDArray[np.bool_]:
-    """Which tie points (n,) have an image in this frame."""
+    """Mark tie points that have an image in a frame.
+
+    Args:
+        tie_points: n points.
+        sensor: name of the frame's sensor.
+
+    Returns:
+        True for such points, (n,).
+    """
     number = tie_points.names.index(sensor)
     return np.asarray((tie_points.sensor_a == number) | (tie_points.sensor_b == number), np.bool_)
 
 
 def inside_slips(tie_points: TiePoints, slips: Sequence[Slip]) -> NDArray[np.bool_]:
-    """Which tie points (n,) lie in one of the bands."""
+    """Mark tie points that lie in one of the bands.
+
+    Args:
+        tie_points: n points.
+        slips: shifted bands.
+
+    Returns:
+        True for such points, (n,).
+    """
     inside = np.zeros(len(tie_points), np.bool_)
     for slip in slips:
         for side, _ in _sides(tie_points, slip):
@@ -155,6 +181,9 @@ def slip_of(rig: Rig, tie_points: TiePoints, residuals_px: Array, sensor: str) -
         tie_points: all of them.
         residuals_px: as of `find_slips`, of an adjustment that this frame had no part in.
         sensor: the frame.
+
+    Returns:
+        The shifted band; None where the frame has none.
     """
     slip = next(iter(find_slips(rig, tie_points, residuals_px, sensors=(sensor,))), None)
     if slip is None:
@@ -183,7 +212,15 @@ def slip_of(rig: Rig, tie_points: TiePoints, residuals_px: Array, sensor: str) -
 
 
 def slip_figures(rig: Rig, slips: Sequence[Slip]) -> SlipFigures:
-    """The worst slip in figures of the quality report."""
+    """The worst slip in figures of the quality report.
+
+    Args:
+        rig: the camera.
+        slips: from `find_slips`, the worst first.
+
+    Returns:
+        Figures of the first, and the sensors of all; empty without slips.
+    """
     if not slips:
         return SlipFigures()
     worst = slips[0]

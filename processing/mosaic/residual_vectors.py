@@ -21,12 +21,16 @@ VECTORS_MAX: Final = 600
 def residual_vectors(rig: Rig, tie_points: TiePoints, mosaic: Mosaic) -> dict[str, Any]:
     """JSON-ready: positions of tie points in the virtual image and their residuals.
 
+    Args:
+        rig: the camera.
+        tie_points: those the mosaic is of.
+        mosaic: the adjustment.
+
     Returns:
         `width_px`, `height_px` of the virtual image; `overlaps`, for every searched pair of
-        sensors: `sensors`, `sought`, `found`, `used`, `rms_px` (of used points, null
-        without any); `vectors`, at most VECTORS_MAX, evenly thinned: [column, row, right, down,
-        kind], pixels of the virtual image, kind 0 between PAN sensors, 1 PAN to colour, 2 left out
-        by data snooping.
+        sensors: `sensors`, `sought`, `found`, `used`, `rms_px` (of used points, null without any);
+        `vectors`, at most VECTORS_MAX, evenly thinned: [column, row, right, down, kind], pixels of
+        the virtual image, kind 0 between PAN sensors, 1 PAN to colour, 2 left out by data snooping.
 
     Raises:
         ValueError: a rig without virtual image.

@@ -81,7 +81,10 @@ def stitch_record(
         measured_c: those of them that were read.
         estimated_dc: what `processing.mosaic.estimated_dc` made of it.
         bands: how the other colours were registered to green.
-        height_m: of the exposure above ground.
+        height_m: of the exposure above ground; None where it is not known.
+
+    Returns:
+        Determined quantities with their covariance.
     """
     held = set(mosaic.undetermined)
     rows: list[Array] = []
@@ -133,7 +136,14 @@ def stitch_record(
 
 
 def stitch_record_json(record: StitchRecord) -> dict[str, Any]:
-    """The record as JSON-ready data; the covariance as its lower triangle, row by row."""
+    """The record as JSON-ready data.
+
+    Args:
+        record: of one exposure.
+
+    Returns:
+        Content of `mosaic.json`; the covariance as its lower triangle, row by row.
+    """
     lower = record.covariance[np.tril_indices(len(record.names))]
     return {
         "format": STITCH_FORMAT,
@@ -163,6 +173,12 @@ def stitch_record_json(record: StitchRecord) -> dict[str, Any]:
 
 def stitch_record_from_json(content: Mapping[str, Any]) -> StitchRecord:
     """Read what `stitch_record_json` wrote.
+
+    Args:
+        content: parsed JSON.
+
+    Returns:
+        The record.
 
     Raises:
         StitchRecordError: a key is missing, or sizes do not fit.
@@ -201,9 +217,17 @@ def stitch_record_from_json(content: Mapping[str, Any]) -> StitchRecord:
 
 
 def layer_scale_design(mosaic: Mosaic, cone: Cone, first: int) -> Array:
-    """ln(local scale) of the correction of P at the middle of the cone's sensors, ppm per unknown.
+    """ln(local scale) of the correction of P at the middle of the cone's sensors.
 
     Half the divergence of P = I + p: (p11 + p22) / 2 - 3/2 (p31 x + p32 y), lengths in half sizes.
+
+    Args:
+        mosaic: the adjustment.
+        cone: a cone with a free layer.
+        first: index of the layer's first unknown, p11.
+
+    Returns:
+        ppm per unknown, (u,).
     """
     x, y = np.mean([[s.x_mm, s.y_mm] for s in cone.sensors], axis=0) / mosaic.model.half_size_mm
     row = np.zeros(len(mosaic.model.names))

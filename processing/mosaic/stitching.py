@@ -71,6 +71,9 @@ def stitch(
         temperatures_c: temperatures that were read, by probe name.
         method: "free", or one to be compared with.
         settings: of the adjustment.
+
+    Returns:
+        The mosaics, their test and what was found.
     """
     if method != "free":
         other = fixed_mosaic if method == "fixed" else pan_only_mosaic

@@ -84,6 +84,11 @@ def uncertainty_contribution_of(
         shifted_px: how far frames lay apart beyond the search for tie points, else zero.
         weak: sensors that rest on calibration.
         smear_px: by cone, what its stated TDI count leaves of the motion, where that is too much.
+
+    Returns:
+        Covariances of datum and frames, and patterns; all zero without findings.
+
+    Source: docs/explanation/mathematics/validity.md#what-findings-add.
     """
     warmed = tuple(_wrong_temperature(rig, mosaic, estimated_dc))
     # A wrong temperature changes the common scale of all layers, too.

@@ -83,6 +83,7 @@ class Displacement:
 
     @property
     def length_px(self) -> float:
+        """Length of the displacement, PAN px."""
         return math.hypot(self.dx_px, self.dy_px)
 
 
@@ -102,6 +103,7 @@ class RelativeDisplacement:
 
     @property
     def significant(self) -> bool:
+        """True where the statistic exceeds its limit."""
         return self.statistic > self.limit
 
 
@@ -135,6 +137,7 @@ class Validity:
 
     @property
     def consistent(self) -> bool:
+        """True where the global test is passed."""
         return self.global_statistic <= self.global_limit
 
 
@@ -157,6 +160,11 @@ def evaluate_master(
         mosaic: a free mosaic, in any datum.
         temperatures_c: temperature by probe name, as the mosaic's start was made with.
         settings: None takes the defaults.
+
+    Returns:
+        The verdict.
+
+    Source: docs/explanation/mathematics/validity.md#one-displaced-sensor and #probe-that-misreads.
     """
     settings = settings or ValiditySettings()
     master = [
@@ -291,7 +299,15 @@ def _misread(found: Misfit, probe: str) -> ProbeBias:
 
 
 def pan_points(rig: Rig, mosaic: Mosaic) -> dict[str, int]:
-    """P/P points in use, by PAN sensor."""
+    """P/P points in use.
+
+    Args:
+        rig: the camera.
+        mosaic: the adjustment.
+
+    Returns:
+        Number of points by PAN sensor, zero where it has none.
+    """
     counts = {s.name: 0 for cone in rig.pan_cones for s in cone.sensors}
     for (a, b), used in mosaic.used.items():
         if a in counts and b in counts:
@@ -311,9 +327,22 @@ def robust_datum(
 ) -> Mosaic:
     """The mosaic in the datum of the master sensors that are still in place.
 
-    Without a displaced sensor this is `mosaic` itself. The inner geometry is the same; what changes
-    is the datum, which a displaced sensor pulls by a quarter of its displacement. Where another
-    sensor may be the one that moved, the datum rests on neither, if two are left to carry it.
+    The inner geometry is the same; what changes is the datum, which a displaced sensor pulls by a
+    quarter of its displacement. Where another sensor may be the one that moved, the datum rests on
+    neither, if two are left to carry it.
+
+    Args:
+        rig: the camera.
+        placements: the start of the mosaic.
+        tie_points: those the mosaic is of.
+        mosaic: with all master sensors in its datum.
+        validity: its test.
+        settings: of the adjustment; None takes the defaults.
+
+    Returns:
+        The mosaic; `mosaic` itself without a displaced sensor.
+
+    Source: docs/explanation/mathematics/mosaicking.md#robust-datum.
     """
     if validity.displaced is None:
         return mosaic

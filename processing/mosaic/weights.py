@@ -76,6 +76,20 @@ def groups_of(
     settings: MosaicSettings,
     kinds: Sequence[int],
 ) -> list[TiePointGroup]:
+    """Tie points by pair of sensors, with their a-priori accuracy.
+
+    Args:
+        rig: the camera.
+        start: placements by calibration + TDM, by sensor name.
+        tie_points: matched points.
+        settings: a-priori standard deviations.
+        kinds: classes that take part, `PAN_TO_PAN` or `PAN_TO_COLOUR`.
+
+    Returns:
+        Pairs that have points.
+
+    Source: docs/explanation/mathematics/mosaicking.md#weights.
+    """
     typical = {}
     for kind in CLASSES:
         sigmas = tie_points.sigma_px[tie_points.kind == kind]
@@ -125,7 +139,16 @@ def groups_of(
 def initial_weights(
     model: MosaicModel, start: Mapping[str, SensorPlacement], group: TiePointGroup
 ) -> Array:
-    """Weight factors before any adjustment: points far from their pair's median are left out."""
+    """Weight factors before any adjustment: points far from their pair's median are left out.
+
+    Args:
+        model: the unknowns.
+        start: placements by calibration + TDM, by sensor name.
+        group: m points; receives their differences at the start, px, and redundancies of one.
+
+    Returns:
+        1 or, for a point left out, 0, (m,).
+    """
     a = _started_px(model, start[group.a], group.corrected_a)
     b = _started_px(model, start[group.b], group.corrected_b)
     off = a - b
@@ -142,6 +165,15 @@ def _started_px(model: MosaicModel, start: SensorPlacement, corrected_mm: Array)
 
 
 def full_weight(group: TiePointGroup, class_scale: Mapping[int, float]) -> Array:
+    """Weights as if no point were left out.
+
+    Args:
+        group: m points.
+        class_scale: factor on the a-priori sigmas, by kind.
+
+    Returns:
+        1 / sigma squared, (2 m,), px^-2: x of all points, then y.
+    """
     return np.tile(1.0 / (group.sigma * class_scale[group.kind]) ** 2, 2)
 
 
@@ -152,6 +184,20 @@ def block_of(
     values: Array,
     scale: float,
 ) -> ObservationBlock:
+    """Observation equations of a group, linearised.
+
+    Args:
+        model: the unknowns.
+        start: placements by calibration + TDM, by sensor name.
+        group: m points.
+        values: the unknowns at which to linearise, (u,).
+        scale: factor on the a-priori sigmas.
+
+    Returns:
+        2 m equations, px: x of all points, then y; unknowns in `MosaicModel.units`.
+
+    Source: docs/explanation/mathematics/mosaicking.md#observation-equations.
+    """
     a, columns_a, design_a = vip_and_design(model, start[group.a], group.corrected_a, values)
     b, columns_b, design_b = vip_and_design(model, start[group.b], group.corrected_b, values)
     columns = np.concatenate([columns_a, columns_b])
@@ -171,7 +217,16 @@ def block_of(
 def block_after_step(
     block: ObservationBlock, group: TiePointGroup, scale: float
 ) -> ObservationBlock:
-    """A block after a step along its derivatives that left `group.difference`, newly weighed."""
+    """A block after a step along its derivatives that left `group.difference`, newly weighed.
+
+    Args:
+        block: before the step.
+        group: its points.
+        scale: factor on the a-priori sigmas.
+
+    Returns:
+        The block with the same derivatives.
+    """
     return replace(
         block,
         misclosure=-group.difference.T.reshape(-1),
@@ -184,8 +239,18 @@ def class_scales(
 ) -> tuple[dict[int, float], bool]:
     """Variance components: P/P and P/C sigmas that make both classes fit their residuals.
 
-    P/P keeps its a-priori sigma (unit weight); only the ratio is estimated. Returns the factors on
-    the a-priori sigmas and whether their ratio moved by more than two per mille.
+    P/P keeps its a-priori sigma (unit weight); only the ratio is estimated.
+
+    Args:
+        groups: points with differences and redundancies of an adjustment.
+        before: factors of that adjustment, by kind.
+        settings: `min_class_redundancy`, below which the factors stay.
+
+    Returns:
+        Factors on the a-priori sigmas by kind, and whether their ratio moved by more than two per
+        mille.
+
+    Source: docs/explanation/mathematics/mosaicking.md#weights.
     """
     variance = {}
     for kind in CLASSES:
@@ -208,8 +273,17 @@ def weight_factors(
 ) -> list[Array]:
     """Weight factors of each group from normalised residuals, the larger of both coordinates.
 
-    Soft: Huber about the group's median, for rounds in which the model does not fit yet. Else zero
-    beyond the limit (data snooping, w-test against the robust spread of the class), one within.
+    Args:
+        groups: points with differences and redundancies of an adjustment.
+        settings: `outlier_limit`.
+        soft: Huber about the group's median, for rounds in which the model does not fit yet. Else
+            zero beyond the limit (data snooping, w-test against the robust spread of the class),
+            one within.
+
+    Returns:
+        0 to 1, (m,) for each group.
+
+    Source: docs/explanation/mathematics/mosaicking.md#weights.
     """
     normalised = []
     for group in groups:
