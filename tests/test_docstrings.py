@@ -20,6 +20,7 @@ COMPLETE: tuple[str, ...] = (
     "processing/image",
     "processing/matching",
     "processing/mosaic",
+    "processing/pipelines",
 )
 """Packages whose docstrings are complete."""
 

@@ -73,6 +73,9 @@ class ExposureInput:
             tdi_shifts: of the frame.
             scale: factor of the signal.
             measure_lines: whether the means of bundles along lines are wanted.
+
+        Returns:
+            What the correction counted and measured in the frame.
         """
         sensor = corrector.sensor
         return level1_from_level0(
@@ -162,7 +165,11 @@ class ExposurePipeline(ABC, Generic[SettingsT, CorrectedT, AdjustedT, ImageT, Pr
 
     @abstractmethod
     def clone(self) -> ExposurePipeline[SettingsT, CorrectedT, AdjustedT, ImageT, ProductT]:
-        """Another for an exposure at the same time; calibrations are shared, buffers are not."""
+        """Another pipeline for an exposure at the same time.
+
+        Returns:
+            A pipeline that shares the calibrations and has buffers of its own.
+        """
 
     @abstractmethod
     def warm_up(self) -> None:

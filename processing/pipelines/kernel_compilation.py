@@ -59,7 +59,11 @@ class Compilation:
 
 
 def kernels() -> dict[str, Any]:
-    """All compiled kernels by "module.function"."""
+    """All compiled kernels of the package.
+
+    Returns:
+        Numba's dispatchers by "module.function", sorted.
+    """
     found = {}
     for module_name in _KERNEL_MODULES:
         for name, value in vars(importlib.import_module(module_name)).items():
@@ -69,7 +73,11 @@ def kernels() -> dict[str, Any]:
 
 
 def variants() -> dict[str, int]:
-    """How many variants (by argument types) of each kernel this process holds ready."""
+    """Count the variants of each kernel, by argument types, that this process holds ready.
+
+    Returns:
+        Number by "module.function".
+    """
     return {name: len(kernel.signatures) for name, kernel in kernels().items()}
 
 
@@ -83,10 +91,9 @@ def compile_for(
 ) -> Compilation:
     """Compile, or load from the cache, what this rig's pipeline will call.
 
-    Recorded variants are compiled in several processes. The pipeline then runs once, which
-    compiles whatever else it calls. Without radiometry, as at installation, what a calibrated
-    sensor needs is compiled as well; so is what a Bayer head needs, whether this rig has one or
-    not.
+    Recorded variants are compiled in several processes. The pipeline then runs once, which compiles
+    whatever else it calls. Without radiometry, as at installation, what a calibrated sensor needs
+    is compiled as well; so is what a Bayer head needs, whether this rig has one or not.
 
     Args:
         rig: the camera.
@@ -94,6 +101,9 @@ def compile_for(
         settings: of the pipeline.
         progress: called after each kernel that another process compiled.
         processes: None takes one for each core, 0 compiles in this process as the pipeline runs.
+
+    Returns:
+        Variants by kernel, how many were compiled, and the seconds it took.
 
     Raises:
         KernelCompilationError: a recorded variant cannot be compiled.

@@ -53,6 +53,12 @@ class KernelVariants:
 def signature_text(arguments: tuple[Any, ...]) -> str:
     """Argument types in numba's notation.
 
+    Args:
+        arguments: numba's types of one variant.
+
+    Returns:
+        Text as in `kernel_variants.toml`.
+
     Example:
         >>> from numba import types
         >>> signature_text((types.float32[:, ::1], types.literal(4)))
@@ -64,13 +70,27 @@ def signature_text(arguments: tuple[Any, ...]) -> str:
 
 
 def argument_types(text: str) -> tuple[Any, ...]:
-    """Inverse of `signature_text`."""
+    """Inverse of `signature_text`.
+
+    Args:
+        text: such as "(float32[:, ::1], literal(4))".
+
+    Returns:
+        Numba's types.
+    """
     found: tuple[Any, ...] = sigutils.normalize_signature(text)[0]
     return found
 
 
 def recorded_variants(path: Path = VARIANTS_FILE) -> dict[str, KernelVariants]:
-    """The table of variants by "module.function"."""
+    """Read the table of variants.
+
+    Args:
+        path: a file like `kernel_variants.toml`.
+
+    Returns:
+        Variants by "module.function".
+    """
     content = tomllib.loads(path.read_text("utf-8"))
     return {
         name: KernelVariants(tuple(entry["variants"]), float(entry["seconds"]))
@@ -78,7 +98,7 @@ def recorded_variants(path: Path = VARIANTS_FILE) -> dict[str, KernelVariants]:
     }
 
 
-def is_cached(kernel: Any, arguments: tuple[Any, ...]) -> bool:
+def _is_cached(kernel: Any, arguments: tuple[Any, ...]) -> bool:
     """Whether the cache on disk holds a variant; nothing is loaded."""
     cache = kernel._cache
     key = cache._index_key(arguments, kernel.targetctx.codegen())
@@ -111,7 +131,7 @@ def compile_recorded(
         name: entry
         for name, entry in table.items()
         if name in kernels
-        and not all(is_cached(kernels[name], argument_types(s)) for s in entry.signatures)
+        and not all(_is_cached(kernels[name], argument_types(s)) for s in entry.signatures)
     }
     if not missing:
         return 0

@@ -86,7 +86,15 @@ class HeadsProduct:
 
 
 def has_diverging_axes(rig: Rig) -> bool:
-    """Whether a rig without a virtual image has heads of which each is an image of its own."""
+    """Whether a rig without a virtual image has heads of which each is an image of its own.
+
+    Args:
+        rig: the camera.
+
+    Returns:
+        True where a cone has several bands, or two optical axes differ by more than
+        `DIVERGING_AXES_RAD`; False for rigs with a virtual image.
+    """
     if rig.virtual_image is not None:
         return False
     if any(len(cone.bands) > 1 for cone in rig.cones):
@@ -96,7 +104,14 @@ def has_diverging_axes(rig: Rig) -> bool:
 
 
 def perspective_of(cone: Cone) -> VirtualImage:
-    """The strict perspective a head is resampled to: its own pixels and principal distance."""
+    """The strict perspective a head is resampled to: its own pixels and principal distance.
+
+    Args:
+        cone: with one sensor.
+
+    Returns:
+        Size, pitch and principal distance, without drift.
+    """
     sensor = cone.sensors[0]
     return VirtualImage(sensor.width_px, sensor.height_px, sensor.pitch_um, cone.lens.f_mm, 1)
 
@@ -104,7 +119,16 @@ def perspective_of(cone: Cone) -> VirtualImage:
 def raw_of_perspective(
     cone: Cone, temperatures_c: Mapping[str, float], colrow: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Raw pixels (n, 2) of pixels (n, 2) of the strict perspective; NaN where the lens folds."""
+    """Raw pixels of pixels of the strict perspective.
+
+    Args:
+        cone: with one sensor.
+        temperatures_c: temperature by probe name, degC.
+        colrow: column and row of the perspective, (n, 2).
+
+    Returns:
+        Raw column and row, (n, 2); NaN where the lens folds.
+    """
     image = perspective_of(cone)
     return raw_from_vip_mm(_placement(cone, temperatures_c), vip_mm_from_px(image, colrow))
 

@@ -100,7 +100,16 @@ StitchedStages = Stages[CorrectedFrames, AdjustedFrames, ComposedImage]
 def figures_of(
     rig: Rig, settings: PipelineSettings, stages: StitchedStages
 ) -> Iterator[FigureGroup | None]:
-    """All figures of a stitched exposure but those of its conditions and of its valid area."""
+    """All figures of a stitched exposure but those of its conditions and of its valid area.
+
+    Args:
+        rig: the camera.
+        settings: of the pipeline.
+        stages: the exposure and what all stages made of it.
+
+    Yields:
+        Groups of figures; None for a group that was not determined.
+    """
     conditions, temperatures = stages.exposure.conditions, stages.exposure.temperatures
     corrected, adjusted, image = stages.corrected, stages.adjusted, stages.image
     level1, start, stitching = corrected.level1, corrected.start, adjusted.stitching
@@ -148,7 +157,14 @@ def figures_of(
 
 
 def farthest_shift_px(content: ContentCheck) -> float:
-    """How far the farthest frame lies from where points are sought; zero where all are there."""
+    """How far the farthest frame lies from where points are sought.
+
+    Args:
+        content: check of the frames' content.
+
+    Returns:
+        PAN pixels; zero where all are there.
+    """
     return max((math.hypot(*shift) for shift in content.shifted_px.values()), default=0.0)
 
 

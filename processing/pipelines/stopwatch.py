@@ -15,7 +15,14 @@ class Stopwatch:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Time what is done inside."""
+        """Time what is done inside a `with` block.
+
+        Args:
+            name: of the stage; the seconds of several blocks of one name are added.
+
+        Yields:
+            Nothing.
+        """
         began = time.perf_counter()
         try:
             yield

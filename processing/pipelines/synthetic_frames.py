@@ -25,10 +25,16 @@ _SEED: Final = 20
 
 
 def synthetic_frames(rig: Rig) -> dict[str, Array]:
-    """Level-0 frames by sensor, (h, w) uint16, of one plane texture in the nominal placement.
+    """Frames of one plane texture in the nominal placement.
 
     The frames agree to a tenth of a pixel. The search for shifted bands thus ends in its first
     round.
+
+    Args:
+        rig: the camera.
+
+    Returns:
+        Level-0 frames by sensor, (h, w) uint16; empty without a virtual image.
     """
     image = rig.virtual_image
     if image is None:
@@ -48,7 +54,14 @@ def synthetic_frames(rig: Rig) -> dict[str, Array]:
 
 
 def synthetic_head_frames(rig: Rig) -> dict[str, Array]:
-    """Level-0 frames by sensor, (h, w) uint16, for rigs whose images lie in no common plane."""
+    """Frames of a texture for rigs whose images lie in no common plane.
+
+    Args:
+        rig: the camera.
+
+    Returns:
+        Level-0 frames by sensor, (h, w) uint16.
+    """
     tile = _tile()
     frames = {}
     for sensor in rig.sensors:
@@ -60,7 +73,14 @@ def synthetic_head_frames(rig: Rig) -> dict[str, Array]:
 
 
 def synthetic_radiometry(sensor: Sensor) -> RadiometricCalibration:
-    """A calibration with maps and a defect, for a sensor of no flight."""
+    """A calibration with maps and a defect, for a sensor of no flight.
+
+    Args:
+        sensor: its size counts.
+
+    Returns:
+        A gain of one but for the first row, and one defective pixel.
+    """
     shape = (sensor.height_px, sensor.width_px)
     gain = np.ones(shape, np.float32)
     gain[0] = 1.01
