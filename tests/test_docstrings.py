@@ -21,6 +21,7 @@ COMPLETE: tuple[str, ...] = (
     "processing/matching",
     "processing/mosaic",
     "processing/pipelines",
+    "processing/quality",
 )
 """Packages whose docstrings are complete."""
 

@@ -48,7 +48,15 @@ class LevelStep:
 
 
 def level_figures(rig: Rig, ground: CommonWindows | None) -> BandLevelFigures | None:
-    """The median signal of each band over that of PAN on the same ground."""
+    """Level of each band against PAN on the same ground.
+
+    Args:
+        rig: the camera.
+        ground: windows that heads share; None where there are none.
+
+    Returns:
+        Median signal over that of PAN by band, for bands with enough windows; None without PAN.
+    """
     if ground is None or not ground.pan.any():
         return None
     seen = np.isfinite(ground.mean[ground.pan])
@@ -69,6 +77,9 @@ def level_steps(levels: Mapping[int, Mapping[str, float]]) -> tuple[LevelStep, .
     Args:
         levels: signal over that of PAN by band, by exposure number; exposures without any are left
             out.
+
+    Returns:
+        Steps in the order of the exposures.
     """
     numbers = sorted(number for number, of_bands in levels.items() if of_bands)
     steps = []

@@ -36,11 +36,14 @@ def clipping_figures(rig: Rig, frames: Mapping[str, Array]) -> ClippingFigures |
     Args:
         rig: the camera.
         frames: Level-0 frames by sensor name, (h, w) uint16, DN.
+
+    Returns:
+        That frame's sensor, all that are cut off, level in DN and share of pixels; None for none.
     """
     found = {
         s.name: cut
         for s in rig.sensors
-        if s.name in frames and (cut := clipped_at(s, frames[s.name])) is not None
+        if s.name in frames and (cut := _clipped_at(s, frames[s.name])) is not None
     }
     if not found:
         return None
@@ -49,13 +52,8 @@ def clipping_figures(rig: Rig, frames: Mapping[str, Array]) -> ClippingFigures |
     return ClippingFigures(worst, tuple(found), level_dn, share)
 
 
-def clipped_at(sensor: Sensor, frame: Array) -> tuple[int, float] | None:
-    """The value where a frame ends, DN, and the share of its pixels there; None for none.
-
-    Args:
-        sensor: as in the rig file.
-        frame: Level-0, (h, w) uint16.
-    """
+def _clipped_at(sensor: Sensor, frame: Array) -> tuple[int, float] | None:
+    """The value where a frame ends, DN, and the share of its pixels there; None for none."""
     step = max(STEP[0], len(frame) // ROWS)
     sample = frame[::step, :: STEP[1]].ravel()
     if sensor.raw_units_per_dn != 1:

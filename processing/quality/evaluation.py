@@ -142,7 +142,13 @@ def evaluate(
         probes_out_of_range: probes whose temperature cannot be.
         nominal_bands: colours placed by calibration because too few tie points were found.
         mismatched_bands: those of them that have texture that does not match that of green.
+        thresholds: None takes the defaults.
         requirements: of the project, if any.
+
+    Returns:
+        The report, its verdict that of the gravest finding.
+
+    Source: docs/explanation/mathematics/quality.md#flags-and-verdict.
     """
     t, figures = thresholds or Thresholds(), figures.finite()
     findings = [

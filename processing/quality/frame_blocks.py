@@ -96,7 +96,14 @@ def block_edges(
 
 
 def block_figures(blocks: tuple[BlockEdge, ...]) -> BlockFigures:
-    """The largest edge in figures of the quality report."""
+    """The largest edge in figures of the quality report.
+
+    Args:
+        blocks: edges of changed blocks, the largest first.
+
+    Returns:
+        Figures of the first; empty without an edge.
+    """
     if not blocks:
         return BlockFigures()
     worst = blocks[0]

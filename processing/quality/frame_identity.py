@@ -54,9 +54,15 @@ class FixedPatterns:
         self._known: dict[tuple[str, int], Array] = {}
 
     def of(self, name: str, shifts: int) -> Array | None:
-        """Second differences along the rows looked at, after so many TDI shifts.
+        """Pattern of a sensor's response in the rows looked at.
 
-        None for a sensor without a calibrated response.
+        Args:
+            name: of the sensor.
+            shifts: TDI shifts, over which the response is averaged.
+
+        Returns:
+            Second differences of the response between neighbours, (rows, columns); None for a
+            sensor without a calibrated response.
         """
         corrector = self._correctors.get(name)
         if corrector is None or corrector.response is None:
@@ -130,6 +136,9 @@ def identity_figures(
         placements: by calibration and TDM, by sensor name.
         tie_points: with the colour master.
         bands: how the others lie against it.
+
+    Returns:
+        Such frames, the heads they came from, and by what; empty without one.
     """
     found = by_pattern or _by_place(rig, placements, tie_points, bands)
     shown_by = "fixed pattern" if by_pattern else "geometry"

@@ -28,6 +28,9 @@ def signal_figures(
         sensors: those with a frame.
         frames: Level-1 words by sensor name, (h, w) uint16.
         statistics: of the correction, by sensor name.
+
+    Returns:
+        Mean, brightness and saturation; no groups without a sensor.
     """
     if not sensors:
         return ()
@@ -51,12 +54,15 @@ def sharpness_figures(
     frames: Mapping[str, Array],
     rows: Mapping[str, tuple[int, int]],
 ) -> SharpnessFigures | None:
-    """Share of the finest detail, the poorer of both directions, median over the sensors.
+    """Share of the finest detail over the sensors.
 
     Args:
         sensors: those with a frame.
         frames: Level-1 words by sensor name, (h, w) uint16.
         rows: first and last exposed row by sensor name.
+
+    Returns:
+        The poorer of both directions, median over the sensors; None without a sensor.
     """
     if not sensors:
         return None

@@ -30,7 +30,15 @@ from processing.quality.rules import above
 
 
 def content_findings(figures: QualityFigures, bands: Sequence[str]) -> list[Finding]:
-    """Frames with texture that show other ground than their neighbours."""
+    """Frames with texture that show other ground than their neighbours.
+
+    Args:
+        figures: of one exposure.
+        bands: bands whose texture does not match that of green.
+
+    Returns:
+        One finding or none.
+    """
     content, misread = figures.of(ContentFigures), figures.of(WordFormatFigures)
     frames = [f for f in content.mismatched_sensors if f not in misread.word_format_sensors]
     named = ", ".join([*frames, *bands])
@@ -50,7 +58,14 @@ def content_findings(figures: QualityFigures, bands: Sequence[str]) -> list[Find
 
 
 def identity_findings(figures: QualityFigures) -> list[Finding]:
-    """Frames that are stored for another head than the one that took them."""
+    """Frames that are stored for another head than the one that took them.
+
+    Args:
+        figures: of one exposure.
+
+    Returns:
+        One finding or none.
+    """
     identity = figures.of(IdentityFigures)
     if not identity.exchanged_frames:
         return []
@@ -71,7 +86,14 @@ def identity_findings(figures: QualityFigures) -> list[Finding]:
 
 
 def word_format_findings(figures: QualityFigures) -> list[Finding]:
-    """Words in another format than the rig file states."""
+    """Words in another format than the rig file states.
+
+    Args:
+        figures: of one exposure.
+
+    Returns:
+        One finding or none.
+    """
     words = figures.of(WordFormatFigures)
     if not words.word_format:
         return []
@@ -88,7 +110,15 @@ def word_format_findings(figures: QualityFigures) -> list[Finding]:
 
 
 def signal_findings(figures: QualityFigures, t: Thresholds) -> list[Finding]:
-    """Signal that a head or its read-out has changed."""
+    """Signal that a head or its read-out has changed.
+
+    Args:
+        figures: of one exposure.
+        t: limits.
+
+    Returns:
+        Findings about steps, balance, blocks, clipping and local blur.
+    """
     findings = []
     steps, unread = figures.of(SignalStepFigures), figures.of(UnreadFigures)
     step = steps.signal_step
@@ -211,6 +241,15 @@ def _blur(
 
 
 def exposure_findings(figures: QualityFigures, t: Thresholds) -> list[Finding]:
+    """Exposure that is too dark, too bright or blurred.
+
+    Args:
+        figures: of one exposure.
+        t: limits.
+
+    Returns:
+        Findings about brightness, exposure times, saturation, smear and sharpness.
+    """
     findings = []
     bright = figures.of(SignalFigures).bright_fraction
     if bright is not None and bright < t.bright_fraction:

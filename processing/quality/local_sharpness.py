@@ -50,7 +50,7 @@ class LocalBlur:
     along: Literal["columns", "rows"]
 
 
-def local_blurs(ground: CommonWindows) -> tuple[LocalBlur, ...]:
+def _local_blurs(ground: CommonWindows) -> tuple[LocalBlur, ...]:
     """The least sharp region of every frame that can be compared."""
     colour, pan = _colour_deficits(ground), _pan_deficits(ground)
     found = []
@@ -67,8 +67,15 @@ def local_blur_figures(rig: Rig, ground: CommonWindows | None) -> LocalBlurFigur
 
     Of PAN only what the next frame does not have counts: grounds differ in how their detail goes on
     below the pixels of colour, and then in several frames.
+
+    Args:
+        rig: the camera.
+        ground: windows that heads share; None where there are none.
+
+    Returns:
+        Sensor, deficit and region in pixels of both; None for a kind that cannot be compared.
     """
-    blurs = () if ground is None else local_blurs(ground)
+    blurs = () if ground is None else _local_blurs(ground)
     colour, _ = _least_sharp([b for b in blurs if not b.pan])
     pan, next_pan = _least_sharp([b for b in blurs if b.pan])
     usual = 0.0 if next_pan is None else max(0.0, next_pan.deficit)

@@ -19,7 +19,11 @@ def nominal_area(rig: Rig, missing: Collection[str]) -> ValidArea:
     """What the image of a rig holds while some heads gave no frame.
 
     Args:
+        rig: the camera.
         missing: sensors without a frame; names that the rig does not know are passed over.
+
+    Returns:
+        The valid area with its gaps by band.
     """
     return _nominal_area(rig, frozenset(missing))
 

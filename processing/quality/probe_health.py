@@ -86,6 +86,7 @@ class ProbeReading:
 
     @property
     def flag(self) -> Flag:
+        """The flag that the probe's state raises."""
         return FLAGS[self.state]
 
 
@@ -93,7 +94,14 @@ def bridge_by_others(rig: Rig, usable_c: Mapping[str, float]) -> dict[str, float
     """Temperatures for the probes of one exposure that have none, from those that have one.
 
     The camera warms as a whole: a probe without a reading is taken to be as far above its
-    calibration temperature as the median of the others. Empty where there are no others.
+    calibration temperature as the median of the others.
+
+    Args:
+        rig: the camera.
+        usable_c: temperatures that can be used, degC, by probe name.
+
+    Returns:
+        Temperatures of the other probes, degC; empty where `usable_c` has none of the rig's.
     """
     reference = calibration_temperatures(rig)
     offsets = [usable_c[p] - reference[p] for p in reference if p in usable_c]
@@ -104,7 +112,14 @@ def bridge_by_others(rig: Rig, usable_c: Mapping[str, float]) -> dict[str, float
 
 
 def calibration_temperatures(rig: Rig) -> dict[str, float]:
-    """By probe, degC: of the cone it belongs to, else of the first sensor that uses it."""
+    """Temperature at calibration of every probe.
+
+    Args:
+        rig: the camera.
+
+    Returns:
+        degC by probe: of the cone it belongs to, else of the first sensor that uses it.
+    """
     result = {sensor.probe: sensor.calibration_c for sensor in reversed(rig.sensors)}
     result |= {cone.probe: cone.calibration_c for cone in reversed(rig.cones)}
     return {probe: result[probe] for probe in rig.probes}
@@ -127,6 +142,9 @@ def evaluate_probes(
         estimates: temperature (degC) and its standard deviation (K) by stitching, for probes whose
             cone has an estimate; used for bridging only, weighted with the other probes.
         settings: None takes the defaults.
+
+    Returns:
+        State and temperature of every probe of `calibration_c`.
     """
     settings = settings or ProbeSettings()
     past = {

@@ -32,6 +32,9 @@ def unread_figures(unread_fraction: Mapping[str, float | None]) -> UnreadFigures
     Args:
         unread_fraction: `processing.radiometry.level1.FrameStatistics.unread_fraction` by sensor
             name; sensors without one are skipped.
+
+    Returns:
+        Share, 0 to 1, and sensor; None where no sensor has one.
     """
     shares = {name: share for name, share in unread_fraction.items() if share is not None}
     if not shares:

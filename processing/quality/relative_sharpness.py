@@ -39,6 +39,12 @@ def relative_sharpness_figures(
         rig: the camera.
         placements: of the sensors, by name.
         frames: Level-1 words by sensor name, (h, w) uint16.
+
+    Returns:
+        Sensor and its detail over that of its neighbours; empty where no head is clearly less
+        sharp, None where none can be compared.
+
+    Source: docs/explanation/mathematics/quality.md#sharpness.
     """
     common = [o for o in overlaps(rig) if o.sensor_a in frames and o.sensor_b in frames]
     shares: dict[tuple[str, Overlap], tuple[float | None, float | None]] = {}

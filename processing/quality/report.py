@@ -133,7 +133,14 @@ class Thresholds:
 
 
 def as_json(report: QualityReport) -> dict[str, Any]:
-    """The report as JSON-ready data: no NaN, no infinity, flags by name."""
+    """The report as JSON-ready data: no NaN, no infinity, flags by name.
+
+    Args:
+        report: of one exposure.
+
+    Returns:
+        Content of quality.json.
+    """
     return {
         "verdict": report.verdict.value,
         "flags": [flag.name for flag in Flag if flag & report.flags],

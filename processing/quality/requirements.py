@@ -34,9 +34,16 @@ class QualityRequirements:
 def requirement_findings(
     figures: QualityFigures, requirements: QualityRequirements
 ) -> Iterator[Finding]:
-    """A finding, and a re-fly, for everything asked for that an exposure does not keep.
+    """What a project asks for and an exposure does not keep.
 
     Unknown figures are not evaluated.
+
+    Args:
+        figures: of one exposure.
+        requirements: limits of the project.
+
+    Yields:
+        A finding with a re-fly for each requirement that is not met.
     """
     geometry, time = figures.of(GeometryFigures), figures.of(TimeFigures)
     for value, limit, flag, is_minimum, sentence in (

@@ -86,7 +86,14 @@ def signal_steps(
 
 
 def step_figures(steps: Sequence[SignalStep]) -> SignalStepFigures:
-    """The largest step in figures of the quality report."""
+    """The largest step in figures of the quality report.
+
+    Args:
+        steps: of the frames of one exposure, the largest first.
+
+    Returns:
+        Figures of the first; empty without a step.
+    """
     if not steps:
         return SignalStepFigures()
     worst = steps[0]

@@ -39,7 +39,17 @@ def stitching_figures(
 ) -> Iterator[FigureGroup]:
     """Tie points, adjustment, displaced sensor, balance and colour registration.
 
-    Overlaps of sensors that are not `present` do not count as poor in tie points.
+    Args:
+        rig: the camera.
+        tie_points: those the mosaic is of.
+        mosaic: what the image was made with.
+        validity: test of the calibration; None where it was not made.
+        balance: of the PAN heads.
+        bands: how the other colours were registered to green.
+        present: sensors with a frame; overlaps of others do not count as poor in tie points.
+
+    Yields:
+        Groups of figures.
     """
     yield _adjustment(mosaic)
     outlier = balance.outlier or (None, None)
@@ -56,7 +66,16 @@ def stitching_figures(
 
 
 def poorest_overlap(rig: Rig, mosaic: Mosaic, present: Collection[str]) -> tuple[str, str] | None:
-    """The overlap of PAN sensors that are `present` with the fewest tie points in use."""
+    """The overlap of PAN sensors with the fewest tie points in use.
+
+    Args:
+        rig: the camera.
+        mosaic: the adjustment.
+        present: sensors with a frame; overlaps of others are left out.
+
+    Returns:
+        Names of both sensors; None without such an overlap.
+    """
     pan = {s.name for cone in rig.pan_cones for s in cone.sensors if s.name in present}
     overlaps = [pair for pair in mosaic.used if pan.issuperset(pair)]
     return min(overlaps, key=lambda pair: mosaic.used[pair], default=None)

@@ -32,6 +32,16 @@ from processing.quality.rules import above, probe_bias_phrase
 def stitching_findings(
     figures: QualityFigures, nominal_bands: Sequence[str], t: Thresholds
 ) -> list[Finding]:
+    """Stitching that is weak, does not fit, or disagrees with the calibration.
+
+    Args:
+        figures: of one exposure.
+        nominal_bands: bands placed by calibration because too few tie points were found.
+        t: limits.
+
+    Returns:
+        Findings about tie points, fit, scales, mountings, slips and displaced sensors.
+    """
     findings = []
     overlap, slip = figures.of(PoorestOverlapFigures), figures.of(SlipFigures)
     elsewhere = figures.of(ContentFigures).mismatched_sensors

@@ -43,32 +43,59 @@ class ValidArea:
     gaps: Mapping[str, tuple[Box, ...]] = field(default_factory=dict)
 
     def mask(self, band: str) -> Mask:
-        """Which cells are valid, (rows, columns)."""
+        """Which cells of a band are valid.
+
+        Args:
+            band: name of the band.
+
+        Returns:
+            True for valid cells, (rows, columns).
+        """
         valid = np.ones((self.rows, self.columns), np.bool_)
         for left, top, right, bottom in self.gaps.get(band, ()):
             valid[top:bottom, left:right] = False
         return valid
 
     def share(self, band: str) -> float:
-        """The valid share of a band, 0 to 1."""
+        """The valid share of a band.
+
+        Args:
+            band: name of the band.
+
+        Returns:
+            0 to 1.
+        """
         return float(self.mask(band).mean())
 
 
 def grid_of(width_px: int, height_px: int) -> tuple[int, int]:
-    """Columns and rows of cells of an image; cells are square but for rounding."""
+    """Grid of an image; cells are square but for rounding.
+
+    Args:
+        width_px: of the image.
+        height_px: of the image.
+
+    Returns:
+        Columns and rows of cells, at most `CELLS`.
+    """
     longer = max(width_px, height_px)
     return max(1, round(CELLS * width_px / longer)), max(1, round(CELLS * height_px / longer))
 
 
 def gap_cells(raster: NDArray[Any], columns: int, rows: int, *, saturated_bit: int = 0) -> Mask:
-    """Which cells of an image hold no valid pixels, (rows, columns).
+    """Which cells of an image hold no valid pixels.
 
     A cell is valid where at least half of its pixels are; gaps narrower than half a cell are not
     seen. Sixteen pixels of a cell are looked at.
 
     Args:
         raster: (h, w) integers over the whole image; 0 is no data.
+        columns: cells across the image.
+        rows: cells down the image.
         saturated_bit: the bit of a value that marks saturation; 0 where none does.
+
+    Returns:
+        True for gaps, (rows, columns).
     """
     height, width = raster.shape
     down = ((np.arange(rows * SAMPLES) + 0.5) * height / (rows * SAMPLES)).astype(np.int64)
@@ -82,6 +109,12 @@ def gap_cells(raster: NDArray[Any], columns: int, rows: int, *, saturated_bit: i
 
 def area_of(cells: Mapping[str, Mask]) -> ValidArea:
     """The area by the gap cells of every band, all on one grid.
+
+    Args:
+        cells: True for gaps, (rows, columns), by band.
+
+    Returns:
+        The area; bands without gaps are not listed.
 
     Raises:
         ValueError: there is no band at all.
@@ -107,6 +140,9 @@ def area_of_rasters(
         bands: all that the image is to have.
         cells: columns and rows of the grid.
         saturated_bit: of a raster's words.
+
+    Returns:
+        The area.
     """
     columns, rows = cells
     nothing = np.ones((rows, columns), np.bool_)
@@ -121,9 +157,16 @@ def area_of_rasters(
 
 
 def boxes_of(gaps: Mask, most: int = BOXES_MAX) -> tuple[Box, ...]:
-    """Boxes that cover the true cells of a grid and no others, at most so many.
+    """Boxes that cover the true cells of a grid and no others.
 
-    Where more were needed, the grid is coarsened by twos, majority of cells.
+    Where more than `most` were needed, the grid is coarsened by twos, majority of cells.
+
+    Args:
+        gaps: True for gaps, (rows, columns).
+        most: largest number of boxes.
+
+    Returns:
+        Left, top, right, bottom of each in cells, right and bottom exclusive.
     """
     scale, cells = 1, gaps
     rows, columns = gaps.shape
@@ -137,20 +180,41 @@ def boxes_of(gaps: Mask, most: int = BOXES_MAX) -> tuple[Box, ...]:
 
 
 def valid_area_figures(area: ValidArea) -> ValidAreaFigures:
-    """The band with the smallest valid share, and that share; no band where all are whole."""
+    """The band with the smallest valid share, and that share.
+
+    Args:
+        area: of one image.
+
+    Returns:
+        Share and band; share 1 and no band where all are whole.
+    """
     shares = {band: area.share(band) for band in area.gaps}
     worst = min(shares, key=lambda band: shares[band], default=None)
     return ValidAreaFigures(1.0 if worst is None else shares[worst], worst)
 
 
 def as_json(area: ValidArea) -> dict[str, Any]:
-    """The area as `quality.json` and telemetry hold it."""
+    """The area as `quality.json` and telemetry hold it.
+
+    Args:
+        area: of one image.
+
+    Returns:
+        JSON-ready data.
+    """
     gaps = {band: [list(box) for box in boxes] for band, boxes in area.gaps.items()}
     return {"columns": area.columns, "rows": area.rows, "gaps": gaps}
 
 
 def from_json(content: object) -> ValidArea | None:
-    """The area out of `quality.json`; None where it holds none that can be used."""
+    """The area out of `quality.json`.
+
+    Args:
+        content: parsed JSON of any kind.
+
+    Returns:
+        The area; None where `content` holds none that can be used.
+    """
     if not isinstance(content, Mapping):
         return None
     columns, rows, gaps = content.get("columns"), content.get("rows"), content.get("gaps")

@@ -27,6 +27,9 @@ def word_format_figures(rig: Rig, frames: Mapping[str, Array]) -> WordFormatFigu
     Args:
         rig: the camera.
         frames: Level-0 frames by sensor name, (h, w) uint16, DN.
+
+    Returns:
+        The formats found and the sensors; None where all are as stated.
     """
     wrong = {
         s.name: format_
@@ -39,11 +42,15 @@ def word_format_figures(rig: Rig, frames: Mapping[str, Array]) -> WordFormatFigu
 
 
 def wrong_format(sensor: Sensor, frame: Array) -> str | None:
-    """The format of a frame's words where it is not the sensor's; None where it is.
+    """The format of a frame's words where it is not the sensor's.
 
     Args:
         sensor: as in the rig file.
         frame: Level-0, (h, w) uint16.
+
+    Returns:
+        "byte-swapped", "left-justified", "right-justified" or "beyond N bits"; None where the
+        format is the sensor's or not determinable.
     """
     if sensor.bits >= 16:
         return None

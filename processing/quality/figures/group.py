@@ -29,11 +29,25 @@ class Key:
     pattern: str
 
     def of(self, name: str) -> str:
-        """The figure's name for one key of the mapping."""
+        """The figure's name for one key of the mapping.
+
+        Args:
+            name: the key, such as that of a cone.
+
+        Returns:
+            The pattern with the key in the place of `<...>`.
+        """
         return re.sub("<.*>", lambda _: name, self.pattern)
 
     def names_in(self, content: Mapping[str, Any]) -> dict[str, Any]:
-        """Values of quality.json by key of the mapping."""
+        """Pick the mapping's figures.
+
+        Args:
+            content: figures of quality.json by name.
+
+        Returns:
+            Values by key of the mapping.
+        """
         form = re.compile(re.sub("<.*>", "(.+)", self.pattern))
         found = {name: form.fullmatch(name) for name in content}
         return {match[1]: content[name] for name, match in found.items() if match is not None}
@@ -58,7 +72,11 @@ class FigureGroup:
     """Figures that are determined together; None is not determined."""
 
     def as_json(self) -> dict[str, Figure]:
-        """Figures by their documented names."""
+        """Figures by their documented names.
+
+        Returns:
+            All figures of the group, null where one is not determined.
+        """
         content: dict[str, Figure] = {}
         for one in _fields(type(self)):
             value = getattr(self, one.name)
@@ -82,20 +100,42 @@ class QualityFigures:
         object.__setattr__(self, "groups", tuple(by_type.values()))
 
     def of(self, kind: type[Group]) -> Group:
-        """One group; where it is not there, one of which nothing is determined."""
+        """One group of figures.
+
+        Args:
+            kind: class of the group.
+
+        Returns:
+            The group; where it is not there, one of which nothing is determined.
+        """
         return next((group for group in self.groups if isinstance(group, kind)), kind())
 
     def finite(self) -> QualityFigures:
-        """The same with None for what is no number."""
+        """The same without NaN and infinity.
+
+        Returns:
+            A copy with None for what is no number.
+        """
         return QualityFigures(*(_finite(group) for group in self.groups))
 
     def as_json(self) -> dict[str, Figure]:
-        """Figures by their documented names, as in quality.json."""
+        """Figures by their documented names, as in quality.json.
+
+        Returns:
+            Figures of all groups.
+        """
         return {name: value for group in self.groups for name, value in group.as_json().items()}
 
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> QualityFigures:
-        """Figures as quality.json has them; a value of another type is not determined."""
+        """Figures as quality.json has them.
+
+        Args:
+            content: figures by name.
+
+        Returns:
+            Groups of figures; a value of another type is not determined.
+        """
         kinds = FigureGroup.__subclasses__()
         named = {one.name for kind in kinds for one in _fields(kind) if one.key is None}
         keyed = {name: value for name, value in content.items() if name not in named}
@@ -103,7 +143,11 @@ class QualityFigures:
 
 
 def documented_figures() -> dict[str, str]:
-    """The meaning of every figure by its name."""
+    """The meaning of every figure.
+
+    Returns:
+        Meaning by the name in quality.json.
+    """
     kinds = FigureGroup.__subclasses__()
     return {one.json_name: one.meaning for kind in kinds for one in _fields(kind)}
 
