@@ -204,7 +204,7 @@ def scale_figures(held: HeldQuantities | None) -> HeadScaleFigures | None:
     neighbours alone, all heads are weighed together: the one that bends the others is named.
 
     Args:
-        held: None for a rig with a master cone.
+        held: from `held_quantities`; None where it had nothing to go by.
 
     Returns:
         Scale, ppm, and name of the head; None where no scale differs significantly.
