@@ -87,8 +87,8 @@ ALLOWED: Final[dict[tuple[str, str], str]] = {
     ("daemon/mission/mirror/mirrored_log.py", "tell"): "method of a binary stream",
 }
 
-_WORD: Final = re.compile(r"[A-Za-z]+")
-_PART: Final = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+")
+WORD: Final = re.compile(r"[A-Za-z]+")
+PART: Final = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+")
 
 
 class Occurrence(NamedTuple):
@@ -116,8 +116,8 @@ def occurrences(paths: tuple[str, ...] = ()) -> Iterator[Occurrence]:
             continue
         allowed = {word for (place, word) in ALLOWED if path == place or path.startswith(place)}
         for number, text in enumerate((ROOT / path).read_text("utf-8").splitlines(), 1):
-            for name in _WORD.findall(text):
-                for part in _PART.findall(name):
+            for name in WORD.findall(text):
+                for part in PART.findall(name):
                     word = part.lower()
                     if word in INSTEAD and word not in allowed:
                         yield Occurrence(path, number, word, text.strip())
