@@ -13,6 +13,8 @@ COMPLETE: tuple[str, ...] = (
     "drivers/contract.py",
     "drivers/detection",
     "drivers/errors.py",
+    "drivers/receivers",
+    "drivers/thermometers",
     "drivers/timescales",
     "drivers/transport",
     "drivers/triggers",

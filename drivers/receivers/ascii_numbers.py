@@ -19,6 +19,12 @@ _DECIMAL: Final = re.compile(
 def parse_integer(text: str) -> int:
     """The value of a field of a whole number.
 
+    Args:
+        text: an optional sign and 1 to 18 digits.
+
+    Returns:
+        The number.
+
     Raises:
         ValueError: it is empty or anything else, "1.0" and "1_0" too.
 
@@ -33,6 +39,12 @@ def parse_integer(text: str) -> int:
 
 def parse_decimal(text: str) -> float:
     """The value of a field of a finite decimal number, with or without an exponent.
+
+    Args:
+        text: an optional sign, digits with or without a decimal point, an optional exponent.
+
+    Returns:
+        The number.
 
     Raises:
         ValueError: it is empty, not finite or anything else.

@@ -19,7 +19,18 @@ GIMBAL_LOCK_COSINE = 1e-7
 
 
 def interpolated_quaternion(first: Quaternion, second: Quaternion, fraction: float) -> Quaternion:
-    """The rotation that share of the way from the first to the second, along the shorter arc."""
+    """The rotation between two others, along the shorter arc.
+
+    Args:
+        first: unit quaternion.
+        second: unit quaternion.
+        fraction: share of the way from `first` to `second`; 0 and 1 give these.
+
+    Returns:
+        Unit quaternion.
+
+    Source: Shoemake (1985), slerp.
+    """
     cosine = sum(a * b for a, b in zip(first, second, strict=True))
     sign = -1.0 if cosine < 0 else 1.0
     angle = math.acos(min(1.0, abs(cosine)))
@@ -33,6 +44,16 @@ def interpolated_quaternion(first: Quaternion, second: Quaternion, fraction: flo
 
 def quaternion_of(roll_rad: float, pitch_rad: float, heading_rad: float) -> Quaternion:
     """The rotation from body to north, east, down of roll, pitch and heading.
+
+    Args:
+        roll_rad: rotation about the forward axis, right side down positive, rad.
+        pitch_rad: nose up positive, rad.
+        heading_rad: clockwise from north, rad.
+
+    Returns:
+        Unit quaternion w, x, y, z.
+
+    Source: docs/explanation/mathematics/navigation.md.
 
     Example:
         >>> quaternion_of(0.0, 0.0, 0.0)
@@ -50,7 +71,16 @@ def quaternion_of(roll_rad: float, pitch_rad: float, heading_rad: float) -> Quat
 
 
 def angles_of(q: Quaternion) -> tuple[float, float, float]:
-    """Roll, pitch and heading (0 to 2 pi), rad, of the rotation from body to north, east, down.
+    """Roll, pitch and heading of a rotation.
+
+    Args:
+        q: unit quaternion of the rotation from body to north, east, down.
+
+    Returns:
+        Roll (-pi to pi), pitch (-pi/2 to pi/2) and heading (0 to 2 pi), rad. Where the cosine of
+        pitch is below GIMBAL_LOCK_COSINE, roll is 0.
+
+    Source: docs/explanation/mathematics/navigation.md.
 
     Example:
         >>> [round(angle, 6) for angle in angles_of((1.0, 0.0, 0.0, 0.0))]

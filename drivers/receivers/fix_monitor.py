@@ -16,7 +16,13 @@ LOST_FOR_NS: Final = 2_000_000_000
 
 
 def missing_for_flight(sample: NavSample) -> str | None:
-    """What a sample does not have that an exposure needs, in words; None where it has all.
+    """What a sample does not have that an exposure needs.
+
+    Args:
+        sample: the sample.
+
+    Returns:
+        "position", "usable time" or "height", the first that is missing; None if nothing is.
 
     Example:
         >>> from dataclasses import replace
@@ -34,7 +40,14 @@ def missing_for_flight(sample: NavSample) -> str | None:
 
 
 def fix_description(fix: str | None, satellites: int | None) -> str:
-    """Such as "searching, 0 satellites" or "3d, 9 satellites".
+    """A receiver's fix in words.
+
+    Args:
+        fix: fix status as in NavSample; None if it was not received.
+        satellites: satellites in use; None if unknown.
+
+    Returns:
+        Such as "searching, 0 satellites" or "3d, 9 satellites".
 
     Example:
         >>> fix_description("none", 0), fix_description("3d", None)
@@ -66,7 +79,12 @@ class FixMonitor:
         self._lost_ns, self._is_searching = None, False
 
     def update(self, fix: str | None, satellites: int | None) -> None:
-        """Note the receiver's latest fix status; None before the first."""
+        """Note the receiver's latest fix status.
+
+        Args:
+            fix: fix status as in NavSample; None before the first.
+            satellites: satellites in use; None if unknown.
+        """
         if fix is None:
             return
         now_ns = self._clock.mono_ns()

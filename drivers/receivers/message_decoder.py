@@ -27,9 +27,18 @@ class Framer(Protocol):
     def pending(self) -> int:
         """Bytes of a message that is not whole yet."""
 
-    def reset(self) -> None: ...
+    def reset(self) -> None:
+        """Discard an incomplete message."""
 
-    def feed(self, data: bytes) -> list[bytes]: ...
+    def feed(self, data: bytes) -> list[bytes]:
+        """Add bytes of the stream.
+
+        Args:
+            data: bytes as received, cut anywhere.
+
+        Returns:
+            The messages that became complete with them.
+        """
 
 
 class MessageDecoder:
@@ -60,7 +69,18 @@ class MessageDecoder:
 
     @abstractmethod
     def on_message(self, message: bytes, mono_ns: int) -> list[Nav]:
-        """Records that one whole message makes; raises one of `decode_errors` if it is invalid."""
+        """Interpret one complete message.
+
+        Args:
+            message: its bytes, checked by the framer.
+            mono_ns: arrival on CLOCK_MONOTONIC, ns.
+
+        Returns:
+            The records it makes; may be empty.
+
+        Raises:
+            Exception: one of `decode_errors` if the message is invalid.
+        """
 
     @property
     def leap_seconds(self) -> int | None:
@@ -93,7 +113,15 @@ class MessageDecoder:
         self.fix = self.satellites = None
 
     def feed(self, data: bytes, mono_ns: int) -> list[Nav]:
-        """Records that became whole with these bytes, stamped with their arrival."""
+        """Decode bytes of the stream; an invalid message is counted.
+
+        Args:
+            data: bytes as received, cut anywhere.
+            mono_ns: their arrival on CLOCK_MONOTONIC, ns.
+
+        Returns:
+            The records that became complete, stamped with `mono_ns`.
+        """
         records: list[Nav] = []
         for message in self._framer.feed(data):
             try:
@@ -108,7 +136,14 @@ class MessageDecoder:
         return records
 
     def is_near_navigation(self, gps_ns: int) -> bool:
-        """Whether a mark may be of this time; one far from navigation is counted."""
+        """Whether a mark may be of a time; one far from navigation is counted.
+
+        Args:
+            gps_ns: time of the mark, ns since the GPS epoch.
+
+        Returns:
+            True within FAR_NS of the last navigation epoch, and before the first one.
+        """
         if self._gps_ns is None or abs(gps_ns - self._gps_ns) <= FAR_NS:
             return True
         self.counters["marks_far"] += 1

@@ -42,7 +42,14 @@ class MessageFramer:
         self._buffer = b""
 
     def feed(self, data: bytes) -> list[bytes]:
-        """The messages that became whole with these bytes, sync and checksum included."""
+        """Add bytes of the stream.
+
+        Args:
+            data: bytes as received, cut anywhere.
+
+        Returns:
+            The messages that became complete with them, sync and checksum included.
+        """
         buffer = self._buffer + data
         found = []
         at = 0
@@ -86,7 +93,16 @@ class MessageFramer:
 
 
 def line_size(buffer: bytes, at: int, limit: int) -> int | None:
-    """Size of a printable line with its line feed, `limit` bytes at most; see SizeOf."""
+    """Size of a printable line with its line feed.
+
+    Args:
+        buffer: bytes of the stream.
+        at: where the line begins with its mark.
+        limit: largest size, bytes.
+
+    Returns:
+        As SizeOf: bytes; 0 if there is no such line, None if it is not complete yet.
+    """
     match = _LINE.match(buffer, at, at + limit)
     end = match.end() if match else at
     if end - at >= limit:

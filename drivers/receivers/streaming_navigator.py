@@ -71,7 +71,11 @@ class StreamingNavigator(SerialDevice):
 
     @abstractmethod
     def new_decoder(self) -> MessageDecoder:
-        """The decoder of this protocol, with this device's settings."""
+        """The decoder of this protocol, with this device's settings.
+
+        Returns:
+            A new decoder.
+        """
 
     def line_settings(self) -> tuple[int, str]:
         return self.baudrate, self.parity
@@ -105,7 +109,11 @@ class StreamingNavigator(SerialDevice):
         )
 
     def undecodable_sentence(self) -> str:
-        """What the operator reads where bytes came and none of them made sense."""
+        """What the operator reads if bytes were received and none of them could be decoded.
+
+        Returns:
+            The sentence, without a full stop.
+        """
         return (
             f"what comes at {self.port} is no {self.protocol}; check that the receiver sends "
             f"{self.protocol} here, and on a serial port that its speed is {self.baudrate} bit/s"

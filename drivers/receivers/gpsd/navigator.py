@@ -20,7 +20,15 @@ from drivers.transport.tcp_port import SCHEME, TcpPort, open_tcp_port
 
 
 def open_gpsd(path: str, baudrate: int, parity: str) -> TcpPort:
-    """Connect to host:port; a connection has neither speed nor parity.
+    """Connect to a gpsd.
+
+    Args:
+        path: host:port.
+        baudrate: not used; a connection has none.
+        parity: not used; a connection has none.
+
+    Returns:
+        The connection.
 
     Raises:
         DeviceError: the address does not answer; the message contains the remedy.

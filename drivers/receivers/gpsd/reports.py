@@ -73,7 +73,15 @@ class GpsdReports:
         return "by our table, gpsd sends none" if self.counters["samples"] else "unknown"
 
     def feed(self, data: bytes, mono_ns: int) -> list[NavSample]:
-        """The samples in these bytes and what was left of those before."""
+        """Decode bytes of the connection.
+
+        Args:
+            data: bytes as received, cut anywhere.
+            mono_ns: their arrival on CLOCK_MONOTONIC, ns.
+
+        Returns:
+            The samples of the lines that became complete.
+        """
         samples = []
         *lines, rest = (self._pending + data).split(b"\n")
         for line in lines:

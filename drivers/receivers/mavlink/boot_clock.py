@@ -71,7 +71,12 @@ class BootClock:
         self._doubt_ns = 0.0
 
     def add_system_time(self, unix_us: int, boot_ms: int) -> None:
-        """Add a SYSTEM_TIME; without UTC (before the first fix) it is ignored."""
+        """Add a SYSTEM_TIME; without UTC (before the first fix) it is ignored.
+
+        Args:
+            unix_us: `time_unix_usec`, UTC since 1970, us.
+            boot_ms: `time_boot_ms`, time since the autopilot's start, ms.
+        """
         if unix_us < UNIX_FROM_US:
             return
         # Time since start is cut to milliseconds: half of one is added on the average.
@@ -89,25 +94,54 @@ class BootClock:
         self.leap_seconds = leap_seconds_at(unix_ns - GPS_EPOCH_UNIX_NS)
 
     def gps_ns(self, boot_ns: int) -> int | None:
-        """GPS time of an instant of the autopilot's clock; None before UTC is known."""
+        """GPS time of an instant of the autopilot's clock.
+
+        Args:
+            boot_ns: time since the autopilot's start, ns.
+
+        Returns:
+            Nanoseconds since the GPS epoch; None before UTC is known.
+        """
         if not self._readings:
             return None
         return self.gps_of_unix_ns(boot_ns + round(self._line.at(boot_ns)))
 
     def gps_of_unix_ns(self, unix_ns: int) -> int:
-        """GPS time of a UTC instant."""
+        """GPS time of a UTC instant, with the built-in table of leap seconds.
+
+        Args:
+            unix_ns: UTC since 1970 without leap seconds, ns.
+
+        Returns:
+            Nanoseconds since the GPS epoch.
+        """
         utc_ns = unix_ns - GPS_EPOCH_UNIX_NS
         return utc_ns + leap_seconds_at(utc_ns) * SECOND_NS
 
     def gps_of_us(self, microseconds: int) -> tuple[int, int] | None:
-        """GPS time of a stamp that is either of UTC or counts from the start, and its sigma."""
+        """GPS time of a stamp that is either UTC or counts from the start.
+
+        Args:
+            microseconds: UTC since 1970 from UNIX_FROM_US on, else time since the start, us.
+
+        Returns:
+            Nanoseconds since the GPS epoch and their standard deviation, ns; None for a time since
+            the start before UTC is known.
+        """
         if microseconds >= UNIX_FROM_US:
             return self.gps_of_unix_ns(microseconds * 1000), self.utc_sigma_ns
         gps_ns = self.gps_ns(microseconds * 1000)
         return None if gps_ns is None else (gps_ns, self.sigma_ns(microseconds * 1000))
 
     def sigma_ns(self, boot_ns: int) -> int:
-        """Standard deviation of `gps_ns` against what the autopilot's UTC is on the average."""
+        """Standard deviation of `gps_ns` against the mean of the autopilot's UTC.
+
+        Args:
+            boot_ns: time since the autopilot's start, ns.
+
+        Returns:
+            Standard deviation, ns.
+        """
         return round(math.hypot(self._line.sigma_ns(boot_ns), TRUNCATION_SIGMA_NS, self._doubt_ns))
 
     @property

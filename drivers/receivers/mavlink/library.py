@@ -21,6 +21,9 @@ V2_OVERHEAD: Final = 12
 def dialect() -> Any:
     """The dialect with the most messages: ArduPilot's, which holds all common ones.
 
+    Returns:
+        The module of pymavlink.
+
     Raises:
         MissingExtraError: pymavlink is not installed.
     """
@@ -47,11 +50,22 @@ class MavlinkParser:
         )
 
     def framer(self) -> MessageFramer:
-        """A framer for versions 1 and 2, signed or not; messages not in the dialect are none."""
+        """A framer for versions 1 and 2, signed or not; messages not in the dialect are none.
+
+        Returns:
+            A new framer.
+        """
         return MessageFramer(bytes((V1, V2)), self._size_of, self._fits)
 
     def messages_of(self, datagram: bytes) -> list[bytes] | None:
-        """The checked messages of a datagram; None where it holds anything else."""
+        """The checked messages of a datagram.
+
+        Args:
+            datagram: its bytes.
+
+        Returns:
+            The bytes of each message; None if the datagram holds anything else.
+        """
         found, at = [], 0
         while at < len(datagram):
             size = self._size_of(datagram, at) if datagram[at] in (V1, V2) else 0
@@ -63,7 +77,17 @@ class MavlinkParser:
         return found
 
     def parse(self, frame: bytes) -> Any:
-        """The message of a checked frame; one of `errors` where its content makes no sense."""
+        """The message of a checked frame.
+
+        Args:
+            frame: bytes of one message.
+
+        Returns:
+            pymavlink's object of the message.
+
+        Raises:
+            Exception: one of `errors` if its content is invalid.
+        """
         return self._parser.decode(bytearray(frame))
 
     def _size_of(self, buffer: bytes, at: int) -> int | None:

@@ -114,17 +114,25 @@ class MavlinkNavigator(StreamingNavigator):
     # The port for TIMESYNC
 
     def subscribe_timesync(self, callback: TimesyncListener | None) -> None:
-        """Call `callback` with every TIMESYNC of the autopilot, from the thread that runs the device.
+        """Pass every TIMESYNC of the autopilot to a listener.
 
-        `callback` must return quickly; None ends the subscription.
+        Args:
+            callback: called from the thread that runs the device, returns quickly; None ends the
+                subscription.
         """
         self._timesync_listener = callback
 
     def send_timesync(self, *, tc1_ns: int, ts1_ns: int) -> bool:
-        """Send a TIMESYNC, from any thread; False where the line is not open or just lost.
+        """Send a TIMESYNC; from any thread.
 
-        A request has `tc1_ns` 0 and our own time in `ts1_ns`; an answer gives the asker's `ts1_ns`
-        back with our time in `tc1_ns`.
+        Args:
+            tc1_ns: 0 in a request, our own time in an answer, ns.
+            ts1_ns: our own time in a request, the requester's `ts1_ns` in an answer, ns.
+
+        Returns:
+            False if the line is not open, just lost, or the autopilot is not known yet.
+
+        Source: MAVLink, time synchronization protocol, TIMESYNC (111).
         """
         line = self._talking
         if line is None or not self.decoder.system:

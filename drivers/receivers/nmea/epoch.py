@@ -90,10 +90,13 @@ class Epoch:
         return "2d" if "2d" in self.fixes else "3d"
 
     def height_m(self, undulation_m: float | None) -> float | None:
-        """Above the ellipsoid; None where none came, or only one above the geoid.
+        """Height above the ellipsoid.
 
         Args:
-            undulation_m: geoid above ellipsoid, for a receiver that does not send it.
+            undulation_m: geoid above ellipsoid, m, if the receiver does not send it; None if unknown.
+
+        Returns:
+            Height, m; None if none was received, or only one above the geoid without undulation.
         """
         if self.ellipsoidal_m is not None:
             return self.ellipsoidal_m
@@ -105,8 +108,12 @@ class Epoch:
     def add(self, kind: str, fields: Fields) -> None:
         """Add the content of a sentence.
 
+        Args:
+            kind: key of SENTENCES.
+            fields: address and fields of the sentence.
+
         Raises:
-            ValueError, IndexError: it makes no sense; the epoch may hold a part of it.
+            ValueError, IndexError: the content is invalid; the epoch may hold a part of it.
         """
         SENTENCES[kind](self, fields)
         self.kinds.add(kind)

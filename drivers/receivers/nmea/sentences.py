@@ -29,7 +29,16 @@ _BARE: Final = re.compile(rb"\$([A-OQ-Z][A-Z][A-Z]{3}|P[A-Z]{3,}),[^*]*[\r\n]{1,
 
 
 def size_of(buffer: bytes, at: int) -> int | None:
-    """See `drivers.receivers.message_framer.SizeOf`. A line ends with CR LF, LF, or CR alone."""
+    """Size of a sentence; a line ends with CR LF, LF, or CR alone.
+
+    Args:
+        buffer: bytes of the stream.
+        at: where the sentence begins with "$".
+
+    Returns:
+        As `drivers.receivers.message_framer.SizeOf`: bytes; 0 if there is none, None if it is not
+        complete yet.
+    """
     match = _LINE.match(buffer, at, at + MAX_LENGTH)
     end = match.end() if match else at
     if end - at >= MAX_LENGTH:
@@ -45,7 +54,16 @@ def size_of(buffer: bytes, at: int) -> int | None:
 
 
 def is_sentence(line: bytes) -> bool:
-    """Whether a whole line is a sentence with the right checksum, or one that has none at all."""
+    """Whether a complete line is a sentence.
+
+    Args:
+        line: the line with its end.
+
+    Returns:
+        True if the checksum is right, or if there is none and the address is a valid one.
+
+    Source: NMEA 0183 as published in gpsd's "NMEA Revealed", checksums.
+    """
     match = _BODY.fullmatch(line)
     if match is None:
         return _BARE.fullmatch(line) is not None
@@ -56,41 +74,103 @@ def is_sentence(line: bytes) -> bool:
 
 
 def has_checksum(line: bytes) -> bool:
-    """Whether a sentence ends with a checksum."""
+    """Whether a sentence ends with a checksum.
+
+    Args:
+        line: the sentence.
+
+    Returns:
+        True if it holds an asterisk.
+    """
     return b"*" in line
 
 
 def is_proprietary(line: bytes) -> bool:
-    """Whether a sentence is of a maker's own kind; some send those without a checksum."""
+    """Whether a sentence is a manufacturer's own; some send those without a checksum.
+
+    Args:
+        line: the sentence.
+
+    Returns:
+        True if its address begins with P.
+    """
     return line.startswith(b"$P")
 
 
 def fields_of(line: bytes) -> list[str]:
-    """Address and fields of a sentence."""
+    """The fields of a sentence.
+
+    Args:
+        line: the sentence.
+
+    Returns:
+        Address and fields, without "$" and checksum.
+
+    Raises:
+        UnicodeDecodeError: it is not ASCII.
+    """
     return line[1:].partition(b"*")[0].decode("ascii").strip().split(",")
 
 
 def number(text: str) -> float:
-    """A decimal number; ValueError for anything else, "nan" and "1e9" too."""
+    """The value of a decimal field.
+
+    Args:
+        text: an optional sign and digits with or without a decimal point.
+
+    Returns:
+        The number.
+
+    Raises:
+        ValueError: anything else, "nan" and "1e9" too.
+    """
     if not _NUMBER.fullmatch(text):
         raise ValueError(f"{text!r} is no number")
     return float(text)
 
 
 def number_or_none(text: str) -> float | None:
-    """None for an empty field."""
+    """The value of a decimal field that may be empty.
+
+    Args:
+        text: the field.
+
+    Returns:
+        The number; None for an empty field.
+
+    Raises:
+        ValueError: it is neither empty nor a number.
+    """
     text = text.strip()
     return number(text) if text else None
 
 
 def dop_or_none(text: str) -> float | None:
-    """A dilution of precision; None where it is empty or a value that means "unknown"."""
+    """A dilution of precision.
+
+    Args:
+        text: the field.
+
+    Returns:
+        The value; None if it is empty or one that means "unknown" (0, DOP_UNKNOWN_FROM or more).
+
+    Raises:
+        ValueError: it is neither empty nor a number.
+    """
     value = number_or_none(text)
     return value if value is not None and 0 < value < DOP_UNKNOWN_FROM else None
 
 
 def angle_deg(text: str, hemisphere: str, limit: float) -> float | None:
-    """Degrees of dddmm.mmm and N, S, E or W; None where one of both is empty.
+    """Latitude or longitude of two fields.
+
+    Args:
+        text: dddmm.mmm.
+        hemisphere: N, S, E or W.
+        limit: largest absolute value, degrees.
+
+    Returns:
+        Degrees, south and west negative; None if one of both fields is empty.
 
     Raises:
         ValueError: it is no angle within the limit.
@@ -107,7 +187,13 @@ def angle_deg(text: str, hemisphere: str, limit: float) -> float | None:
 
 
 def position_of(fields: list[str]) -> tuple[float, float] | None:
-    """Latitude and longitude, degrees, of four fields; None where one is empty.
+    """Latitude and longitude of four fields.
+
+    Args:
+        fields: latitude, N or S, longitude, E or W.
+
+    Returns:
+        Latitude and longitude, degrees, north and east positive; None if one field is empty.
 
     Raises:
         ValueError: a field is no angle, or its hemisphere is one of the other angle.
@@ -120,7 +206,13 @@ def position_of(fields: list[str]) -> tuple[float, float] | None:
 
 
 def resolution_deg(text: str) -> float:
-    """What the last digit of a dddmm.mmm is worth, degrees.
+    """The weight of the last digit of an angle.
+
+    Args:
+        text: dddmm.mmm.
+
+    Returns:
+        Degrees.
 
     Example:
         >>> round(resolution_deg("4717.1127") * 60, 6)
@@ -130,7 +222,17 @@ def resolution_deg(text: str) -> float:
 
 
 def time_of_day_ns(text: str) -> tuple[int, bool]:
-    """Nanoseconds of hhmmss.fff, exact, and whether it lies in a leap second (hh:mm:60)."""
+    """UTC time of day, exact to its digits.
+
+    Args:
+        text: hhmmss or hhmmss.fff with up to 9 decimals.
+
+    Returns:
+        Nanoseconds since midnight, and whether the time is in a leap second (hh:mm:60).
+
+    Raises:
+        ValueError: it is no time of day.
+    """
     match = _TIME.fullmatch(text)
     if match is None:
         raise ValueError(f"{text!r} is no time")
@@ -142,7 +244,17 @@ def time_of_day_ns(text: str) -> tuple[int, bool]:
 
 
 def day_of(text: str) -> int:
-    """Days since the GPS epoch of ddmmyy; a year from 80 on lies in the last century."""
+    """The day of a date.
+
+    Args:
+        text: ddmmyy; a year from 80 on is in the last century.
+
+    Returns:
+        Days since the GPS epoch.
+
+    Raises:
+        ValueError: it is no date.
+    """
     match = _DATE.fullmatch(text)
     if match is None:
         raise ValueError(f"{text!r} is no date")
@@ -151,5 +263,17 @@ def day_of(text: str) -> int:
 
 
 def day_number(year: int, month: int, day: int) -> int:
-    """Days since the GPS epoch; ValueError where there is no such date."""
+    """The day of a date.
+
+    Args:
+        year: all four digits.
+        month: 1 to 12.
+        day: 1 to 31.
+
+    Returns:
+        Days since the GPS epoch, 1980-01-06.
+
+    Raises:
+        ValueError: there is no such date.
+    """
     return datetime.date(year, month, day).toordinal() - GPS_EPOCH_DAY

@@ -40,17 +40,40 @@ class NovatelLog:
 
 
 def crc32(data: bytes) -> int:
-    """NovAtel's CRC: that of zlib without its complements."""
+    """NovAtel's CRC: that of zlib without its complements.
+
+    Args:
+        data: the bytes covered.
+
+    Returns:
+        32-bit checksum.
+
+    Source: OM-20000169, chapter 1, 32-Bit CRC.
+    """
     return zlib.crc32(data, 0xFFFFFFFF) ^ 0xFFFFFFFF
 
 
 def novatel_framer() -> MessageFramer:
-    """A framer for all four kinds of header."""
+    """A framer for all four kinds of header.
+
+    Returns:
+        A new framer.
+    """
     return MessageFramer(STARTS, _size_of, _fits)
 
 
 def log_of(frame: bytes) -> NovatelLog:
-    """A whole checked frame taken apart; ValueError where its text is none."""
+    """The parts of a log.
+
+    Args:
+        frame: a complete frame, checked by the framer.
+
+    Returns:
+        Identity, header time, time status and body.
+
+    Raises:
+        ValueError: an ASCII header has too few words or a word that is no number.
+    """
     if frame[0] == 0xAA:
         identity = struct.unpack_from("<H", frame, 4)[0]
         if frame[2] == 0x13:

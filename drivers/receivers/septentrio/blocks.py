@@ -66,12 +66,22 @@ class SbfBlock:
 
 
 def sbf_framer() -> MessageFramer:
-    """A framer for blocks of any kind."""
+    """A framer for blocks of any kind.
+
+    Returns:
+        A new framer.
+    """
     return MessageFramer(STARTS, _size_of, _fits)
 
 
 def crc(data: bytes) -> int:
     """CRC-16-CCITT, polynomial 0x1021, beginning with 0.
+
+    Args:
+        data: the bytes covered, from the block's ID on.
+
+    Returns:
+        16-bit checksum.
 
     Example:
         >>> hex(crc(b"123456789"))
@@ -81,11 +91,17 @@ def crc(data: bytes) -> int:
 
 
 def block_of(frame: bytes) -> SbfBlock | None:
-    """A whole checked block taken apart; None for one of no use here.
+    """The parts of a block.
+
+    Args:
+        frame: a complete block, checked by the framer.
+
+    Returns:
+        Name, revision, time stamp and values; None for a block that is not in NAMES.
 
     Raises:
         struct.error: it is shorter than its kind.
-        ValueError: its time of week, or a number in it, is none.
+        ValueError: its time of week, or a number in it, is invalid.
     """
     identity = int.from_bytes(frame[4:6], "little")
     name = NAMES.get(identity & 0x1FFF)
@@ -105,7 +121,13 @@ def block_of(frame: bytes) -> SbfBlock | None:
 
 
 def number(value: int | float) -> int | float | None:
-    """The value, None where it is the float that means "do not use".
+    """A value of a block.
+
+    Args:
+        value: as unpacked.
+
+    Returns:
+        The value; None for the float that means "do not use".
 
     Raises:
         ValueError: infinite or not a number.
@@ -119,9 +141,15 @@ def number(value: int | float) -> int | float | None:
 
 
 def accuracies_m(block: SbfBlock) -> tuple[float, float] | None:
-    """Horizontal and vertical standard deviation of a PVTGeodetic of revision 2; None without.
+    """Horizontal and vertical standard deviation of a PVTGeodetic of revision 2.
 
-    The block holds twice their value.
+    Args:
+        block: a PVTGeodetic; it holds twice the values (2DRMS and 2-sigma) in units of 0.01 m.
+
+    Returns:
+        Standard deviations, m; None in a block of an earlier revision or if they are not known.
+
+    Source: mosaic-X5 reference guide, PVTGeodetic, HAccuracy and VAccuracy.
     """
     at = _PVT_ACCURACY_AT
     if block.revision < 2 or len(block.rest) < at - _PVT.size + _PVT_ACCURACY.size:

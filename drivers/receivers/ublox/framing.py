@@ -54,7 +54,14 @@ class UbxFramer:
         self._buffer = b""
 
     def feed(self, data: bytes) -> list[bytes]:
-        """The frames that became whole with these bytes, sync and checksum included."""
+        """Add bytes of the stream.
+
+        Args:
+            data: bytes as received, cut anywhere.
+
+        Returns:
+            The frames that became complete with them, sync and checksum included.
+        """
         buffer = self._buffer + data
         found = []
         at = 0

@@ -77,9 +77,14 @@ class LinePattern:
             raise PatternError("its groups are nested too deeply") from error
 
     def search(self, line: str) -> Mapping[str, str] | None:
-        """The named groups of the leftmost match, in the order of the pattern; None if none matches.
+        """Search a line for the leftmost match.
 
-        A group that did not participate is omitted. At most `MAX_LINE` characters are searched.
+        Args:
+            line: Latin-1 text; at most `MAX_LINE` characters are searched.
+
+        Returns:
+            Text by named group, in the order of the pattern, without groups that did not
+            participate; None if the pattern does not match.
         """
         line = line[:MAX_LINE]
         found: tuple[int, ...] | None = None

@@ -47,7 +47,10 @@ class HostSensor:
         return tuple(f"{chip}/{channel}" for chip in chips for channel in channels)
 
     def read_c(self) -> float | None:
-        """The temperature in degC; None if the chip reports an open sensor.
+        """Read the sensor.
+
+        Returns:
+            Temperature, degC; None if the chip reports an open sensor.
 
         Raises:
             SensorLostError: it no longer exists or does not answer.
@@ -65,10 +68,13 @@ class HostSensor:
 
 
 def find_sensors(root: Path) -> list[HostSensor]:
-    """Every temperature of the host, hwmon before iio; empty if the kernel has none.
+    """Every temperature of the host.
 
     Args:
         root: where sysfs is mounted, normally /sys.
+
+    Returns:
+        The sensors, hwmon before iio; empty if the kernel has none.
 
     Source: Linux Documentation/hwmon/sysfs-interface, ABI/testing/sysfs-bus-iio.
     """

@@ -69,7 +69,14 @@ class HostThermometer(DeviceDriver):
         return found
 
     def bind(self) -> Mapping[str, str]:
-        """Find and read every sensor. See `drivers.contract.Device`."""
+        """Find and read every sensor. See `drivers.contract.Device`.
+
+        Returns:
+            The reading of each probe.
+
+        Raises:
+            DeviceError: a sensor is missing, ambiguous or unreadable; one line each.
+        """
         found = {}
         problems = []
         known = find_sensors(self._root)

@@ -39,6 +39,14 @@ class Reply:
 def crc16(data: bytes) -> int:
     """CRC-16/MODBUS.
 
+    Args:
+        data: the bytes covered; with the checksum behind them, low byte first, the result is 0.
+
+    Returns:
+        16-bit checksum.
+
+    Source: Modbus over Serial Line V1.02, section 6.2.2.
+
     Example:
         >>> hex(crc16(b"123456789"))
         '0x4b37'
