@@ -19,6 +19,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.ring_heads import RING, build_ring, is_intact, number_of
+from benchmarks.switch import Switch, switch
 from daemon.cli.benchmark import pipeline
 from daemon.cli.benchmark.measurement import machine
 from daemon.cli.sim import free_first_address
@@ -121,11 +123,20 @@ def main() -> None:
         default=10,
         help="Interval of full checks, exposures (default: 10).",
     )
+    parser.add_argument("--switch-mbps", type=float, help="a switch of this rate in between")
+    parser.add_argument("--switch-buffer", type=int, default=131_072, help="of its port, bytes")
+    parser.add_argument("--unpaced", action="store_true", help="no link budget for the heads")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args()
     rig = find_rig(options.rig)
-    with tempfile.TemporaryDirectory(prefix="syntopic-capture-", dir=options.root) as name:
-        result = _run(options, rig, Path(name))
+    with ExitStack() as resources:
+        temporary = tempfile.TemporaryDirectory(prefix="syntopic-capture-", dir=options.root)
+        folder = Path(resources.enter_context(temporary))
+        between = None
+        if options.switch_mbps:
+            sizes = (options.switch_mbps, options.switch_buffer)
+            between = resources.enter_context(switch(len(rig.sensors), *sizes))
+        result = _run(options, rig, folder, between)
     if options.json:
         print(json.dumps(result))
     else:
@@ -133,7 +144,9 @@ def main() -> None:
     sys.exit(0 if result["nothing_lost"] else 1)
 
 
-def _run(options: argparse.Namespace, rig: Rig, folder: Path) -> dict[str, Any]:
+def _run(
+    options: argparse.Namespace, rig: Rig, folder: Path, between: Switch | None
+) -> dict[str, Any]:
     exposure_nbytes = sum(2 * s.width_px * s.height_px for s in rig.sensors)
     # What the pipeline puts off waits on disk until it is done.
     retained = RETAINED_EXPOSURES + (options.exposures if options.pipeline else 0)
@@ -147,8 +160,11 @@ def _run(options: argparse.Namespace, rig: Rig, folder: Path) -> dict[str, Any]:
     _refuse_small_disk(cache, exposure_nbytes * RING)
     build_ring(options.rig, frames, ring)
     interval_s = options.interval or rig.frame_interval_s
-    block = free_first_address().rpartition(".")[0]
-    addresses = {s.name: f"{block}.{2 + i}" for i, s in enumerate(rig.sensors)}
+    if between is None:
+        block = free_first_address().rpartition(".")[0]
+        addresses = {s.name: f"{block}.{2 + i}" for i, s in enumerate(rig.sensors)}
+    else:
+        addresses = {s.name: between.head_address(i) for i, s in enumerate(rig.sensors)}
     request = {
         "rig": options.rig,
         "ring": str(ring),
@@ -156,8 +172,11 @@ def _run(options: argparse.Namespace, rig: Rig, folder: Path) -> dict[str, Any]:
         "processes": options.processes,
         "rate_bytes_per_s": options.rate * 1e6,
     }
+    if between is not None:
+        request["bus_host"] = between.head_address(0)
+    emulate = [sys.executable, "-m", "benchmarks.ring_heads", json.dumps(request)]
     emulator = subprocess.Popen(
-        [sys.executable, "-m", "benchmarks.ring_heads", json.dumps(request)],
+        emulate if between is None else between.at_heads(emulate),
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
@@ -166,15 +185,37 @@ def _run(options: argparse.Namespace, rig: Rig, folder: Path) -> dict[str, Any]:
         assert emulator.stdout is not None
         bus = json.loads(emulator.stdout.readline())
         config = folder / "service.toml"
-        config.write_text(_configuration(options, rig, addresses, bus, interval_s, place))
+        text = _configuration(options, rig, addresses, bus, interval_s, place)
+        config.write_text(text + _network(options, between))
         load_before = os.getloadavg()[0]
-        flown = _fly(options, config, bus, interval_s)
+        flown = _fly(options, config, bus, interval_s, between)
         counted, _ = emulator.communicate(timeout=READY_WITHIN_S)
     finally:
         emulator.kill()
-    return _evaluate(
+    found = _evaluate(
         options, rig, folder, flown, json.loads(counted), load_before, interval_s, exposure_nbytes
     )
+    if between is not None:
+        found["switch"] = {
+            "rate_mbps": options.switch_mbps,
+            "buffer_bytes": options.switch_buffer,
+            "paced": not options.unpaced,
+            "packets_dropped": between.dropped_packets(),
+        }
+    return found
+
+
+def _network(options: argparse.Namespace, between: Switch | None) -> str:
+    """The section of the link; the switch's port is slower than the interface reports."""
+    if between is None:
+        return ""
+    lines = [
+        "[network]",
+        f"link_mbps = {{ {between.interface} = {options.switch_mbps} }}",
+        f"switch_buffer_bytes = {options.switch_buffer}",
+        f"is_paced = {json.dumps(not options.unpaced)}",
+    ]
+    return "\n".join(lines) + "\n"
 
 
 def _refuse_small_disk(folder: Path, needed: int) -> None:
@@ -226,18 +267,21 @@ def _configuration(
 
 
 def _fly(
-    options: argparse.Namespace, config: Path, bus: Mapping[str, Any], interval_s: float
+    options: argparse.Namespace,
+    config: Path,
+    bus: Mapping[str, Any],
+    interval_s: float,
+    between: Switch | None,
 ) -> dict[str, Any]:
     """Run the service to its end while checking what it stores; returns its output."""
     processor, retention = CpuMeter(), Retention(options.full_check_every)
     flown: dict[str, Any] = {"events": [], "store_s": [], "delay_s": [], "ledger": {}}
     flown |= {"processed": []}
     triggered_ns: dict[int, int] = {}
+    fly = [sys.executable, "-m", "benchmarks.capture_service", str(config)]
+    fly += ["--pipeline"] if options.pipeline else []
     service = subprocess.Popen(
-        [
-            *(sys.executable, "-m", "benchmarks.capture_service", str(config)),
-            *(["--pipeline"] if options.pipeline else []),
-        ],
+        fly if between is None else between.at_computer(fly),
         stdout=subprocess.PIPE,
         text=True,
     )
@@ -440,6 +484,8 @@ def _print(result: Mapping[str, Any]) -> None:
         f"{result['packets_resent']} of {result['packets_sent']} packets twice; "
         f"{result['checked']} exposures checked, {result['fully_checked']} read completely"
     )
+    if "switch" in result:
+        console.print(f"switch: {_counted(result['switch'])}")
     for problem in (*result["problems"], *(str(event) for event in result["events"])):
         console.print(f"[red]{problem}[/]")
     console.print("nothing lost" if result["nothing_lost"] else "[bold red]something was lost[/]")

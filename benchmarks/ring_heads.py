@@ -43,6 +43,7 @@ class RingPlan:
     ring: Path
     addresses: Mapping[str, str]
     rate_bytes_per_s: float
+    burst_nbytes: int = 512 * 1024
 
 
 def build_ring(rig_name: str, frames: Path | None, folder: Path) -> None:
@@ -126,7 +127,7 @@ def serve(plan: RingPlan, pipe: Connection) -> None:
             shown.expose,
             lambda _mono_ns: 30.0,
             FreeRunningClock(offset_ns=index * 10**11, drift_ppm=float(index - 6)),
-            packet_pacing=Pacing(plan.rate_bytes_per_s, 512 * 1024),
+            packet_pacing=Pacing(plan.rate_bytes_per_s, plan.burst_nbytes),
         )
     for head in heads.values():
         head.start()
@@ -184,7 +185,8 @@ def main() -> None:
             for pipe in pipes:
                 pipe.send((firing.count, starts))
 
-    bus = PulseBus(rig.name, [cone.name for cone in rig.cones], fire)
+    bus_address = (request.get("bus_host", "127.0.0.1"), 0)
+    bus = PulseBus(rig.name, [cone.name for cone in rig.cones], fire, bus_address)
     bus.start()
     host, port = bus.address
     ready = {"host": host, "port": port, "pids": [worker.pid for worker in workers]}

@@ -441,6 +441,23 @@ class LimitsSection(_ConfigurationSection):
     """Time in which open exposures are stored and sealed after a power failure."""
 
 
+class NetworkSection(_ConfigurationSection):
+    """Links between heads and this computer (docs/how-to/drivers/link-budget.md).
+
+    The rate of an interface is read from the kernel. `link_mbps` replaces it where the interface
+    reports none, or where a slower link lies between the switch and this computer.
+    """
+
+    link_mbps: dict[str, Annotated[float, Field(gt=0)]] = {}
+    """Rate of the slowest link between heads and this computer by interface, Mbit/s."""
+    head_link_mbps: float = Field(default=1000.0, gt=0)
+    """Rate of the link between a head and the switch, Mbit/s."""
+    switch_buffer_bytes: int = Field(default=131_072, ge=2048)
+    """Bytes that the switch can queue for one link."""
+    is_paced: bool = True
+    """Whether heads that share a link are paced."""
+
+
 class Configuration(_ConfigurationSection):
     """The complete file."""
 
@@ -456,6 +473,7 @@ class Configuration(_ConfigurationSection):
     exposure: ExposureSection = ExposureSection()
     processing: ProcessingSection = ProcessingSection()
     limits: LimitsSection = LimitsSection()
+    network: NetworkSection = NetworkSection()
     watch: WatchSection | None = None
 
     @property

@@ -216,6 +216,10 @@ class Acquisition:
             port=port,
             packet_size=registers.integer("GevSCPSPacketSize"),
             packet_delay_ns=registers.register(at.STREAM_PACKET_DELAY),
+            transfer_delay_ns=registers.integer("GevSCFTD"),
+            throughput_limit_bytes_per_s=float(registers.integer("DeviceLinkThroughputLimit"))
+            if registers.integer("DeviceLinkThroughputLimitMode")
+            else float("inf"),
         )
 
     def _is_waiting_for(self, source: str) -> bool:

@@ -100,6 +100,8 @@ HEARTBEAT_TIMEOUT_MIN_MS = 500
 PACKET_SIZE_MIN = 576
 PACKET_SIZE_MAX = 65_500
 TDI_SHIFTS_MAX = 64
+THROUGHPUT_MIN_BYTES_PER_S = 100_000
+THROUGHPUT_MAX_BYTES_PER_S = 1_250_000_000
 
 
 @dataclass(frozen=True)
@@ -265,6 +267,19 @@ def head_features(width_px: int, height_px: int) -> tuple[Feature, ...]:
         BooleanFeature("GevSCPSDoNotFragment", transport, STREAM_PACKET_SIZE, bit=30),
         CommandFeature("GevSCPSFireTestPacket", transport, STREAM_PACKET_SIZE, "RW", bit=31),
         IntegerFeature("GevSCPD", transport, STREAM_PACKET_DELAY, unit="ns"),
+        IntegerFeature("GevSCFTD", transport, 0x1_0404, unit="ns"),
+        EnumerationFeature(
+            "DeviceLinkThroughputLimitMode", device, 0x1_0010, entries={"Off": 0, "On": 1}
+        ),
+        IntegerFeature(
+            "DeviceLinkThroughputLimit",
+            device,
+            0x1_0014,
+            minimum=THROUGHPUT_MIN_BYTES_PER_S,
+            maximum=THROUGHPUT_MAX_BYTES_PER_S,
+            default=THROUGHPUT_MAX_BYTES_PER_S,
+            unit="Bps",
+        ),
         IntegerFeature("GevSCPHostPort", transport, STREAM_PORT, bits=(0, 15), maximum=65_535),
         IntegerFeature("GevSCDA", transport, STREAM_DESTINATION),
         IntegerFeature(

@@ -90,12 +90,19 @@ class FrameHeader:
 
 @dataclass(frozen=True)
 class Destination:
-    """Where a frame goes, in packets of which size (IP header included) and how far apart."""
+    """Where a frame goes, in packets of which size (IP header included) and how far apart.
+
+    `packet_delay_ns` is inserted between the end of a packet and the next (GevSCPD),
+    `transfer_delay_ns` before the first one (GevSCFTD). `throughput_limit_bytes_per_s` is the
+    highest rate on the wire (DeviceLinkThroughputLimit).
+    """
 
     address: str
     port: int
     packet_size: int
     packet_delay_ns: int = 0
+    transfer_delay_ns: int = 0
+    throughput_limit_bytes_per_s: float = float("inf")
 
 
 @dataclass(frozen=True)

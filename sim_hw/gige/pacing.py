@@ -6,6 +6,7 @@ Computation only; `stream` waits.
 from __future__ import annotations
 
 import threading
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -73,9 +74,9 @@ class TokenBucket:
         self._last_ns = now_ns
         self._lock = threading.Lock()
 
-    def available(self, now_ns: int, rate_limit_bytes_per_s: float = float("inf")) -> float:
+    def available(self, now_ns: int) -> float:
         """Bytes that may go now; negative while a debt is worked off."""
-        rate = min(self._pacing.rate_bytes_per_s, rate_limit_bytes_per_s)
+        rate = self._pacing.rate_bytes_per_s
         with self._lock:
             gained = max(0, now_ns - self._last_ns) * rate / _NS_PER_S
             self._tokens = min(self._tokens + gained, float(self._pacing.burst_bytes))
@@ -85,3 +86,55 @@ class TokenBucket:
     def spend(self, sent_bytes: int) -> None:
         with self._lock:
             self._tokens -= sent_bytes
+
+
+WIRE_OVERHEAD = 38
+"""Header, check sequence, preamble and gap of an Ethernet frame, outside the packet size."""
+
+class PacketTimer:
+    """When the next packet of a frame may go: GevSCPD and DeviceLinkThroughputLimit.
+
+    A packet begins `packet_delay_ns` after the end of the one before. The end follows from the rate
+    of the head's own link. The throughput limit spaces the beginnings. A sender that wakes up late
+    does not catch up: the pause is the shortest that the receiver ever sees.
+
+    Args:
+        link_bytes_per_s: rate of the head's own link.
+        packet_delay_ns: pause after each packet.
+        limit_bytes_per_s: throughput limit; infinite where there is none.
+    """
+
+    def __init__(
+        self, link_bytes_per_s: float, packet_delay_ns: int, limit_bytes_per_s: float
+    ) -> None:
+        self._link = link_bytes_per_s
+        self._delay_ns = packet_delay_ns
+        self._limit = limit_bytes_per_s
+        self._due_ns = 0.0
+
+    @property
+    def is_limiting(self) -> bool:
+        """Whether anything but the link's rate holds packets back."""
+        return self._delay_ns > 0 or self._limit < self._link
+
+    def start(self, now_ns: int) -> None:
+        """A frame begins: its first packet is due, unless the last pause still runs."""
+        self._due_ns = max(self._due_ns, float(now_ns))
+
+    def wait_ns(self, now_ns: int) -> float:
+        """Time until the next packet is due; zero or less if it may go."""
+        return self._due_ns - now_ns
+
+    def sent(self, size: int, now_ns: int) -> None:
+        """A packet of this IP size goes now; the next one is due after it and its pause."""
+        self._due_ns = max(self._due_ns, float(now_ns)) + self._spacing_ns(size)
+
+    def charge(self, sizes: Sequence[int]) -> None:
+        """Packets that were sent again: what they take delays the frame on its way."""
+        if self.is_limiting:
+            self._due_ns += sum(map(self._spacing_ns, sizes))
+
+    def _spacing_ns(self, size: int) -> float:
+        wire = size + WIRE_OVERHEAD
+        taken_ns = wire / self._link * _NS_PER_S + self._delay_ns
+        return max(taken_ns, wire / self._limit * _NS_PER_S)

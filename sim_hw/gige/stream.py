@@ -26,7 +26,7 @@ from sim_hw.gige.gvsp import (
     unavailable_packet,
 )
 from sim_hw.gige.head_faults import WireFaults
-from sim_hw.gige.pacing import Pacing, TokenBucket
+from sim_hw.gige.pacing import PacketTimer, Pacing, TokenBucket
 
 RETAINED_FRAMES = 2
 """Frames whose packets can be asked for again: the one on its way and the one before."""
@@ -39,6 +39,7 @@ FIRST_LEADER_AHEAD_S = 0.005
 
 _UNAVAILABLE_ANSWERS_MAX = 16
 _POLL_S = 0.2
+_NS_PER_S = 1_000_000_000
 _IP_MTU_DISCOVER = 10
 _IP_PMTUDISC_DONT, _IP_PMTUDISC_DO = 0, 2
 
@@ -79,6 +80,8 @@ class StreamChannel:
         self._waiting: queue.Queue[_Outgoing | None] = queue.Queue(FRAMES_WAITING_MAX)
         self._retained: deque[_Outgoing] = deque(maxlen=RETAINED_FRAMES)
         self._bucket = TokenBucket(pacing, time.monotonic_ns())
+        self._timer: PacketTimer | None = None
+        self._timer_pauses: tuple[int, float] | None = None
         self._stop = threading.Event()
         self._lock = threading.Lock()
         self._counting = threading.Lock()
@@ -138,6 +141,8 @@ class StreamChannel:
         if len(retained):
             self._count("packets_resent", self._send(frame.resent(retained)))
             self._bucket.spend(int(frame.sizes[retained].sum()))
+            if self._timer is not None:
+                self._timer.charge(frame.sizes[retained].tolist())
 
     def fire_test_packet(self, destination: Destination, *, may_fragment: bool) -> None:
         """Send one packet of the size asked for, so that the receiver learns whether it passes."""
@@ -178,9 +183,12 @@ class StreamChannel:
         frame = outgoing.frame
         ends = np.cumsum(frame.sizes)[: max(outgoing.packets, 1)]
         total = int(ends[-1])
-        delay_ns = frame.destination.packet_delay_ns
-        limit = frame.destination.packet_size * 1e9 / delay_ns if delay_ns else float("inf")
-        rate = min(limit, self._pacing.rate_bytes_per_s)
+        to = frame.destination
+        timer = self._timer_of(to)
+        if to.transfer_delay_ns:
+            self._stop.wait(to.transfer_delay_ns / _NS_PER_S)
+        timer.start(time.monotonic_ns())
+        rate = self._pacing.rate_bytes_per_s
         done = 0
         if outgoing.opens_the_stream:
             self._send_first_time(frame, 0, 0)
@@ -189,13 +197,22 @@ class StreamChannel:
         while done < total:
             if self._stop.is_set() or not outgoing.is_requested():
                 return False
-            available = self._bucket.available(time.monotonic_ns(), limit)
+            first = outgoing.sent_packets
+            if timer.is_limiting:
+                now_ns = time.monotonic_ns()
+                if (wait_ns := timer.wait_ns(now_ns)) > 0:
+                    time.sleep(min(wait_ns / _NS_PER_S, _POLL_S))
+                    continue
+                self._send_first_time(frame, first, first)
+                timer.sent(int(frame.sizes[first]), now_ns)
+                outgoing.sent_packets, done = first + 1, int(ends[first])
+                continue
+            available = self._bucket.available(time.monotonic_ns())
             # Half a burst at a time: few wake-ups, and room left to catch up after a late one.
             enough = min(self._pacing.burst_bytes / 2, total - done)
             if available < enough:
                 self._stop.wait((enough - available) / rate)
                 continue
-            first = outgoing.sent_packets
             fits = int(np.searchsorted(ends, done + available, "right"))
             last = min(max(fits, first + 1), len(ends)) - 1
             self._send_first_time(frame, first, last)
@@ -203,6 +220,14 @@ class StreamChannel:
             done = int(ends[last])
             outgoing.sent_packets = last + 1
         return True
+
+    def _timer_of(self, to: Destination) -> PacketTimer:
+        """The timer with the pauses of a destination; it goes on as long as they are the same."""
+        pauses = (to.packet_delay_ns, to.throughput_limit_bytes_per_s)
+        if self._timer is None or self._timer_pauses != pauses:
+            self._timer = PacketTimer(self._pacing.rate_bytes_per_s, *pauses)
+            self._timer_pauses = pauses
+        return self._timer
 
     def _send_first_time(self, frame: FramePackets, first: int, last: int) -> None:
         if not self._loss:

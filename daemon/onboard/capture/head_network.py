@@ -3,40 +3,24 @@
 from __future__ import annotations
 
 import ipaddress
-import socket
-import struct
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 from daemon.configuration.model import Configuration
+from daemon.onboard.capture.routes import network_heads, parse_routes, route_to
 from daemon.onboard.preflight.check_results import CheckResult, passed
 from processing.rig import Rig
 
 ROUTES: Final = Path("/proc/net/route")
 NEIGHBOURS: Final = Path("/proc/net/arp")
-GATEWAY: Final = 0x0002
 COMPLETE: Final = 0x2
 NAMED_MAX: Final = 3
 
 
-@dataclass(frozen=True)
-class Route:
-    """A line of the kernel's table for IPv4."""
-
-    interface: str
-    network: ipaddress.IPv4Network
-    is_gateway: bool
-
-
 def head_network(configuration: Configuration, _rig: Rig) -> Iterator[CheckResult]:
     """A caution for each network that heads share with others; it does not prevent a flight."""
-    heads = {
-        head.sensor: address
-        for head in configuration.head
-        if (address := _ip_address(head.settings.get("address"))) and not address.is_loopback
-    }
+    heads = network_heads(configuration)
     if not heads:
         return
     try:
@@ -60,15 +44,14 @@ def cautions_of(
         routes: text of /proc/net/route.
         neighbours: text of /proc/net/arp.
     """
-    table = _routes(routes)
+    table = parse_routes(routes)
     seen = _neighbours(neighbours)
     by_interface: dict[str, list[str]] = {}
     beyond: set[str] = set()
     for sensor, address in heads.items():
-        fitting = [route for route in table if address in route.network]
-        if not fitting:
+        route = route_to(address, table)
+        if route is None:
             continue
-        route = max(fitting, key=lambda r: r.network.prefixlen)
         by_interface.setdefault(route.interface, []).append(sensor)
         if route.is_gateway:
             beyond.add(route.interface)
@@ -97,23 +80,6 @@ def _listed(sensors: list[str]) -> str:
     return f"{len(sensors)} heads ({sensors[0]} to {sensors[-1]}) are"
 
 
-def _ip_address(value: object) -> ipaddress.IPv4Address | None:
-    try:
-        return ipaddress.IPv4Address(value) if isinstance(value, str) else None
-    except ValueError:
-        return None
-
-
-def _routes(text: str) -> list[Route]:
-    found = []
-    for line in text.splitlines()[1:]:
-        fields = line.split()
-        if len(fields) >= 8:
-            network = ipaddress.IPv4Network((_from_hex(fields[1]), _from_hex(fields[7])))
-            found.append(Route(fields[0], network, bool(int(fields[3], 16) & GATEWAY)))
-    return found
-
-
 def _neighbours(text: str) -> dict[str, set[ipaddress.IPv4Address]]:
     """Addresses that have answered, by interface."""
     found: dict[str, set[ipaddress.IPv4Address]] = {}
@@ -122,8 +88,3 @@ def _neighbours(text: str) -> dict[str, set[ipaddress.IPv4Address]]:
         if len(fields) >= 6 and int(fields[2], 16) & COMPLETE:
             found.setdefault(fields[5], set()).add(ipaddress.IPv4Address(fields[0]))
     return found
-
-
-def _from_hex(text: str) -> str:
-    """An address as the kernel prints it: the number in the host's byte order."""
-    return socket.inet_ntoa(struct.pack("=I", int(text, 16)))

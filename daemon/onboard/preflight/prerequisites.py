@@ -21,6 +21,8 @@ from daemon.mission.store.disk_space import LEVEL2_SHARE
 from daemon.mission.store.health import read_health
 from daemon.onboard.capture.devices import frame_nbytes
 from daemon.onboard.capture.head_network import head_network
+from daemon.onboard.capture.interval import exposure_interval_s
+from daemon.onboard.capture.link_settings import link_budget
 from daemon.onboard.preflight.check_results import CheckOutcome, CheckResult, failed, passed
 from daemon.onboard.preflight.import_names import import_names
 from drivers.base import registry
@@ -235,6 +237,7 @@ CHECKS: Final[Sequence[Check]] = (
     disk_health,
     memory,
     head_network,
+    link_budget,
     pace,
     monitoring,
 )
@@ -248,15 +251,6 @@ CHECKS_AFTER_RESTART: Final = tuple(c for c in CHECKS_AT_START if c not in (disk
 def exposure_nbytes(configuration: Configuration, rig: Rig) -> int:
     """Bytes of the frames of one exposure."""
     return sum(frame_nbytes(rig, head.sensor) for head in configuration.head)
-
-
-def exposure_interval_s(configuration: Configuration, rig: Rig) -> float:
-    """The shortest time between exposures that the trigger asks for, at the planned speed."""
-    trigger = configuration.trigger
-    interval_s = trigger.interval_s
-    if trigger.distance_m is not None:
-        interval_s = trigger.distance_m / configuration.plan.ground_speed_mps
-    return max(interval_s, rig.frame_interval_s)
 
 
 def available_memory_nbytes() -> int | None:

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 from daemon.configuration.model import Configuration
 from daemon.mission.layout import Mission
 from daemon.onboard.capture.devices import device_specs, frame_nbytes
+from daemon.onboard.capture.link_settings import paced_specs
 from daemon.onboard.capture.frame_ring import FrameRing
 from daemon.onboard.service.messages import WorkerSettings
 from daemon.onboard.storage.writer import MirrorPlan
@@ -83,7 +84,7 @@ def capture_process(
     configuration: Configuration, rig: Rig, rings: tuple[FrameRing, ...]
 ) -> ProcessPlan:
     """The process of the devices."""
-    specs = device_specs(configuration, rig)
+    specs = paced_specs(device_specs(configuration, rig), configuration, rig)
     return ProcessPlan(
         "capture", "daemon.onboard.capture.capture:main", (specs, rings), thread_counts(1)
     )

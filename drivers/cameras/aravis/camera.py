@@ -22,6 +22,7 @@ from drivers.cameras.aravis.gvcp import GVCP_PORT, is_ip_address
 from drivers.cameras.aravis.head_configuration import HeadConfiguration
 from drivers.cameras.aravis.library import aravis, aravis_error, message_of
 from drivers.cameras.aravis.packet_filter import ControlSocketFilter, SocketCapture
+from drivers.cameras.aravis.packet_pacing import write_pacing
 from drivers.cameras.aravis.settings import AravisSettings
 from drivers.cameras.pixels import Packing, packed_nbytes
 from drivers.contract import DeviceError
@@ -80,6 +81,7 @@ class AravisCamera:
         self._who = f"{head} at {settings.address}"
         self.chunk_parser: Any = None
         self.chunks: list[str] = []
+        self._pacing: Mapping[str, FeatureValue] = {}
         self._control: ControlSocketFilter | None = None
         try:
             self._open_and_configure(settings)
@@ -342,6 +344,11 @@ class AravisCamera:
         camera.gv_set_stream_options(
             options.NONE if settings.packet_socket else options.PACKET_SOCKET_DISABLED
         )
+        held, problems = write_pacing(
+            self._features, settings, int(camera.gv_get_packet_size()), self._read_tick_frequency()
+        )
+        self._pacing = held
+        refusals += problems
 
     def _read_tick_frequency(self) -> int:
         if not self._camera.is_gv_device():
@@ -386,4 +393,5 @@ class AravisCamera:
             found["TdiShifts"] = int(shifts)
         if self._camera.is_gv_device():
             found["GevSCPSPacketSize"] = int(self._camera.gv_get_packet_size())
+        found.update({name: value for name, value in self._pacing.items() if value})
         return found

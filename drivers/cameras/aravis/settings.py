@@ -70,6 +70,25 @@ class AravisSettings(Configured):
     packet_size_limit = Setting(
         8192, minimum=576, maximum=65535, help="the largest packet that is tried"
     )
+    stream_rate_mbps = Setting(
+        0.0,
+        minimum=0,
+        maximum=1e6,
+        help="rate of the stream on the wire, Mbit/s, set by the link budget; 0 is not limited",
+    )
+    head_link_mbps = Setting(
+        0.0,
+        minimum=0,
+        maximum=1e6,
+        help="rate of the head's own link, by which the pause between packets is shortened; 0 "
+        "leaves the pause long enough for heads that count it from the start of a packet",
+    )
+    transfer_delay_us = Setting(
+        0.0,
+        minimum=0,
+        maximum=60e6,
+        help="pause between readout and first packet, us, set by the link budget",
+    )
     socket_buffer_bytes = Setting(
         33_554_432,
         minimum=65536,

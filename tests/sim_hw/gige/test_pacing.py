@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 
-from sim_hw.gige.pacing import Pacing, TokenBucket
+from sim_hw.gige.pacing import PacketTimer, Pacing, TokenBucket
 
 MS = 1_000_000
 
@@ -40,7 +42,45 @@ def test_a_packet_longer_than_the_burst_is_worked_off_afterwards() -> None:
     assert bucket.available(65 * MS) == pytest.approx(20_000)
 
 
-def test_the_controllers_packet_delay_slows_the_bucket_down() -> None:
-    bucket = TokenBucket(Pacing(rate_bytes_per_s=1e9, burst_bytes=10_000), now_ns=0)
-    bucket.spend(10_000)
-    assert bucket.available(5 * MS, rate_limit_bytes_per_s=1e6) == pytest.approx(5_000)
+def test_the_packet_delay_lies_between_the_end_of_a_packet_and_the_next() -> None:
+    # 1,000 bytes on the wire take 8 us at 1 Gbit/s, and then the pause of 92 us.
+    timer = PacketTimer(125e6, packet_delay_ns=92_000, limit_bytes_per_s=math.inf)
+    timer.start(0)
+    assert timer.wait_ns(0) == 0
+    timer.sent(962, 0)
+    assert timer.wait_ns(0) == pytest.approx(100_000)
+    assert timer.wait_ns(100_000) == pytest.approx(0)
+
+
+def test_the_throughput_limit_counts_all_bytes_on_the_wire() -> None:
+    timer = PacketTimer(125e6, packet_delay_ns=0, limit_bytes_per_s=1e6)
+    timer.start(0)
+    timer.sent(962, 0)
+    assert timer.wait_ns(0) == pytest.approx(1e6)
+
+
+def test_a_late_sender_does_not_catch_up() -> None:
+    timer = PacketTimer(125e6, packet_delay_ns=92_000, limit_bytes_per_s=math.inf)
+    timer.start(0)
+    timer.sent(962, 500 * MS)
+    assert timer.wait_ns(500 * MS) == pytest.approx(100_000)
+
+
+def test_the_pause_goes_on_between_frames() -> None:
+    timer = PacketTimer(125e6, packet_delay_ns=92_000, limit_bytes_per_s=math.inf)
+    timer.sent(962, 0)
+    timer.start(10_000)
+    assert timer.wait_ns(10_000) == pytest.approx(90_000)
+
+
+def test_packets_sent_again_delay_the_frame() -> None:
+    timer = PacketTimer(125e6, packet_delay_ns=92_000, limit_bytes_per_s=math.inf)
+    timer.start(0)
+    timer.charge([962] * 5)
+    assert timer.wait_ns(0) == pytest.approx(500_000)
+
+
+def test_without_limits_nothing_is_held_back() -> None:
+    assert not PacketTimer(60e6, 0, math.inf).is_limiting
+    assert not PacketTimer(60e6, 0, 125e6).is_limiting
+    assert PacketTimer(60e6, 0, 30e6).is_limiting
