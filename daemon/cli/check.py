@@ -34,6 +34,9 @@ With `--find`, detect the protocols at serial ports, tcp://host:port, udpin://ho
 given, or all serial ports and the usual addresses): protocol, speed, and the configuration for it.
 With `--find-heads`, search for GigE Vision, USB3 Vision and V4L2 heads.
 
+For heads on a network, the link budget is printed: what the heads of each interface send per
+exposure, the time that takes, and the pause between packets that each head is given.
+
 Examples: `syntopic check flights/sim/service.toml`, `syntopic check service.toml --fire --json`,
 `syntopic check --find`, `syntopic check --find /dev/ttyUSB0 tcp://10.0.0.5:3001`
 """
@@ -77,19 +80,27 @@ def check(
 
 def check_flight(config: Path, *, fire: bool, as_json: bool) -> None:
     """Look at everything a flight with this configuration needs, and print it."""
+    from daemon.cli.link_tables import print_links
     from daemon.configuration.service_file import load
     from daemon.onboard.preflight.check_results import CheckOutcome, worst_outcome
+    from daemon.onboard.preflight.link_tables import link_tables
 
     configuration, rig = load(config)
     console = Console(stderr=as_json)
     with console.status("looking at what a flight needs"):
         results = collect_results(configuration, rig, config, fire=fire)
+        links = link_tables(configuration, rig)
     outcome = worst_outcome(results)
     if as_json:
         listed = [result.as_json() for result in results]
-        typer.echo(json.dumps({"rig": rig.name, "outcome": outcome.value, "findings": listed}))
+        typer.echo(
+            json.dumps(
+                {"rig": rig.name, "outcome": outcome.value, "findings": listed, "links": links}
+            )
+        )
     else:
         _print_tree(console, config, rig.name, results)
+        print_links(console, links)
         if outcome is CheckOutcome.PASS:
             console.print(f"All passes. Next: syntopic run {config}")
         elif outcome is CheckOutcome.WAITING:

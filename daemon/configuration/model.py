@@ -442,7 +442,7 @@ class LimitsSection(_ConfigurationSection):
 
 
 class NetworkSection(_ConfigurationSection):
-    """Links between heads and this computer (docs/how-to/drivers/link-budget.md).
+    """Links between heads and this computer (docs/how-to/flight/link-budget.md).
 
     The rate of an interface is read from the kernel. `link_mbps` replaces it where the interface
     reports none, or where a slower link lies between the switch and this computer.

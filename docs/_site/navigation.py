@@ -28,6 +28,7 @@ FOLDERS: Final[Mapping[str, str]] = {
 
 FIRST: Final = (
     *("how-to/flight/installation.md", "how-to/flight/finding-devices.md"),
+    "how-to/flight/link-budget.md",
     *("how-to/flight/watching.md", "how-to/processing/calibration.md"),
     *("reference/glossary.md", "reference/configuration.md", "reference/rig-file.md"),
     *("reference/formats.md", "explanation/architecture.md"),

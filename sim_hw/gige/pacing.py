@@ -91,6 +91,7 @@ class TokenBucket:
 WIRE_OVERHEAD = 38
 """Header, check sequence, preamble and gap of an Ethernet frame, outside the packet size."""
 
+
 class PacketTimer:
     """When the next packet of a frame may go: GevSCPD and DeviceLinkThroughputLimit.
 

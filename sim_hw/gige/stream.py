@@ -26,7 +26,7 @@ from sim_hw.gige.gvsp import (
     unavailable_packet,
 )
 from sim_hw.gige.head_faults import WireFaults
-from sim_hw.gige.pacing import PacketTimer, Pacing, TokenBucket
+from sim_hw.gige.pacing import Pacing, PacketTimer, TokenBucket
 
 RETAINED_FRAMES = 2
 """Frames whose packets can be asked for again: the one on its way and the one before."""

@@ -44,6 +44,7 @@ LONG: Final = {"how-to/processing/calibration.md"}
 NOT_RUN: Final[Mapping[tuple[str, str], str]] = {
     ("tutorials/getting-started.md", "clone"): "installs the system; the tests run after it",
     ("how-to/flight/installation.md", "root"): "changes the system; tests/installed flies the unit",
+    ("how-to/flight/link-budget.md", "devices"): "opens every device of a service",
     ("how-to/flight/finding-devices.md", "devices"): "asks every port and network of the machine",
     ("how-to/flight/tls.md", "root"): "writes to /etc; the tests of TLS run the command elsewhere",
     ("how-to/flight/tls.md", "camera"): "needs a camera computer on the network",

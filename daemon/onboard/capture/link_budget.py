@@ -221,7 +221,5 @@ def _wave_shares(
         pause_s = demand.packet_wire_nbytes / rate - (own_s if is_gap_exact else 0.0)
         taken_s = demand.wire_nbytes / link.head_rate_bytes_per_s
         taken_s += (demand.packet_count - 1) * max(pause_s, 0.0)
-        shares.append(
-            HeadShare(demand, rate, max(pause_s, 0.0), delay_s, taken_s, is_gap_exact)
-        )
+        shares.append(HeadShare(demand, rate, max(pause_s, 0.0), delay_s, taken_s, is_gap_exact))
     return shares

@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 from daemon.configuration.model import Configuration
 from daemon.mission.layout import Mission
 from daemon.onboard.capture.devices import device_specs, frame_nbytes
-from daemon.onboard.capture.link_settings import paced_specs
 from daemon.onboard.capture.frame_ring import FrameRing
+from daemon.onboard.capture.link_settings import paced_specs
 from daemon.onboard.service.messages import WorkerSettings
 from daemon.onboard.storage.writer import MirrorPlan
 from daemon.products.processing_threads import thread_counts

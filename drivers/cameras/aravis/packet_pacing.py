@@ -20,6 +20,7 @@ ETHERNET_NBYTES: Final = 38
 BYTES_PER_S_OF_MBPS: Final = 125_000
 PACKET_DELAY: Final = "GevSCPD"
 THROUGHPUT_LIMIT: Final = "DeviceLinkThroughputLimit"
+STREAM_BYTES: Final = "StreamBytesPerSecond"
 TRANSFER_DELAYS: Final = ("GevSCFTD", "StreamTransferStartDelay")
 
 
@@ -67,11 +68,14 @@ def _write_rate(
     features: Features, settings: AravisSettings, packet_size: int, tick_hz: int
 ) -> dict[str, FeatureValue]:
     rate_mbps = settings.stream_rate_mbps
-    if PACKET_DELAY in settings.features or THROUGHPUT_LIMIT in settings.features:
+    if {PACKET_DELAY, THROUGHPUT_LIMIT, STREAM_BYTES} & settings.features.keys():
         return {}
     if not rate_mbps:
         held = features.number(PACKET_DELAY)
         return {PACKET_DELAY: int(held)} if held else {}
+    if features.text("BandwidthControlMode") == STREAM_BYTES:
+        # Allied Vision: in this mode the pause has no effect.
+        return _write_limit(features, STREAM_BYTES, rate_mbps)
     if features.is_writable(PACKET_DELAY):
         ticks = packet_delay_ticks(packet_size, rate_mbps, settings.head_link_mbps, tick_hz)
         low, _ = features.bounds(PACKET_DELAY)
@@ -85,12 +89,17 @@ def _write_rate(
         )
     if "On" in features.entries("DeviceLinkThroughputLimitMode"):
         features.set("DeviceLinkThroughputLimitMode", "On")
-    low, _ = features.bounds(THROUGHPUT_LIMIT)
-    step = features.increment(THROUGHPUT_LIMIT) or 1
+    return _write_limit(features, THROUGHPUT_LIMIT, rate_mbps)
+
+
+def _write_limit(features: Features, name: str, rate_mbps: float) -> dict[str, FeatureValue]:
+    """Bytes per second, rounded down to the head's step."""
+    low, _ = features.bounds(name)
     limit = rate_mbps * BYTES_PER_S_OF_MBPS
     if math.isfinite(low):
+        step = features.increment(name)
         limit = low + math.floor((limit - low) / step) * step
-    return {THROUGHPUT_LIMIT: _set(features, THROUGHPUT_LIMIT, limit, "stream_rate_mbps", rate_mbps)}
+    return {name: _set(features, name, limit, "stream_rate_mbps", rate_mbps)}
 
 
 def _write_transfer_delay(

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from sim_hw.gige.pacing import PacketTimer, Pacing, TokenBucket
+from sim_hw.gige.pacing import Pacing, PacketTimer, TokenBucket
 
 MS = 1_000_000
 

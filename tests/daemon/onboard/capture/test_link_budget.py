@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 
 import pytest
@@ -139,6 +140,6 @@ def test_what_is_granted_never_exceeds_the_link_under_either_reading(
 
 def _ends_before_the_next_wave(plan: LinkPlan) -> None:
     starts = sorted({share.transfer_delay_s for share in plan.shares})
-    for start, following in zip(starts, starts[1:], strict=False):
+    for start, following in itertools.pairwise(starts):
         wave = [s for s in plan.shares if s.transfer_delay_s == start]
         assert start + max(s.duration_s for s in wave) <= following + 1e-9
