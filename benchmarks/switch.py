@@ -66,7 +66,7 @@ def switch(
         mtu: largest IP packet of all links.
 
     Raises:
-        SwitchError: not root, or the kernel lacks one of its parts.
+        SwitchError: not root, or the kernel has not all of its parts.
     """
     if os.geteuid() != 0:
         raise SwitchError("network namespaces and tbf need root")
