@@ -61,8 +61,8 @@ class FixedPatterns:
             shifts: TDI shifts, over which the response is averaged.
 
         Returns:
-            Second differences of the response between neighbours, (rows, columns); None for a
-            sensor without a calibrated response.
+            Second differences along the rows as a share of the response, (rows, width - 2); None
+            for a sensor without a calibrated response.
         """
         corrector = self._correctors.get(name)
         if corrector is None or corrector.response is None:
