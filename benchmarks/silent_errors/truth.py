@@ -15,7 +15,7 @@ from scipy.ndimage import map_coordinates
 
 from benchmarks.silent_errors.exposures import EmulatedExposure
 from benchmarks.uncertainty_consistency import NormalizedErrors, normalized_errors
-from processing.geometry.conditions import reference_exposure_times
+from processing.geometry.exposure_times import reference_exposure_times
 from processing.geometry.placement import vip_mm_from_raw, vip_px_from_mm
 from processing.geometry.projective import apply_projective
 from processing.mosaic.precision import disturbance_covariance_px, placed_covariance_px

@@ -25,7 +25,7 @@ from daemon.mission.store.level0 import read_description, refuse_decompression_b
 from daemon.mission.store.level0_folder import read_capture, read_sealed, unsealed_exposure
 from daemon.mission.store.level2 import BAND_ORDER
 from daemon.mission.store.publication import published
-from processing.geometry.conditions import reference_exposure_times
+from processing.geometry.exposure_times import reference_exposure_times
 from processing.image.pansharpening import pansharpened
 from processing.radiometry.tone_curve import (
     VALUE_COUNT,

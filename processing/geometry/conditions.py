@@ -7,8 +7,7 @@ Smear, parallax, ground sampling distance and dC are computed here; they become 
 from __future__ import annotations
 
 import math
-import statistics
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TypeVar
 
@@ -19,11 +18,9 @@ from processing.geometry.rotation import rotation_matrix
 from processing.quality.figures import FigureGroup
 from processing.quality.figures.circumstances import (
     DcFigures,
-    ExposureScaleFigures,
     GeometryFigures,
     SmearFigures,
     TimeFigures,
-    UnknownExposureFigures,
     WorstHeadFigures,
 )
 from processing.quality.probe_health import bridge_by_others
@@ -31,10 +28,6 @@ from processing.quality.report import NO_FLAGS, Flag, Thresholds
 from processing.rig import Cone, Rig
 
 T = TypeVar("T")
-
-EXPOSURE_TIME_TOLERANCE = 0.02
-"""Exposure times of cones that differ by less are those of one setting."""
-MAX_EXPOSURE_SCALE = 2.05
 
 
 @dataclass(frozen=True)
@@ -104,7 +97,18 @@ class UsableTemperatures:
 def usable_temperatures(
     rig: Rig, conditions: Conditions, thresholds: Thresholds
 ) -> UsableTemperatures:
-    """Sort the probes the rig asks for into usable, missing and out of range."""
+    """Sort the probes the rig asks for into usable, missing and out of range.
+
+    A probe without a usable value is bridged by the others where they allow it.
+
+    Args:
+        rig: the camera; its probes are sorted.
+        conditions: temperatures by probe; None, NaN or an absent key counts as missing.
+        thresholds: limits `temperature_low_c` and `temperature_high_c`, both still usable.
+
+    Returns:
+        Usable, missing and out-of-range probes, and the bridged temperatures, degC.
+    """
     usable, missing, out_of_range = {}, [], []
     for probe in rig.probes:
         value = conditions.temperatures_c.get(probe)
@@ -123,13 +127,29 @@ def usable_temperatures(
 
 
 def by_sensor_name(cone: Cone, of_frames: Mapping[str, T]) -> dict[str, T]:
-    """Values of a cone's frames, by sensor name."""
+    """Values of a cone's frames, by sensor name.
+
+    Args:
+        cone: whose sensors are wanted.
+        of_frames: values by sensor name, those of other cones among them.
+
+    Returns:
+        The values of the cone's sensors, in file order; a sensor without a value has no key.
+    """
     names = [sensor.name for sensor in cone.sensors]
     return {name: of_frames[name] for name in names if name in of_frames}
 
 
 def for_sensors(rig: Rig, of_cones: Mapping[str, T]) -> dict[str, T]:
-    """The same value for each sensor of a cone: by sensor name, from values by cone name."""
+    """The same value for each sensor of a cone.
+
+    Args:
+        rig: the camera.
+        of_cones: values by cone name; a cone may have none.
+
+    Returns:
+        Values by sensor name, in file order; sensors of cones without a value have no key.
+    """
     return {
         sensor.name: of_cones[cone.name]
         for cone in rig.cones
@@ -138,79 +158,19 @@ def for_sensors(rig: Rig, of_cones: Mapping[str, T]) -> dict[str, T]:
     }
 
 
-def reference_exposure_times(rig: Rig, exposure_times: Mapping[str, float]) -> dict[str, float]:
-    """Common exposure time to which the signal of each frame is scaled, by sensor name.
-
-    The median of its cone where that is the median of all PAN cones, or of all colour cones, to
-    within `ALIKE`; else the median of those. A cone exposed less than half as long keeps its own:
-    its highlights would leave the range of words.
-
-    Args:
-        exposure_times: positive, by sensor name, in any unit; the result has the same.
-    """
-    references: dict[str, float] = {}
-    for cones in (rig.pan_cones, rig.colour_cones):
-        of_cones = {
-            cone.name: statistics.median_low(known.values())
-            for cone in cones
-            if (known := by_sensor_name(cone, exposure_times))
-        }
-        if not of_cones:
-            continue
-        usual = statistics.median_low(of_cones.values())
-        for cone in cones:
-            own = of_cones.get(cone.name, usual)
-            is_unscaled = (
-                abs(own / usual - 1.0) <= EXPOSURE_TIME_TOLERANCE
-                or own < usual / MAX_EXPOSURE_SCALE
-            )
-            for name in by_sensor_name(cone, exposure_times):
-                references[name] = own if is_unscaled else usual
-    return references
-
-
-def exposure_scales(rig: Rig, exposure_time_s: Mapping[str, float]) -> dict[str, float]:
-    """Factors on the signal of each frame that make all frames comparable.
-
-    Exactly 1 where the frames of a cone have one exposure time, and that of the other cones. A frame
-    whose exposure time is not known has none.
-
-    Args:
-        exposure_time_s: positive, by sensor name.
-    """
-    references = reference_exposure_times(rig, exposure_time_s)
-    return {name: reference / exposure_time_s[name] for name, reference in references.items()}
-
-
-def exposure_scale_figures(scales: Mapping[str, float]) -> ExposureScaleFigures:
-    """The frame whose level was corrected most, and by what factor."""
-    name = max(scales, key=lambda n: abs(math.log(scales[n])), default=None)
-    if name is None:
-        return ExposureScaleFigures()
-    return ExposureScaleFigures(None if scales[name] == 1.0 else name, scales[name])
-
-
-def unknown_exposure_figures(
-    rig: Rig, present: Collection[str], exposure_time_s: Mapping[str, float]
-) -> UnknownExposureFigures:
-    """Colour frames whose exposure time is not known while that of other frames is.
-
-    Overlaps show the level of a PAN head; nothing in one exposure shows that of a colour head.
-
-    Args:
-        present: names of the sensors that sent a frame.
-        exposure_time_s: by sensor name, what the record states.
-    """
-    if not any(name in exposure_time_s for name in present):
-        return UnknownExposureFigures()
-    colour = [s.name for cone in rig.colour_cones for s in cone.sensors if s.name in present]
-    return UnknownExposureFigures(tuple(n for n in colour if n not in exposure_time_s))
-
-
 def condition_figures(
     rig: Rig, conditions: Conditions, temperatures: UsableTemperatures
 ) -> tuple[FigureGroup, ...]:
-    """Figures that need no pixels."""
+    """Figures that need no pixels: geometry, dC, time and smear.
+
+    Args:
+        rig: the camera.
+        conditions: of the exposure.
+        temperatures: from `usable_temperatures` of the same exposure.
+
+    Returns:
+        Groups of figures; a figure whose inputs are not known is None.
+    """
     gsd_m = ground_sampling_distance_m(rig, conditions)
     ages = [conditions.temperature_age_s.get(probe) for probe in temperatures.usable_c]
     tilts = [abs(a) for a in (conditions.roll_rad, conditions.pitch_rad) if a is not None]
@@ -247,8 +207,26 @@ def _time(conditions: Conditions, gsd_m: float | None) -> TimeFigures:
 
 
 def ground_sampling_distance_m(rig: Rig, conditions: Conditions) -> float | None:
-    """Ground covered by one pixel at the foot of the camera; without a virtual image by the master
-    cone's."""
+    """Ground covered by one pixel at the foot of the camera.
+
+    Args:
+        rig: the camera; without a virtual image the master cone's first sensor counts.
+        conditions: `height_above_ground_m` is used.
+
+    Returns:
+        GSD = h p / f, m; None where the height is not known or not positive.
+
+    Source: docs/explanation/mathematics/quality.md#ground-sampling-distance.
+
+    Example:
+        7.2 um pixels behind 100.5 mm: 7.2 cm from 1005 m.
+
+        >>> from processing.rig import find_rig
+        >>> conditions = Conditions(height_above_ground_m=1005.0)
+        >>> gsd_m = ground_sampling_distance_m(find_rig("ultracam-x"), conditions)
+        >>> round(gsd_m, 6)
+        0.072
+    """
     image, height = rig.virtual_image, conditions.height_above_ground_m
     if height is None or height <= 0:
         return None
@@ -259,10 +237,20 @@ def ground_sampling_distance_m(rig: Rig, conditions: Conditions) -> float | None
 
 
 def parallax_px(rig: Rig, conditions: Conditions, relief_fraction: float) -> float:
-    """Parallax by relief between PAN and a colour master off the flight axis, PAN pixels.
+    """Parallax by relief between PAN and a colour master off the flight axis.
 
-    base * f * dh / h^2 for relief of `relief_fraction` of the height; zero where the height is not
-    known. Along the flight axis syntopic exposure removes it; crab turns some of it back.
+    Along the flight axis syntopic exposure removes it; crab turns some of it back.
+
+    Args:
+        rig: the camera.
+        conditions: `height_above_ground_m` and `crab_rad` are used.
+        relief_fraction: height of the relief over the height above ground, dh / h.
+
+    Returns:
+        base * f * dh / h^2 in PAN pixels; zero where the height is not known, or without a
+        virtual image or colour master.
+
+    Source: docs/explanation/mathematics/quality.md#parallax.
     """
     image, height = rig.virtual_image, conditions.height_above_ground_m
     if image is None or height is None or height <= 0 or rig.colour_master_cone is None:
@@ -306,9 +294,18 @@ def _smears(rig: Rig, conditions: Conditions) -> tuple[FigureGroup, ...]:
 
 
 def tdi_misfit_px(rig: Rig, conditions: Conditions, largest_px: float) -> dict[str, float]:
-    """By PAN cone, what its TDI count leaves of the motion along track, where above `largest_px`.
+    """By PAN cone, what its TDI count leaves of the motion along track.
 
-    Empty where no head shifts its charges.
+    Args:
+        rig: the camera.
+        conditions: speed, height, crab, rates, exposure times and TDI counts are used.
+        largest_px: motion up to this is not reported, px.
+
+    Returns:
+        Motion of the worst sensor in px by cone name, only above `largest_px`; empty where no head
+        shifts its charges.
+
+    Source: docs/explanation/mathematics/quality.md#smear.
     """
     found: dict[str, float] = {}
     if rig.virtual_image is None or not any(conditions.tdi_shifts.values()):
@@ -325,7 +322,27 @@ def head_smear_px(cone: Cone, conditions: Conditions) -> float | None:
     """How far flat ground moves during the exposure where it moves farthest in a head's image.
 
     A head that looks aslant has the ground nearest, and so the longest way, at one edge: all
-    corners count and the middle. None where speed, height or exposure time are not known.
+    corners count and the middle.
+
+    Args:
+        cone: the head; its first sensor counts.
+        conditions: speed, height, crab and the sensor's exposure time are used.
+
+    Returns:
+        Motion in px; None where speed, height or exposure time are not known.
+
+    Source: docs/explanation/mathematics/quality.md#smear.
+
+    Example:
+        A pixel is 7.5 cm from 110 m, and so is the way in 10 ms at 7.5 m/s.
+
+        >>> from processing.rig import find_rig
+        >>> conditions = Conditions(
+        ...     exposure_time_s={"G": 0.01}, ground_speed_mps=7.5, height_above_ground_m=110.0
+        ... )
+        >>> smear_px = head_smear_px(find_rig("rededge").cone("G"), conditions)
+        >>> round(smear_px, 6)
+        1.0
     """
     time_s = conditions.exposure_time_s.get(cone.sensors[0].name)
     speed_mps, height_m = conditions.ground_speed_mps, conditions.height_above_ground_m

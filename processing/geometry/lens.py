@@ -22,9 +22,26 @@ _INVERSION_STEPS = 25
 
 
 def lens_correction(lens: Lens, measured_mm: Array) -> Array:
-    """The correction (dx, dy) of eq. 5.1 at measured points (n, 2), mm, and that of the grid.
+    """The correction (dx, dy) of eq. 5.1, and that of the grid where the lens has one.
 
     The equation divides by z = -f, so the df term is +x df / f.
+
+    Args:
+        lens: the ten parameters and the grid.
+        measured_mm: measured points about the principal point, shape (n, 2), mm, y up.
+
+    Returns:
+        Corrections to be added to measured points, shape (n, 2), mm.
+
+    Source: docs/explanation/mathematics/lens.md#ten-parameters; Heier et al. (2002), eq. 5.1.
+
+    Example:
+        K1 alone: K1 r^3 = 1e-6 * 20^3 = 8 um outward at r = 20 mm.
+
+        >>> lens = Lens(f_mm=100.0, k1=1e-6)
+        >>> lens_correction(lens, np.array([[20.0, 0.0], [12.0, 16.0]]))
+        array([[0.008 , 0.    ],
+               [0.0048, 0.0064]])
     """
     x, y = measured_mm[:, 0], measured_mm[:, 1]
     r2 = x * x + y * y
@@ -45,15 +62,39 @@ def lens_correction(lens: Lens, measured_mm: Array) -> Array:
 
 
 def ideal_from_measured(lens: Lens, measured_mm: Array) -> Array:
-    """Ideal (distortion-free) points of measured ones: ideal = measured + delta(measured)."""
+    """Ideal (distortion-free) points of measured ones: ideal = measured + delta(measured).
+
+    Args:
+        lens: the ten parameters and the grid.
+        measured_mm: measured points about the principal point, shape (n, 2), mm, y up.
+
+    Returns:
+        Ideal points, shape (n, 2), mm.
+
+    Example:
+        >>> ideal_from_measured(Lens(f_mm=100.0, k1=1e-6), np.array([[20.0, 0.0]]))
+        array([[20.008,  0.   ]])
+    """
     return measured_mm + lens_correction(lens, measured_mm)
 
 
 def measured_from_ideal(lens: Lens, ideal_mm: Array) -> Array:
-    """Measured points of ideal ones (n, 2), mm: eq. 5.1 inverted by Newton's method.
+    """Measured points of ideal ones: eq. 5.1 inverted by Newton's method.
 
-    The result is exact to 1e-10 mm. Points so far outside the image that the polynomial folds
-    over have no measured point: they are NaN.
+    Args:
+        lens: the ten parameters and the grid.
+        ideal_mm: ideal points about the principal point, shape (n, 2), mm, y up.
+
+    Returns:
+        Measured points, shape (n, 2), mm, exact to 1e-10 mm. Points so far outside the image that
+        the polynomial folds over have no measured point: they are NaN.
+
+    Source: docs/explanation/mathematics/lens.md#inverse.
+
+    Example:
+        >>> lens = Lens(f_mm=100.0, k1=1e-6)
+        >>> measured_from_ideal(lens, np.array([[20.008, 0.0]])).round(6)
+        array([[20.,  0.]])
     """
     measured = ideal_mm - lens_correction(lens, ideal_mm)
     for _ in range(_INVERSION_STEPS):

@@ -74,6 +74,12 @@ def nominal_placements(
 
     Raises:
         ValueError: the rig has no virtual image, or `tdi_shifts` names what is no sensor of it.
+
+    Example:
+        >>> from processing.rig import find_rig
+        >>> placements = nominal_placements(find_rig("ultracam-x-mini"), {}, {})
+        >>> len(placements), placements["SU00"].similarity.rotation_rad
+        (13, 3.92e-05)
     """
     if unknown := tdi_shifts.keys() - {sensor.name for sensor in rig.sensors}:
         raise ValueError(f"tdi_shifts names {min(unknown)!r}; rig {rig.name} has no such sensor")
@@ -102,6 +108,12 @@ def start_similarity(placement: SensorPlacement) -> Similarity:
     """S at calibration + TDM, whatever the placement's own S has become by adjustment.
 
     The sensor's centre goes to its lens-corrected place in the calibrated layer.
+
+    Args:
+        placement: start or adjusted.
+
+    Returns:
+        layer_from_sensor in the calibrated (ideal) layer, mm.
     """
     return _start_similarity(placement.cone, placement.physical, placement.f_ratio)
 
@@ -117,9 +129,29 @@ def _start_similarity(cone: Cone, physical: Similarity, f_ratio: float) -> Simil
 
 
 def sensor_mm_from_raw(placement: SensorPlacement, colrow: Array) -> Array:
-    """Sensor coordinates u (n, 2), mm, y up, of raw pixels (n, 2) at mid-exposure.
+    """Sensor coordinates u of raw pixels at mid-exposure.
 
     With N TDI shifts the content of row R belongs to row R - tdi_row_sign * N / 2.
+
+    Args:
+        placement: start or adjusted; its sensor and TDI count are used.
+        colrow: (column, row), shape (n, 2), zero-based, integer at the pixel centre, row down.
+
+    Returns:
+        Points from the middle of the pixel array, shape (n, 2), mm, x right, y up.
+
+    Source: docs/explanation/mathematics/coordinates.md#pixels-and-millimetres.
+
+    Example:
+        The upper left pixel of 1248 x 832, 7.2 um; 10 TDI shifts move it up by 5 rows.
+
+        >>> from processing.rig import find_rig
+        >>> rig = find_rig("ultracam-x-mini")
+        >>> corner = np.array([[0.0, 0.0]])
+        >>> sensor_mm_from_raw(nominal_placements(rig, {}, {})["SU00"], corner).round(4)
+        array([[-4.4892,  2.9916]])
+        >>> sensor_mm_from_raw(nominal_placements(rig, {}, {"SU00": 10})["SU00"], corner).round(4)
+        array([[-4.4892,  3.0276]])
     """
     sensor = placement.sensor
     row_shift = sensor.tdi_row_sign * placement.tdi_shifts / 2.0
@@ -130,7 +162,21 @@ def sensor_mm_from_raw(placement: SensorPlacement, colrow: Array) -> Array:
 
 
 def raw_from_sensor_mm(placement: SensorPlacement, u_mm: Array) -> Array:
-    """Inverse of `sensor_mm_from_raw`."""
+    """Inverse of `sensor_mm_from_raw`.
+
+    Args:
+        placement: start or adjusted; its sensor and TDI count are used.
+        u_mm: points from the middle of the pixel array, shape (n, 2), mm, x right, y up.
+
+    Returns:
+        (column, row), shape (n, 2), zero-based, integer at the pixel centre, row down.
+
+    Example:
+        >>> from processing.rig import find_rig
+        >>> placement = nominal_placements(find_rig("ultracam-x-mini"), {}, {})["SU00"]
+        >>> raw_from_sensor_mm(placement, np.array([[0.0, 0.0]]))
+        array([[623.5, 415.5]])
+    """
     sensor = placement.sensor
     row_shift = sensor.tdi_row_sign * placement.tdi_shifts / 2.0
     colrow = np.empty((len(u_mm), 2))
@@ -140,7 +186,17 @@ def raw_from_sensor_mm(placement: SensorPlacement, u_mm: Array) -> Array:
 
 
 def corrected_mm_from_raw(placement: SensorPlacement, colrow: Array) -> Array:
-    """u' of eq. 1 (n, 2), mm: what S and P act on, independent of their adjustment."""
+    """u' of eq. 1: what S and P act on, independent of their adjustment.
+
+    Args:
+        placement: start or adjusted.
+        colrow: (column, row), shape (n, 2), zero-based, integer at the pixel centre, row down.
+
+    Returns:
+        Corrected sensor coordinates at the start position, shape (n, 2), mm, y up.
+
+    Source: Ladstädter et al. (2010), eq. 1.
+    """
     physical = apply_similarity(placement.physical, sensor_mm_from_raw(placement, colrow))
     if placement.sensor.skew_per_mm != NO_SKEW:
         physical = _skewed(placement, physical)
@@ -178,10 +234,23 @@ def vip_mm_from_corrected(placement: SensorPlacement, corrected_mm: Array) -> Ar
 
 
 def raw_from_vip_mm(placement: SensorPlacement, xy_mm: Array) -> Array:
-    """Inverse of `vip_mm_from_raw`, exact to 1e-6 px; (n, 2) to (n, 2).
+    """Inverse of `vip_mm_from_raw`, exact to 1e-6 px.
 
-    Points the lens polynomial cannot reach (far outside the cone's field) are NaN; points outside
-    the sensor have coordinates outside its array.
+    Args:
+        placement: start or adjusted.
+        xy_mm: VIP points, shape (n, 2), mm, x right, y up.
+
+    Returns:
+        (column, row), shape (n, 2), zero-based, row down. Points the lens polynomial cannot reach
+        (far outside the cone's field) are NaN; points outside the sensor have coordinates outside
+        its array.
+
+    Example:
+        >>> from processing.rig import find_rig
+        >>> placement = nominal_placements(find_rig("ultracam-x-mini"), {}, {})["SU00"]
+        >>> xy_mm = vip_mm_from_raw(placement, np.array([[100.0, 200.0]]))
+        >>> raw_from_vip_mm(placement, xy_mm).round(6)
+        array([[100., 200.]])
     """
     xy = np.asarray(xy_mm, dtype=np.float64)
     vip_from_ideal = (
@@ -217,7 +286,21 @@ def _unskewed(placement: SensorPlacement, physical_mm: Array) -> Array:
 
 
 def vip_px_from_mm(image: VirtualImage, xy_mm: Array) -> Array:
-    """VIP pixels (column, row) of VIP points in mm; (n, 2) to (n, 2)."""
+    """VIP pixels of VIP points.
+
+    Args:
+        image: size and pitch of the virtual image.
+        xy_mm: shape (n, 2), mm from its middle, x right, y up.
+
+    Returns:
+        (column, row), shape (n, 2), zero-based, integer at the pixel centre, row down.
+
+    Example:
+        >>> image = VirtualImage(width_px=1001, height_px=601, pitch_um=10.0, f_mm=100.0)
+        >>> vip_px_from_mm(image, np.array([[0.0, 0.0], [1.0, 1.0]])).round(6)
+        array([[500., 300.],
+               [600., 200.]])
+    """
     colrow = np.empty((len(xy_mm), 2))
     colrow[:, 0] = xy_mm[:, 0] / image.pitch_mm + (image.width_px - 1) / 2.0
     colrow[:, 1] = (image.height_px - 1) / 2.0 - xy_mm[:, 1] / image.pitch_mm
@@ -225,7 +308,20 @@ def vip_px_from_mm(image: VirtualImage, xy_mm: Array) -> Array:
 
 
 def vip_mm_from_px(image: VirtualImage, colrow: Array) -> Array:
-    """Inverse of `vip_px_from_mm`."""
+    """Inverse of `vip_px_from_mm`.
+
+    Args:
+        image: size and pitch of the virtual image.
+        colrow: (column, row), shape (n, 2), zero-based, integer at the pixel centre, row down.
+
+    Returns:
+        VIP points, shape (n, 2), mm from its middle, x right, y up.
+
+    Example:
+        >>> image = VirtualImage(width_px=1001, height_px=601, pitch_um=10.0, f_mm=100.0)
+        >>> vip_mm_from_px(image, np.array([[600.0, 200.0]])).round(6)
+        array([[1., 1.]])
+    """
     xy = np.empty((len(colrow), 2))
     xy[:, 0] = (colrow[:, 0] - (image.width_px - 1) / 2.0) * image.pitch_mm
     xy[:, 1] = ((image.height_px - 1) / 2.0 - colrow[:, 1]) * image.pitch_mm

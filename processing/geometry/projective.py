@@ -13,7 +13,24 @@ Array = NDArray[np.float64]
 
 
 def apply_projective(target_from_source: Array, xy: Array) -> Array:
-    """Carry points (n, 2) by a (3, 3) homography; any consistent unit."""
+    """Carry points by a homography.
+
+    Args:
+        target_from_source: shape (3, 3), acts on (x, y, 1).
+        xy: source points, shape (n, 2), any consistent unit.
+
+    Returns:
+        Target points, shape (n, 2), in the unit of `xy`.
+
+    Source: docs/explanation/mathematics/coordinates.md#similarity-and-projective-transformation.
+
+    Example:
+        The denominator is 1 + 0.1 x: at x = 10 everything shrinks by half.
+
+        >>> homography = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.1, 0.0, 1.0]])
+        >>> apply_projective(homography, np.array([[10.0, 4.0]]))
+        array([[5., 2.]])
+    """
     h = target_from_source
     x, y = xy[:, 0], xy[:, 1]
     w = h[2, 0] * x + h[2, 1] * y + h[2, 2]
@@ -24,7 +41,21 @@ def apply_projective(target_from_source: Array, xy: Array) -> Array:
 
 
 def projective_jacobian(target_from_source: Array, xy: Array) -> Array:
-    """d(target) / d(source) at points (n, 2): shape (n, 2, 2)."""
+    """d(target) / d(source) of a homography.
+
+    Args:
+        target_from_source: shape (3, 3), acts on (x, y, 1).
+        xy: source points, shape (n, 2), any consistent unit.
+
+    Returns:
+        Shape (n, 2, 2), target coordinate by source coordinate.
+
+    Example:
+        >>> homography = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.1, 0.0, 1.0]])
+        >>> projective_jacobian(homography, np.array([[10.0, 4.0]])).round(3)
+        array([[[ 0.25,  0.  ],
+                [-0.1 ,  0.5 ]]])
+    """
     h = target_from_source
     x, y = xy[:, 0], xy[:, 1]
     w = h[2, 0] * x + h[2, 1] * y + h[2, 2]
@@ -53,6 +84,14 @@ def rotation_homography(master_from_cone: Array, f_cone_mm: float, f_master_mm: 
 
     Source: Ladstädter et al. (2010), "epipolar transformation" of the platform calibration;
     docs/explanation/mathematics/coordinates.md#similarity-and-projective-transformation.
+
+    Example:
+        A head turned by phi = 0.1 rad: its axis meets the master's plane at -f tan(phi).
+
+        >>> from processing.geometry.rotation import rotation_matrix
+        >>> homography = rotation_homography(rotation_matrix(0.0, 0.1, 0.0), 100.0, 100.0)
+        >>> apply_projective(homography, np.array([[0.0, 0.0]])).round(4) + 0.0
+        array([[-10.0335,   0.    ]])
     """
     master = np.diag([f_master_mm, f_master_mm, -1.0])
     cone = np.diag([1.0, 1.0, -f_cone_mm])

@@ -33,7 +33,24 @@ class ResidualGrid:
     delta_mm: Array
 
     def correction_to_ideal(self, measured_mm: Array) -> Array:
-        """The correction (n, 2) at measured places (n, 2); beyond the grid that of its border."""
+        """The correction at measured places, bilinear between nodes.
+
+        Args:
+            measured_mm: shape (n, 2), mm in the layer, y up.
+
+        Returns:
+            Shape (n, 2), mm, to be added; beyond the grid that of its border.
+
+        Example:
+            Half way between nodes of 0 and 4 um, and beyond the border.
+
+            >>> delta_mm = np.zeros((2, 2, 2))
+            >>> delta_mm[:, 1, 0] = 0.004
+            >>> grid = ResidualGrid(np.array([0.0, 10.0]), np.array([0.0, 10.0]), delta_mm)
+            >>> grid.correction_to_ideal(np.array([[5.0, 5.0], [99.0, 5.0]]))
+            array([[0.002, 0.   ],
+                   [0.004, 0.   ]])
+        """
         (i, u), (j, v) = _cells(self.x_mm, self.y_mm, measured_mm)
         u, v, delta = u[:, None], v[:, None], self.delta_mm
         lower = delta[j, i] * (1.0 - u) + delta[j, i + 1] * u
@@ -41,7 +58,11 @@ class ResidualGrid:
         return np.asarray(lower * (1.0 - v) + upper * v)
 
     def as_lens_grid(self) -> LensGrid:
-        """As a rig file holds it."""
+        """As a rig file holds it.
+
+        Returns:
+            The same nodes in mm, corrections in um, rounded to 1e-6 um.
+        """
         um = np.round(self.delta_mm * 1e3, 6)
         return LensGrid(
             tuple(self.x_mm.tolist()),
@@ -53,7 +74,14 @@ class ResidualGrid:
 
 @lru_cache(maxsize=64)
 def grid_of_lens(grid: LensGrid) -> ResidualGrid:
-    """The grid of a rig file's lens."""
+    """The grid of a rig file's lens.
+
+    Args:
+        grid: nodes in mm, corrections in um.
+
+    Returns:
+        The same grid, corrections in mm; one object for equal grids.
+    """
     delta_mm = np.stack([np.array(grid.dx_um), np.array(grid.dy_um)], axis=-1) * 1e-3
     return ResidualGrid(np.array(grid.x_mm), np.array(grid.y_mm), delta_mm)
 
@@ -61,12 +89,26 @@ def grid_of_lens(grid: LensGrid) -> ResidualGrid:
 def fit_residual_grid(
     measured_mm: Array, residual_mm: Array, *, half_mm: tuple[float, float], nodes: tuple[int, int]
 ) -> ResidualGrid:
-    """Fit a grid to residuals (computed less measured, ideal side) by smoothed least squares.
+    """Fit a grid to residuals by smoothed least squares.
 
     Args:
-        measured_mm, residual_mm: (n, 2).
-        half_mm: the grid reaches so far from the middle of the measured places.
-        nodes: how many across and down.
+        measured_mm: places in the layer, shape (n, 2), mm.
+        residual_mm: computed less measured, ideal side, shape (n, 2), mm.
+        half_mm: how far the grid reaches from the middle of the places, across and down.
+        nodes: number of nodes across and down, two or more each.
+
+    Returns:
+        The grid of the corrections to be added.
+
+    Source: docs/explanation/mathematics/lens.md#residual-grid.
+
+    Example:
+        >>> x, y = np.meshgrid(np.linspace(-10.0, 10.0, 5), np.linspace(-10.0, 10.0, 5))
+        >>> places_mm = np.column_stack([x.ravel(), y.ravel()])
+        >>> residual_mm = np.full((25, 2), 0.001)
+        >>> grid = fit_residual_grid(places_mm, residual_mm, half_mm=(10.0, 10.0), nodes=(4, 4))
+        >>> grid.correction_to_ideal(np.array([[3.0, -2.0]])).round(6)
+        array([[0.001, 0.001]])
     """
     middle = (measured_mm.max(axis=0) + measured_mm.min(axis=0)) / 2.0
     x = middle[0] + np.linspace(-half_mm[0], half_mm[0], nodes[0])
@@ -83,7 +125,19 @@ def fit_residual_grid(
 def cross_validation_residuals(
     measured_mm: Array, residual_mm: Array, *, half_mm: tuple[float, float], nodes: tuple[int, int]
 ) -> Array:
-    """What a grid fitted to every other residual leaves of the rest, and the other way, (n, 2)."""
+    """What a grid fitted to every other residual leaves of the rest, and the other way.
+
+    Args:
+        measured_mm: places in the layer, shape (n, 2), mm.
+        residual_mm: computed less measured, ideal side, shape (n, 2), mm.
+        half_mm: as of `fit_residual_grid`.
+        nodes: as of `fit_residual_grid`.
+
+    Returns:
+        What is left of each residual, shape (n, 2), mm.
+
+    Source: docs/explanation/mathematics/lens.md#residual-grid.
+    """
     left = np.empty_like(residual_mm)
     index = np.arange(len(measured_mm))
     for parity in (0, 1):
@@ -94,7 +148,14 @@ def cross_validation_residuals(
 
 
 def grid_bytes(grid: ResidualGrid) -> bytes:
-    """The grid as `.npz`."""
+    """The grid as `.npz`.
+
+    Args:
+        grid: to be written.
+
+    Returns:
+        Content of the file: `x_mm`, `y_mm`, `delta_mm` and `direction`.
+    """
     stream = io.BytesIO()
     np.savez(
         stream,
@@ -108,6 +169,12 @@ def grid_bytes(grid: ResidualGrid) -> bytes:
 
 def grid_from_bytes(data: bytes) -> ResidualGrid:
     """Read what `grid_bytes` wrote.
+
+    Args:
+        data: content of the file.
+
+    Returns:
+        The grid.
 
     Raises:
         ValueError: it holds other arrays, or another direction.

@@ -18,10 +18,20 @@ def sun_elevation_rad(unix_s: float, latitude_rad: float, longitude_rad: float) 
 
     Args:
         unix_s: UTC, seconds since 1970.
-        latitude_rad, longitude_rad: of the place, east positive.
+        latitude_rad: of the place, north positive.
+        longitude_rad: of the place, east positive.
+
+    Returns:
+        Elevation, rad, within +-pi/2; below zero at night.
 
     Source: The Astronomical Almanac, "low precision formulas for the Sun" (0.01 deg from 1950 to
     2050), and Greenwich mean sidereal time of the IAU 1982 model to first order.
+
+    Example:
+        At the equator about noon of the equinox 2024-03-20 the sun is nearly overhead.
+
+        >>> round(math.degrees(sun_elevation_rad(1_710_936_445.0, 0.0, 0.0)), 1)
+        89.8
     """
     days = (unix_s - J2000_UNIX_S) / DAY_S
     anomaly = math.radians(357.528 + 0.985_600_3 * days)

@@ -35,7 +35,19 @@ class HeightModel:
     step_y_m: float
 
     def at(self, xy_m: Array) -> Array:
-        """Heights (n,) at places (n, 2); NaN outside, and next to unknown ones."""
+        """Heights at places, bilinear between grid points.
+
+        Args:
+            xy_m: shape (n, 2), m, in the system of the model.
+
+        Returns:
+            Shape (n,), m; NaN outside, and next to unknown heights.
+
+        Example:
+            >>> model = HeightModel(np.array([[0.0, 10.0], [0.0, 10.0]]), 0.0, 100.0, 50.0, -100.0)
+            >>> model.at(np.array([[25.0, 60.0], [75.0, 60.0]]))
+            array([ 5., nan])
+        """
         column = (xy_m[:, 0] - self.x_m) / self.step_x_m
         row = (xy_m[:, 1] - self.y_m) / self.step_y_m
         height, width = self.height_m.shape
@@ -56,17 +68,26 @@ def on_terrain(
     *,
     earth_radius_m: float | None = MEAN_EARTH_RADIUS_M,
 ) -> Array:
-    """Ground points (n, 3) of rays (n, 3) from one projection centre.
+    """Ground points of rays from one projection centre.
 
     Args:
-        centre_m: (3,) east, north, height.
-        rays: directions of any length, object axes.
+        centre_m: east, north, height, shape (3,), m.
+        rays: directions of any length, object axes, shape (n, 3).
         model: heights of the ground, in the height system of the centre.
         earth_radius_m: heights are counted from a sphere, which falls away below a straight ray;
             None: the system is Cartesian.
 
     Returns:
-        The first ground along each ray; NaN for one that leaves the model or does not come down.
+        The first ground along each ray, shape (n, 3), m; NaN for one that leaves the model or does
+        not come down.
+
+    Example:
+        A ray 45 degrees down from 100 m above level ground.
+
+        >>> model = HeightModel(np.full((5, 5), 20.0), -200.0, 200.0, 100.0, -100.0)
+        >>> rays = np.array([[1.0, 0.0, -1.0]])
+        >>> on_terrain(np.array([0.0, 0.0, 120.0]), rays, model, earth_radius_m=None).round(6)
+        array([[100.,   0.,  20.]])
     """
     unit = rays / np.linalg.norm(rays, axis=1, keepdims=True)
     top, bottom = float(np.nanmax(model.height_m)), float(np.nanmin(model.height_m))

@@ -49,18 +49,32 @@ class Rectangle:
 
     @property
     def width_mm(self) -> float:
+        """Extent in x; zero or less where it is empty."""
         return self.x_max_mm - self.x_min_mm
 
     @property
     def height_mm(self) -> float:
+        """Extent in y; zero or less where it is empty."""
         return self.y_max_mm - self.y_min_mm
 
     @property
     def empty(self) -> bool:
+        """Whether it has no area."""
         return self.width_mm <= 0.0 or self.height_mm <= 0.0
 
     def contains(self, xy_mm: Array) -> NDArray[np.bool_]:
-        """Which of the points (n, 2) lie inside."""
+        """Which of the points lie inside or on the border.
+
+        Args:
+            xy_mm: VIP points, shape (n, 2), mm.
+
+        Returns:
+            Shape (n,).
+
+        Example:
+            >>> Rectangle(0.0, 0.0, 2.0, 1.0).contains(np.array([[1.0, 1.0], [1.0, 1.1]]))
+            array([ True, False])
+        """
         x, y = xy_mm[:, 0], xy_mm[:, 1]
         return np.asarray(
             (x >= self.x_min_mm)
@@ -98,6 +112,7 @@ class ConeCount:
 
     @property
     def degrees_of_freedom(self) -> int:
+        """Independent unknowns of the cone."""
         return self.parameters - self.constraints
 
 
@@ -111,10 +126,12 @@ class ParameterCounts:
 
     @property
     def parameters(self) -> int:
+        """Sum over the cones."""
         return sum(cone.parameters for cone in self.cones)
 
     @property
     def constraints(self) -> int:
+        """Sum over the cones and of those common to all converging heads."""
         return sum(cone.constraints for cone in self.cones) + self.common_constraints
 
     @property
@@ -124,7 +141,14 @@ class ParameterCounts:
 
 
 def mosaic_cones(rig: Rig) -> tuple[Cone, ...]:
-    """The cones a free mosaic adjusts: all PAN cones, then the colour master where there is one."""
+    """The cones a free mosaic adjusts: all PAN cones, then the colour master where there is one.
+
+    Args:
+        rig: the camera.
+
+    Returns:
+        Cones, PAN in file order.
+    """
     cones = list(rig.pan_cones)
     if rig.colour_master_cone is not None:
         colour_master = rig.cone(rig.colour_master_cone)
@@ -137,6 +161,12 @@ def free_cones(rig: Rig) -> tuple[list[str], list[str]]:
     """Cones whose layer is a free projective transformation, and those whose mounting is free.
 
     Layers are carried into the master's; where there is no master, PAN heads are turned.
+
+    Args:
+        rig: the camera.
+
+    Returns:
+        Names of the cones with a free layer, and names of those with a free mounting.
     """
     cones = mosaic_cones(rig)
     mountings = [c.name for c in cones if rig.master_cone is None and c.role == "pan"]
@@ -150,6 +180,24 @@ def counts(rig: Rig) -> ParameterCounts:
     projective layer transformation (8), a converging head a rotation (3)
     instead; four constraints fix the datum (eq. 6) or separate sensor
     from layer transformations (eq. 6a, 7a, 7b).
+
+    Args:
+        rig: the camera.
+
+    Returns:
+        Counts of the cones of `mosaic_cones`, and of the common constraints.
+
+    Source: docs/explanation/mathematics/mosaicking.md#parameters-and-degrees-of-freedom;
+    Ladstädter et al. (2010), tables 1 and 2.
+
+    Example:
+        PAN cones of 4, 2, 2 and 1 sensors and a colour master: 8 similarities and 4 layers are
+        8 * 4 + 4 * 8 parameters, the three cones of several sensors have 3 * 4 constraints.
+
+        >>> from processing.rig import find_rig
+        >>> found = counts(find_rig("ultracam-x"))
+        >>> found.parameters, found.constraints, found.unknowns
+        (64, 12, 52)
     """
     result = []
     layers, mountings = free_cones(rig)
@@ -171,6 +219,12 @@ def footprint(placement: SensorPlacement) -> Rectangle:
     """The upright rectangle inscribed in a sensor's image in the VIP, through its side midpoints.
 
     Exact to the few pixels by which a sensor's sides are askew.
+
+    Args:
+        placement: start or adjusted.
+
+    Returns:
+        The rectangle, mm in the VIP.
     """
     w, h = placement.sensor.width_px, placement.sensor.height_px
     middle_col, middle_row = (w - 1) / 2.0, (h - 1) / 2.0
@@ -187,7 +241,22 @@ def footprint(placement: SensorPlacement) -> Rectangle:
 
 
 def intersection(a: Rectangle, b: Rectangle) -> Rectangle:
-    """What two rectangles have in common; may be `empty`."""
+    """What two rectangles have in common.
+
+    Args:
+        a: one rectangle, mm.
+        b: the other, in the same plane.
+
+    Returns:
+        The common rectangle; `empty` where they do not meet.
+
+    Example:
+        >>> common = intersection(Rectangle(0.0, 0.0, 2.0, 2.0), Rectangle(1.0, -1.0, 3.0, 1.0))
+        >>> common
+        Rectangle(x_min_mm=1.0, y_min_mm=0.0, x_max_mm=2.0, y_max_mm=1.0)
+        >>> intersection(common, Rectangle(5.0, 0.0, 6.0, 1.0)).empty
+        True
+    """
     return Rectangle(
         max(a.x_min_mm, b.x_min_mm),
         max(a.y_min_mm, b.y_min_mm),
@@ -197,10 +266,17 @@ def intersection(a: Rectangle, b: Rectangle) -> Rectangle:
 
 
 def common_view(a: SensorPlacement, b: SensorPlacement) -> Rectangle:
-    """What two sensors both see; may be `empty`.
+    """What two sensors both see.
 
     A sensor that is tilted against the virtual image sees no upright rectangle of it: then the box
     around what both see, corners of which one may miss.
+
+    Args:
+        a: placement of one sensor.
+        b: placement of the other, in the same virtual image.
+
+    Returns:
+        The rectangle, mm in the VIP; may be `empty`.
     """
     if _is_upright(a) and _is_upright(b):
         return intersection(footprint(a), footprint(b))
@@ -212,7 +288,14 @@ def common_view(a: SensorPlacement, b: SensorPlacement) -> Rectangle:
 
 
 def outline(placement: SensorPlacement) -> Array:
-    """The corners of a sensor in the VIP, mm, around it, (4, 2)."""
+    """The corners of a sensor in the VIP, around it from the upper left one.
+
+    Args:
+        placement: start or adjusted.
+
+    Returns:
+        Outer corners of the corner pixels, shape (4, 2), mm.
+    """
     right, low = placement.sensor.width_px - 0.5, placement.sensor.height_px - 0.5
     corners = np.array([[-0.5, -0.5], [right, -0.5], [right, low], [-0.5, low]])
     return vip_mm_from_raw(placement, corners)
@@ -239,6 +322,17 @@ def overlaps(rig: Rig) -> tuple[Overlap, ...]:
     """The overlap strips of PAN sensors of different cones (twelve for a 3x3 grid).
 
     Where sensors meet only at a corner there is no strip: see `corners`.
+
+    Args:
+        rig: the camera; it has a virtual image.
+
+    Returns:
+        Strips at calibration temperature, in the order of the sensors.
+
+    Example:
+        >>> from processing.rig import find_rig
+        >>> len(overlaps(find_rig("ultracam-x-mini")))
+        12
     """
     placements, places = nominal_placements(rig, {}, {}), _pan_footprints(rig)
     result = []
@@ -253,7 +347,19 @@ def overlaps(rig: Rig) -> tuple[Overlap, ...]:
 
 @lru_cache(maxsize=_RIGS)
 def corners(rig: Rig) -> tuple[Corner, ...]:
-    """Areas where strips cross, with every PAN sensor that sees them (four for a 3x3 grid)."""
+    """Areas where strips cross, with every PAN sensor that sees them (four for a 3x3 grid).
+
+    Args:
+        rig: the camera; it has a virtual image.
+
+    Returns:
+        Areas seen by three or more sensors.
+
+    Example:
+        >>> from processing.rig import find_rig
+        >>> [len(corner.sensors) for corner in corners(find_rig("ultracam-x-mini"))]
+        [4, 4, 4, 4]
+    """
     places = _pan_footprints(rig)
     placements = nominal_placements(rig, {}, {})
     found: dict[tuple[str, ...], Rectangle] = {}
@@ -279,10 +385,14 @@ def corners(rig: Rig) -> tuple[Corner, ...]:
 
 @lru_cache(maxsize=_RIGS)
 def colour_coverage(rig: Rig) -> Mapping[str, Rectangle]:
-    """What of each PAN sensor the colour master sees, by PAN sensor name.
+    """What of each PAN sensor the colour master sees.
 
-    Empty where the rig has no colour master; of a colour master with several sensors the first
-    is meant.
+    Args:
+        rig: the camera; of a colour master with several sensors the first is meant.
+
+    Returns:
+        Common rectangles by PAN sensor name, without those that are empty; no keys where the rig
+        has no colour master.
     """
     if rig.colour_master_cone is None:
         return {}
@@ -302,8 +412,17 @@ def colour_coverage(rig: Rig) -> Mapping[str, Rectangle]:
 def colour_ratio(rig: Rig) -> int | None:
     """PAN pixels per colour-master pixel where that is a whole number, to one percent.
 
-    None where there is no colour master and where the ratio is not whole (DMC, 4.8): the frames
-    cannot be compared by box means of raw pixels.
+    Args:
+        rig: the camera.
+
+    Returns:
+        The ratio. None where there is no colour master and where the ratio is not whole (DMC, 4.8):
+        the frames cannot be compared by box means of raw pixels.
+
+    Example:
+        >>> from processing.rig import find_rig
+        >>> colour_ratio(find_rig("ultracam-x")), colour_ratio(find_rig("dmc"))
+        (3, None)
     """
     exact = exact_colour_ratio(rig)
     rounded = round(exact or 0.0)
@@ -311,7 +430,14 @@ def colour_ratio(rig: Rig) -> int | None:
 
 
 def exact_colour_ratio(rig: Rig) -> float | None:
-    """PAN pixels per colour-master pixel, from principal distances and pitches."""
+    """PAN pixels per colour-master pixel, from principal distances and pitches.
+
+    Args:
+        rig: the camera.
+
+    Returns:
+        The ratio; None without a colour master or PAN cones.
+    """
     if rig.colour_master_cone is None or not rig.pan_cones:
         return None
     pan, colour = rig.pan_cones[0], rig.cone(rig.colour_master_cone)

@@ -38,10 +38,28 @@ class GroundPlane:
 
 
 def ground_plane(rig: Rig, conditions: Conditions) -> GroundPlane | None:
-    """The plane an exposure is projected onto; None where there is none to project onto.
+    """The plane an exposure is projected onto.
 
-    That is with a master cone (all cones see from one place) and where the height is not known
-    (the projection centres then count as one). Roll and pitch tilt the plane; unknown ones do not.
+    Roll and pitch tilt the plane; unknown ones do not.
+
+    Args:
+        rig: the camera.
+        conditions: `height_above_ground_m`, `roll_rad` and `pitch_rad` are used.
+
+    Returns:
+        The plane; None with a master cone (all cones see from one place) and where the height is
+        not known (the projection centres then count as one).
+
+    Source: docs/explanation/mathematics/virtual-camera.md#ground-plane.
+
+    Example:
+        Right wing down by 0.1 rad: the zenith leans to the left of the camera.
+
+        >>> from processing.rig import find_rig
+        >>> conditions = Conditions(height_above_ground_m=1000.0, roll_rad=0.1)
+        >>> plane = ground_plane(find_rig("dmc"), conditions)
+        >>> plane.height_m, [round(component, 4) + 0.0 for component in plane.up]
+        (1000.0, [-0.0998, 0.0, 0.995])
     """
     height_m = conditions.height_above_ground_m
     if not rig.has_virtual_camera or height_m is None or height_m <= 0:
@@ -52,22 +70,47 @@ def ground_plane(rig: Rig, conditions: Conditions) -> GroundPlane | None:
 
 
 def offset_mm(rig: Rig, cone: Cone) -> Array:
-    """From the virtual projection centre to a cone's, (3,) in camera axes, from construction.
+    """From the virtual projection centre to a cone's, from construction.
 
     Heights are neglected: what a millimetre of them moves is far below what can be measured.
+
+    Args:
+        rig: the camera.
+        cone: one of its cones.
+
+    Returns:
+        Shape (3,), mm, camera axes (x right, y forward, z up); z is zero.
     """
     x, y, _ = np.subtract(cone.position_mm, rig.image_position_mm)
     return np.array([y, x, 0.0])
 
 
 def vip_from_layer(rig: Rig, cone: Cone, ground: GroundPlane | None) -> Array:
-    """P, (3, 3) in mm: a cone's layer to the virtual image, by its mounting and the ground plane.
+    """P: a cone's layer to the virtual image, by its mounting and the ground plane.
 
     A ray d from the offset c meets the plane u.x = -h where x ~ (I - c u' / (h + u.c)) d as the
     virtual camera sees it. Without a plane the rotation alone remains.
 
+    Args:
+        rig: the camera.
+        cone: one of its cones.
+        ground: the plane; None for the rotation alone.
+
+    Returns:
+        Homography, shape (3, 3), mm.
+
     Raises:
         ValueError: the rig has no virtual image.
+
+    Source: docs/explanation/mathematics/virtual-camera.md#ground-plane.
+
+    Example:
+        The master cone is the virtual image.
+
+        >>> from processing.rig import find_rig
+        >>> rig = find_rig("ultracam-x")
+        >>> np.allclose(vip_from_layer(rig, rig.cone(rig.master_cone), None), np.eye(3))
+        True
     """
     if rig.virtual_image is None:
         raise ValueError(f"rig {rig.name} has no [virtual_image]; nothing can be placed in it")
@@ -81,7 +124,16 @@ def vip_from_layer(rig: Rig, cone: Cone, ground: GroundPlane | None) -> Array:
 def projection_figures(
     rig: Rig, conditions: Conditions, relief_fraction: float
 ) -> ProjectionFigures | None:
-    """The height a virtual camera projected onto, and what relief leaves, in figures."""
+    """The height a virtual camera projected onto, and what relief leaves, in figures.
+
+    Args:
+        rig: the camera.
+        conditions: of the exposure.
+        relief_fraction: height of the relief over the height above ground.
+
+    Returns:
+        Figures; None where no plane is used.
+    """
     plane = ground_plane(rig, conditions)
     if plane is None:
         return None
@@ -89,9 +141,18 @@ def projection_figures(
 
 
 def head_parallax_px(rig: Rig, conditions: Conditions, relief_fraction: float) -> float | None:
-    """What relief leaves between two PAN heads after projection onto the mean plane, PAN pixels.
+    """What relief leaves between two PAN heads after projection onto the mean plane.
 
-    base * f * dh / h^2 of the two heads that are farthest apart; None where no plane is used.
+    Args:
+        rig: the camera.
+        conditions: of the exposure.
+        relief_fraction: height of the relief over the height above ground, dh / h.
+
+    Returns:
+        base * f * dh / h^2 of the two heads that are farthest apart, PAN pixels; None where no
+        plane is used.
+
+    Source: docs/explanation/mathematics/virtual-camera.md#ground-plane.
     """
     image, plane = rig.virtual_image, ground_plane(rig, conditions)
     if image is None or plane is None:

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from processing.geometry.conditions import (
     Conditions,
     UsableTemperatures,
-    exposure_scales,
     parallax_px,
     tdi_misfit_px,
 )
+from processing.geometry.exposure_times import exposure_scales
 from processing.geometry.placement import nominal_placements
 from processing.geometry.virtual_camera import ground_plane
 from processing.image.colour import (

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.geometry.conditions import (
+from processing.geometry.conditions import parallax_px
+from processing.geometry.exposure_times import (
     exposure_scale_figures,
     exposure_scales,
-    parallax_px,
     unknown_exposure_figures,
 )
 from processing.geometry.placement import SensorPlacement

@@ -10,12 +10,14 @@ import pytest
 from processing.geometry.conditions import (
     Conditions,
     condition_figures,
-    exposure_scale_figures,
-    exposure_scales,
     parallax_px,
-    reference_exposure_times,
     tdi_misfit_px,
     usable_temperatures,
+)
+from processing.geometry.exposure_times import (
+    exposure_scale_figures,
+    exposure_scales,
+    reference_exposure_times,
 )
 from processing.geometry.placement import nominal_placements
 from processing.quality.figures import Figure, QualityFigures

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from processing.geometry.conditions import unknown_exposure_figures
+from processing.geometry.exposure_times import unknown_exposure_figures
 from processing.geometry.placement import nominal_placements
 from processing.quality.band_levels import level_steps
 from processing.quality.common_windows import measure_common_windows
