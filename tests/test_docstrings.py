@@ -18,6 +18,7 @@ COMPLETE: tuple[str, ...] = (
     "drivers/timescales",
     "drivers/transport",
     "drivers/triggers",
+    "processing/bundle",
     "processing/errors.py",
     "processing/geometry",
     "processing/image",

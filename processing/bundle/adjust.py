@@ -109,13 +109,18 @@ def adjust(
 
     Args:
         network: observations and starting values.
-        settings: see `AdjustmentSettings`.
+        settings: see `AdjustmentSettings`; None: its defaults.
         progress: called with what is done, the iteration, and the weighted sum of squares.
+
+    Returns:
+        Adjusted values with their cofactors, residuals and statistics.
 
     Raises:
         NetworkError: tables that do not fit, starting values far off, no convergence, or fewer
             observations than unknowns.
         RankDefectError: a parameter cannot be determined; the message names it.
+
+    Source: docs/explanation/mathematics/bundle.md#adjustment.
     """
     validate(network)
     settings = settings or AdjustmentSettings()
@@ -174,6 +179,16 @@ def undetermined_points(
 
     They are seen once or from one projection centre only. Or their starting value is behind a
     camera that sees them. Only a few points may be: with many, the images are wrong.
+
+    Args:
+        network: observations.
+        state: orientations and coordinates at which rays are intersected.
+        weight: factor on the weight of each image point, shape (image points,); zero leaves it
+            out; None: one.
+
+    Returns:
+        Shape (points,), True where a point is not fixed. None of them where more than a few are
+        behind a camera.
     """
     found = np.zeros(len(network.points.names), dtype=bool)
     if weight is None:

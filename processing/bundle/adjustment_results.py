@@ -89,7 +89,15 @@ class ResidualPattern:
 
 
 def parameters_of(result: Adjustment) -> tuple[AdjustedParameter, ...]:
-    """Estimated interior orientation and additional parameters of every camera."""
+    """Estimated interior orientation and additional parameters of every camera.
+
+    Args:
+        result: the adjustment.
+
+    Returns:
+        Estimated parameters, camera by camera, the ten before additional ones; held ones are left
+        out.
+    """
     found = []
     for index, camera in enumerate(result.network.cameras):
         columns = np.concatenate([result.layout.interior[index], result.layout.terms[index]])
@@ -123,7 +131,14 @@ def parameters_of(result: Adjustment) -> tuple[AdjustedParameter, ...]:
 
 
 def exposures_of(result: Adjustment) -> tuple[AdjustedOrientation, ...]:
-    """Projection centre and angles of every image's station and attitude, image by image."""
+    """Projection centre and angles of every image's station and attitude.
+
+    Args:
+        result: the adjustment.
+
+    Returns:
+        One orientation per image, in the order of the network.
+    """
     images, layout = result.network.images, result.layout
     found = []
     angles = omega_phi_kappa(result.state.attitude)
@@ -143,7 +158,14 @@ def exposures_of(result: Adjustment) -> tuple[AdjustedOrientation, ...]:
 
 
 def heads_of(result: Adjustment) -> tuple[AdjustedOrientation, ...]:
-    """Relative orientation of every head."""
+    """Relative orientation of every head.
+
+    Args:
+        result: the adjustment.
+
+    Returns:
+        One orientation per head, in the order of the network: offset in rig axes, rig from camera.
+    """
     angles = omega_phi_kappa(result.state.head_rotation)
     by_vector = angles_by_rotation_vector("XYZ", result.state.head_rotation)
     return tuple(
@@ -161,9 +183,16 @@ def heads_of(result: Adjustment) -> tuple[AdjustedOrientation, ...]:
 def check_point_differences(
     result: Adjustment, names: Sequence[str], xyz_m: Array, sigma_m: Array
 ) -> PointDifferences:
-    """Adjusted object points against independent coordinates (n, 3) with sigmas (n, 3), m.
+    """Adjusted object points against independent coordinates.
 
-    NaN coordinates are not compared; points that were not adjusted are skipped.
+    Args:
+        result: the adjustment.
+        names: of the points; those that were not adjusted are skipped.
+        xyz_m: independent coordinates, shape (n, 3), m; NaN is not compared.
+        sigma_m: their standard deviations, shape (n, 3), m; NaN counts as zero.
+
+    Returns:
+        Differences and their predicted sigmas, for the points that were compared.
     """
     at = {name: index for index, name in enumerate(result.network.points.names)}
     checked_names, differences, sigmas, squares, count = [], [], [], 0.0, 0
@@ -191,7 +220,14 @@ def check_point_differences(
 
 
 def control_residuals(result: Adjustment) -> PointDifferences:
-    """Adjusted less given coordinates of weighted control points (`sigma_m`: a priori)."""
+    """Adjusted less given coordinates of weighted control points.
+
+    Args:
+        result: the adjustment.
+
+    Returns:
+        Differences, NaN for coordinates without a sigma; `sigma_m` is a priori.
+    """
     sigma = result.network.points.sigma_m
     rows = np.flatnonzero((np.nan_to_num(sigma) > 0.0).any(axis=1))
     rows = rows[np.isfinite(result.point_cofactor[rows]).all(axis=(1, 2))]
@@ -207,7 +243,14 @@ def control_residuals(result: Adjustment) -> PointDifferences:
 
 
 def image_residuals_mm(result: Adjustment) -> Array:
-    """Computed less measured of every image point (n, 2), NaN for points that were not adjusted."""
+    """Computed less measured coordinates of every image point.
+
+    Args:
+        result: the adjustment.
+
+    Returns:
+        Shape (image points, 2), mm; NaN for points that were not adjusted.
+    """
     residual = np.full((len(result.network.image_points.image), 2), np.nan)
     rows = result.equations
     weight = np.sqrt(np.where(result.weight > 0.0, result.weight, 1.0))
@@ -221,8 +264,18 @@ def image_residuals_mm(result: Adjustment) -> Array:
 def systematic_residuals(
     result: Adjustment, camera: int, cells: tuple[int, int]
 ) -> ResidualPattern:
-    """Mean image residuals of one camera over a grid of (columns, rows) cells, as in Ladstädter
-    et al. (2010), fig. 10."""
+    """Mean image residuals of one camera over a grid of cells.
+
+    Args:
+        result: the adjustment.
+        camera: index of the camera; it has image points.
+        cells: (columns, rows) over the extent of its image points.
+
+    Returns:
+        Means of the cells that have points, row by row.
+
+    Source: Ladstädter et al. (2010), fig. 10.
+    """
     table = result.network.image_points
     residual = image_residuals_mm(result)
     own = (result.network.images.camera[table.image] == camera) & np.isfinite(residual).all(axis=1)

@@ -21,18 +21,40 @@ def principal_distance_mm(camera: CameraModel, interior: Array) -> float:
 
     Australis keeps f and carries df in the correction (+x df / f); the centred model projects with
     f - df, which is the same to first order.
+
+    Args:
+        camera: model and principal distance.
+        interior: the ten, shape (10,).
+
+    Returns:
+        Principal distance, mm.
+
+    Source: docs/explanation/mathematics/bundle.md#camera-model.
     """
     return camera.f_mm if camera.model == "australis" else camera.f_mm - float(interior[2])
 
 
 def ideal_mm(camera: CameraModel, interior: Array, terms: Array, xy_mm: Array) -> Array:
-    """Ideal image coordinates (n, 2) of measured ones (n, 2), mm about the principal point.
+    """Ideal image coordinates of measured ones, about the principal point.
 
     Args:
         camera: model, principal point and principal distance.
-        interior: the ten, (10,).
-        terms: values of the additional parameters, (t,).
-        xy_mm: measured.
+        interior: the ten, shape (10,).
+        terms: values of the additional parameters, shape (t,).
+        xy_mm: measured, shape (n, 2), mm, y up.
+
+    Returns:
+        Shape (n, 2), mm.
+
+    Source: Heier et al. (2002), eq. 5.1; docs/explanation/mathematics/bundle.md#camera-model.
+
+    Example:
+        K1 alone: K1 r^3 = 8 um outward at r = 20 mm, as in `processing.geometry.lens`.
+
+        >>> interior = np.zeros(10)
+        >>> interior[3] = 1e-6
+        >>> ideal_mm(CameraModel("C", f_mm=100.0), interior, np.zeros(0), np.array([[20.0, 0.0]]))
+        array([[20.008,  0.   ]])
     """
     xy_mm = _placed(camera, terms, xy_mm)
     if camera.model == "australis":
@@ -44,7 +66,17 @@ def ideal_mm(camera: CameraModel, interior: Array, terms: Array, xy_mm: Array) -
 
 
 def interior_derivatives(camera: CameraModel, interior: Array, terms: Array, xy_mm: Array) -> Array:
-    """d(ideal) / d(the ten), (n, 2, 10); df of the centred model acts in the projection: zero."""
+    """d(ideal) / d(the ten).
+
+    Args:
+        camera: model, principal point and principal distance.
+        interior: the ten, shape (10,).
+        terms: values of the additional parameters, shape (t,).
+        xy_mm: measured, shape (n, 2), mm.
+
+    Returns:
+        Shape (n, 2, 10); df of the centred model acts in the projection: zero.
+    """
     xy_mm = _placed(camera, terms, xy_mm)
     if camera.model == "australis":
         return _ten(camera, xy_mm[:, 0] - camera.xp_mm, xy_mm[:, 1] - camera.yp_mm)
@@ -60,7 +92,17 @@ def interior_derivatives(camera: CameraModel, interior: Array, terms: Array, xy_
 
 
 def term_derivatives(camera: CameraModel, interior: Array, terms: Array, xy_mm: Array) -> Array:
-    """d(ideal) / d(additional parameters), (n, 2, t)."""
+    """d(ideal) / d(additional parameters).
+
+    Args:
+        camera: model, principal point and terms.
+        interior: the ten, shape (10,).
+        terms: values of the additional parameters, shape (t,).
+        xy_mm: measured, shape (n, 2), mm.
+
+    Returns:
+        Shape (n, 2, t).
+    """
     if not camera.terms:
         return np.zeros((len(xy_mm), 2, 0))
     place = _about_given(camera, xy_mm)

@@ -30,11 +30,28 @@ class RayModel:
 
     @property
     def is_straight(self) -> bool:
+        """Whether rays are straight in the object coordinates."""
         return self.earth_radius_m is None and not self.refraction
 
 
 def refraction_coefficient(height_m: Array, ground_m: float) -> Array:
-    """K of d(angle) = K tan(angle off the vertical), rad, for cameras at heights above the sea."""
+    """K of d(angle) = K tan(angle off the vertical).
+
+    Args:
+        height_m: cameras above the sea, shape (n,), m, not zero.
+        ground_m: the ground above the sea.
+
+    Returns:
+        Shape (n,), rad.
+
+    Source: Manual of Photogrammetry (ASPRS), atmospheric refraction after the ARDC 1959 atmosphere.
+
+    Example:
+        From 3000 m over the sea: 2410e-6 * 3 / (9 - 18 + 250), 30 urad at 45 degrees.
+
+        >>> refraction_coefficient(np.array([3000.0]), 0.0).round(8)
+        array([3.e-05])
+    """
     camera, ground = height_m * 1e-3, ground_m * 1e-3
     return np.asarray(
         2410e-6
@@ -61,6 +78,14 @@ def corrected_rays(
     Returns:
         (n, 3); by the point and by the projection centre (n, 3, 3) each. That the height of the
         projection centre changes K is left out: a millionth.
+
+    Example:
+        On a sphere of 6371 km a point 2 km away lies 2000^2 / 2R = 0.314 m below the plane.
+
+        >>> ray_m = np.array([[2000.0, 0.0, -1000.0]])
+        >>> seen, _, _ = corrected_rays(ray_m, np.array([1000.0]), RayModel(MEAN_EARTH_RADIUS_M))
+        >>> seen.round(3)
+        array([[ 2000.   ,     0.   , -1000.314]])
     """
     n = len(ray_m)
     seen, d_point = ray_m.copy(), np.broadcast_to(np.eye(3), (n, 3, 3)).copy()

@@ -88,11 +88,17 @@ def equations(
         network: observations.
         layout: columns.
         state: current values.
-        weight: (image points,) factor on the weight of each image point; zero leaves it out.
+        weight: factor on the weight of each image point, shape (image points,); zero leaves it
+            out.
         derivatives: without them `reduced` and `point_part` are zero.
+
+    Returns:
+        Whitened rows, image points first.
 
     Raises:
         BehindCameraError: an object point is not in front of a camera that saw it.
+
+    Source: docs/explanation/mathematics/bundle.md#collinearity and #other-observations.
     """
     build = _Builder(layout, derivatives)
     _image_rows(build, network, layout, state, weight)

@@ -50,11 +50,31 @@ class Run:
     minimum_norm: bool
 
     def rows(self, state: ParameterValues, *, derivatives: bool = True) -> Equations:
+        """Rows at a state.
+
+        Args:
+            state: where misclosures are computed.
+            derivatives: as of `equations`.
+
+        Returns:
+            The rows, with the weights of the run.
+        """
         return equations(self.network, self.layout, state, self.weight, derivatives=derivatives)
 
 
 def iterate(run: Run) -> tuple[Equations, ReducedEquations]:
-    """Iterate to convergence; return the rows and reduced equations at the solution."""
+    """Iterate to convergence; `run.state` is then the solution.
+
+    Args:
+        run: variables of the adjustment; its state and history are changed.
+
+    Returns:
+        The rows and reduced equations at the solution.
+
+    Raises:
+        NetworkError: no convergence, or an object point behind a camera that saw it.
+        RankDefectError: directions without information.
+    """
     for iteration in range(run.max_iterations + 1):
         rows = _front(run, run.state)
         objective = float(rows.misclosure @ rows.misclosure)
@@ -115,7 +135,15 @@ def _take_step(
 
 
 def robust_weights(run: Run) -> None:
-    """Huber weights on whole image points, renewed at every iteration."""
+    """Huber weights on whole image points, renewed at every iteration.
+
+    Args:
+        run: variables of the adjustment; its state and weights are changed.
+
+    Raises:
+        NetworkError: an object point behind a camera that saw it.
+        RankDefectError: directions without information.
+    """
     points = run.network.image_points
     for iteration in range(run.max_iterations):
         rows = _front(run, run.state)

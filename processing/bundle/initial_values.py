@@ -23,15 +23,23 @@ def resect(xy_mm: Array, xyz_m: Array, f_mm: float) -> tuple[Array, Array]:
     """Projection centre and rotation of an image from four or more known points (SQPnP).
 
     Args:
-        xy_mm: ideal image coordinates about the principal point, (n, 2).
-        xyz_m: object points, (n, 3); they may lie in a plane.
+        xy_mm: ideal image coordinates about the principal point, shape (n, 2), mm.
+        xyz_m: object points, shape (n, 3), m; they may lie in a plane.
         f_mm: principal distance.
 
     Returns:
-        station (3,) m and object_from_camera (3, 3).
+        Station, shape (3,), m, and object_from_camera, shape (3, 3).
 
     Raises:
         ValueError: fewer than four points, or no solution.
+
+    Example:
+        A camera 100 m above the middle of a square of 20 m looks down.
+
+        >>> corners_m = np.array([[-10.0, -10, 0], [10, -10, 0], [10, 10, 0], [-10, 10, 0]])
+        >>> station_m, rotation = resect(corners_m[:, :2] * 0.5, corners_m, f_mm=50.0)
+        >>> station_m.round(4) + 0.0, np.allclose(rotation, np.eye(3))
+        (array([  0.,   0., 100.]), True)
     """
     if len(xy_mm) < 4:
         raise ValueError(f"{len(xy_mm)} known points in an image; a resection takes four")
@@ -55,13 +63,22 @@ def intersect(
 
     Args:
         points: how many there are.
-        point: (m,) which point a ray belongs to.
-        station_m: (m, 3) where it starts.
-        direction: (m, 3) where it goes, object axes, any length.
+        point: which point a ray belongs to, shape (m,).
+        station_m: where it starts, shape (m, 3), m.
+        direction: where it goes, object axes, any length, shape (m, 3).
 
     Returns:
-        coordinates (points, 3), NaN where rays are parallel or fewer than two, and the number of
-        rays of each point (points,).
+        Coordinates, shape (points, 3), m, NaN where rays are parallel or fewer than two, and the
+        number of rays of each point, shape (points,).
+
+    Example:
+        Two rays that pass each other at 2 m meet in the middle.
+
+        >>> station_m = np.array([[0.0, 0.0, 10.0], [10.0, 2.0, 0.0]])
+        >>> direction = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
+        >>> xyz_m, rays = intersect(1, np.array([0, 0]), station_m, direction)
+        >>> xyz_m.round(6) + 0.0, rays
+        (array([[0., 1., 0.]]), array([2]))
     """
     unit = direction / np.linalg.norm(direction, axis=1, keepdims=True)
     across = np.eye(3) - unit[:, :, None] * unit[:, None, :]
@@ -84,8 +101,14 @@ def completed(network: Network) -> Network:
     before, points from two or more oriented images, in turn until nothing more is found. Lens
     corrections are applied as far as the cameras' starting values hold them.
 
+    Args:
+        network: observations; stations, attitudes and points may be NaN.
+
+    Returns:
+        The network with starting values. Points that no two images see have the mean of the others.
+
     Raises:
-        NetworkError: images or points that this does not reach.
+        NetworkError: images that this does not reach.
     """
     station, attitude = network.stations.position_m.copy(), network.attitudes.rotation.copy()
     xyz = network.points.xyz_m.copy()

@@ -183,15 +183,30 @@ class LinearConstraint:
 
 
 def no_distances() -> Distances:
+    """An empty table of distances.
+
+    Returns:
+        No rows.
+    """
     return Distances(_index(()), _index(()), np.zeros(0), np.zeros(0))
 
 
 def no_gnss() -> Gnss:
+    """An empty table of antenna positions.
+
+    Returns:
+        No rows and no lines.
+    """
     empty = np.zeros((0, 3))
     return Gnss(_index(()), _index(()), empty, empty, empty, _index(()), np.zeros(0))
 
 
 def no_measured_attitudes() -> MeasuredAttitudes:
+    """An empty table of measured attitudes.
+
+    Returns:
+        No rows.
+    """
     return MeasuredAttitudes(_index(()), np.zeros((0, 3, 3)), np.zeros((0, 3)))
 
 
@@ -213,12 +228,26 @@ class Network:
     rays: RayModel = field(default_factory=RayModel)
 
     def problems(self) -> tuple[str, ...]:
-        """One sentence for each error in shapes, indices and numbers; empty when it fits."""
+        """Check shapes, indices and numbers.
+
+        Returns:
+            One sentence for each error; empty when the tables fit.
+        """
         return tuple(_problems(self))
 
 
 def validate(network: Network) -> Network:
-    """The network itself, or a NetworkError with everything that is wrong with it."""
+    """Refuse a network whose tables do not fit.
+
+    Args:
+        network: to be checked.
+
+    Returns:
+        The network itself.
+
+    Raises:
+        NetworkError: with everything that is wrong with it.
+    """
     problems = network.problems()
     if problems:
         raise NetworkError(problems)

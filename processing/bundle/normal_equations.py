@@ -82,7 +82,16 @@ class GaussNewtonStep:
 
 
 def point_normals(equations: Equations, layout: ParameterLayout) -> Array:
-    """Normal matrices (p, 3, 3) of the eliminated points alone; one where a coordinate is held."""
+    """Normal matrices of the eliminated points alone.
+
+    Args:
+        equations: the rows.
+        layout: their columns and points.
+
+    Returns:
+        Shape (p, 3, 3), in the order of `layout.eliminated_points`; one is added to the diagonal
+        where a coordinate is held.
+    """
     points = len(layout.eliminated_points)
     result = np.zeros((points, 3, 3))
     rows = equations.point >= 0
@@ -98,6 +107,13 @@ def point_normals(equations: Equations, layout: ParameterLayout) -> Array:
 
 def reduced_equations(equations: Equations, layout: ParameterLayout) -> ReducedEquations:
     """Eliminate the points.
+
+    Args:
+        equations: the rows.
+        layout: their columns and points.
+
+    Returns:
+        Normal equations of the columns, with what leads back to the points.
 
     Raises:
         ValueError: more columns than `MAX_COLUMNS`, or a point that its rays do not fix.
@@ -169,6 +185,14 @@ def constrained_matrix(reduced: ReducedEquations, constraints: Array) -> tuple[A
     """The scaled reduced matrix with constraints added, and the scaled constraint rows of norm 1.
 
     Adding C'C leaves the solution under C dx = 0 as it is and gives its directions information.
+
+    Args:
+        reduced: from `reduced_equations`.
+        constraints: rows, shape (k, c); constraints @ dx = 0.
+
+    Returns:
+        Matrix, shape (c, c), of unknowns multiplied by `reduced.scale`, and rows, shape (k, c), of
+        the same.
     """
     scaled = reduced.matrix / reduced.scale[:, None] / reduced.scale
     if not len(constraints):
@@ -183,9 +207,12 @@ def solve(reduced: ReducedEquations, constraints: Array, *, minimum_norm: bool) 
 
     Args:
         reduced: from `reduced_equations`.
-        constraints: (k, c) rows; constraints @ dx = 0.
+        constraints: rows, shape (k, c); constraints @ dx = 0.
         minimum_norm: with directions that nothing determines, the shortest (scaled) correction
             instead of an error: a free network.
+
+    Returns:
+        Corrections of columns and points, and the predicted decrease of the sum of squares.
 
     Raises:
         SingularError: directions without information.
@@ -211,7 +238,15 @@ def solve(reduced: ReducedEquations, constraints: Array, *, minimum_norm: bool) 
 
 
 def cofactor_matrix(reduced: ReducedEquations, constraints: Array, *, minimum_norm: bool) -> Array:
-    """Cofactors (c, c) of the columns, constraints and eliminated points taken into account.
+    """Cofactors of the columns, constraints and eliminated points taken into account.
+
+    Args:
+        reduced: from `reduced_equations`.
+        constraints: rows, shape (k, c); constraints @ dx = 0.
+        minimum_norm: directions that nothing determines have no variance, instead of an error.
+
+    Returns:
+        Shape (c, c); times sigma0 squared it is the covariance.
 
     Raises:
         SingularError: directions without information.

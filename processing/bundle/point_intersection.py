@@ -37,7 +37,14 @@ class IntersectedPoints:
 
 
 def orientation_layout(network: Network) -> ParameterLayout:
-    """Columns of everything whose errors are propagated: what the network leaves free."""
+    """Columns of everything whose errors are propagated: what the network leaves free.
+
+    Args:
+        network: orientations as they are used.
+
+    Returns:
+        The layout, without points that their rays do not fix.
+    """
     return layout_of(network, undetermined_points(network, initial_values(network)))
 
 
@@ -48,7 +55,7 @@ def propagated_covariance(
     position_m: Array,
     attitude_rad: Array,
 ) -> Array:
-    """Covariance (c, c) of the columns of directly georeferenced exposures.
+    """Covariance of the columns of directly georeferenced exposures.
 
     The boresight is taken as the average, over the calibration's exposures, of inertial against
     adjusted attitudes; so all attitudes share the calibration's error of their mean, together with
@@ -57,8 +64,13 @@ def propagated_covariance(
     Args:
         layout: from `orientation_layout`.
         calibration: where heads, cameras and boresight were determined; None: they are exact.
-        position_m: (3,) sigma of every station's coordinates.
-        attitude_rad: (3,) sigma of every inertial attitude about the rig's axes.
+        position_m: sigma of every station's coordinates, shape (3,), m.
+        attitude_rad: sigma of every inertial attitude about the rig's axes, shape (3,), rad.
+
+    Returns:
+        Shape (c, c), metres and radians.
+
+    Source: docs/explanation/mathematics/navigation.md#combined-intersection.
     """
     covariance = np.zeros((layout.columns, layout.columns))
     n = 0
@@ -93,10 +105,15 @@ def intersect_points(
         network: orientations as they are used; object coordinates are starting values, their sigmas
             are not used.
         layout: from `orientation_layout` of the same network.
-        covariance: (c, c) of its columns, metres and radians.
+        covariance: of its columns, shape (c, c), metres and radians.
+
+    Returns:
+        Coordinates and covariances of all object points of the network.
 
     Raises:
         NetworkError: no convergence.
+
+    Source: docs/explanation/mathematics/navigation.md#combined-intersection.
     """
     network = replace(
         network,

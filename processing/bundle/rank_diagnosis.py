@@ -66,9 +66,17 @@ def rank_defects(
     """Name every direction of the unknowns that has no information.
 
     Args:
-        network, layout, state: what was to be adjusted.
+        network: what was to be adjusted.
+        layout: its columns.
+        state: its values.
         reduced: its reduced equations.
         singular: they could not be solved; the weakest direction is reported at least.
+
+    Returns:
+        Datum motions of the whole block first, then the other directions; empty where there are
+        none and `singular` is False.
+
+    Source: docs/explanation/mathematics/bundle.md#rank-and-free-networks.
     """
     matrix, _ = constrained_matrix(reduced, layout.constraints)
     values, vectors = linalg.eigh(matrix)

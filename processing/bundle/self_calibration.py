@@ -49,6 +49,12 @@ _OF_CONE: Final[tuple[Kind, ...]] = ("perspective-x", "perspective-y")
 def parts_of(rig: Rig) -> tuple[Part, ...]:
     """The part of the stitched image that each PAN CCD covers, from calibrated positions.
 
+    Args:
+        rig: the camera.
+
+    Returns:
+        One rectangle per PAN sensor, in file order, mm.
+
     Raises:
         ValueError: a rig without a stitched image.
     """
@@ -82,8 +88,27 @@ def with_self_calibration(
         master_cone: whose CCDs carry the datum.
         interior: whether dx0, dy0 and df can be separated from the images' orientation.
 
+    Returns:
+        The camera with `free`, `terms` and `gauges` of the set; `none` leaves it as it is.
+
     Raises:
         ValueError: a set of CCDs for an image that is not made of several.
+
+    Source: docs/explanation/mathematics/bundle.md#additional-parameters.
+
+    Example:
+        Nine CCDs in four cones: 7 + 2 (9 - 1) and 7 + 6 (9 - 1) + 2 (4 - 1) parameters.
+
+        >>> from processing.rig import find_rig
+        >>> parts = parts_of(find_rig("ultracam-x"))
+        >>> camera = CameraModel("image", f_mm=100.5)
+        >>> [
+        ...     parameter_count(
+        ...         with_self_calibration(camera, name, parts, master_cone="0", interior=True)
+        ...     )
+        ...     for name in SETS
+        ... ]
+        [0, 2, 23, 61]
     """
     free = set(camera.free)
     if name == "none":
@@ -118,5 +143,12 @@ def with_self_calibration(
 
 
 def parameter_count(camera: CameraModel) -> int:
-    """Independent parameters of a camera: what is estimated less its gauges."""
+    """Independent parameters of a camera.
+
+    Args:
+        camera: `free`, `terms` and `gauges` are counted.
+
+    Returns:
+        What is estimated less its gauges.
+    """
     return len(camera.free) + len(camera.terms) - len(camera.gauges)

@@ -60,6 +60,7 @@ class Part:
 
     @property
     def centre_mm(self) -> tuple[float, float]:
+        """Middle of the rectangle, (x, y)."""
         return ((self.x_min_mm + self.x_max_mm) / 2.0, (self.y_min_mm + self.y_max_mm) / 2.0)
 
 
@@ -78,9 +79,23 @@ class Term:
 
 
 def part_of(parts: Sequence[Part], xy_mm: Array) -> NDArray[np.int64]:
-    """The part that image points (n, 2) belong to, (n,): where they lie deepest inside.
+    """The part that image points belong to: where they lie deepest inside.
 
     In an overlap the border runs in its middle, as the seam does nominally.
+
+    Args:
+        parts: rectangles of the image, at least one.
+        xy_mm: image points, shape (n, 2), mm.
+
+    Returns:
+        Index into `parts`, shape (n,).
+
+    Example:
+        Parts that overlap from 9 to 11 mm meet at 10 mm.
+
+        >>> parts = (Part("A", "0", 0.0, 0.0, 11.0, 20.0), Part("B", "0", 9.0, 0.0, 20.0, 20.0))
+        >>> part_of(parts, np.array([[9.9, 10.0], [10.1, 10.0]]))
+        array([0, 1])
     """
     depth = np.stack(
         [
@@ -96,7 +111,22 @@ def part_of(parts: Sequence[Part], xy_mm: Array) -> NDArray[np.int64]:
 
 
 def term_design(term: Term, xy_mm: Array) -> Array:
-    """Correction (n, 2), mm, that a parameter of one makes at image points (n, 2)."""
+    """Correction that a parameter of one makes.
+
+    Args:
+        term: kind and CCDs.
+        xy_mm: image points, shape (n, 2), mm.
+
+    Returns:
+        Shape (n, 2), mm; zero outside the term's CCDs.
+
+    Example:
+        A rotation of one rad moves a point 2 mm above its CCD's centre by 2 mm to the left.
+
+        >>> part = Part("A", "0", 0.0, 0.0, 10.0, 20.0)
+        >>> term_design(Term("turn", "rotation", ("A",), (part,)), np.array([[5.0, 12.0]]))
+        array([[-2.,  0.]])
+    """
     names = [part.sensor for part in term.parts]
     own = part_of(term.parts, xy_mm)
     chosen = np.isin(own, [names.index(s) for s in term.sensors])

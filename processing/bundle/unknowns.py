@@ -28,6 +28,7 @@ class Unknown(NamedTuple):
 
     @property
     def name(self) -> str:
+        """Name in constraints and messages: kind, owner, component."""
         return f"{self.kind} {self.owner} {self.component}"
 
 
@@ -42,7 +43,7 @@ class ParameterLayout:
         terms: (t,) per camera.
         shift, drift: (lines, 3).
         retained_points: (points, 3), points with columns of their own.
-        eliminated_points: (points,) position among the eliminated points, -1 for others.
+        eliminated: (points,) position among the eliminated points, -1 for others.
         locked: (points, 3) coordinates that are held.
         unknowns: what each column is.
         constraints: (c, columns) rows; corrections summed over all iterations obey them.
@@ -64,6 +65,7 @@ class ParameterLayout:
 
     @property
     def columns(self) -> int:
+        """Number of columns."""
         return len(self.unknowns)
 
     @property
@@ -88,7 +90,14 @@ class ParameterValues:
 
 
 def initial_values(network: Network) -> ParameterValues:
-    """The values the network was given with."""
+    """The values the network was given with.
+
+    Args:
+        network: starting values.
+
+    Returns:
+        Copies of them; shifts and drifts of lines are zero.
+    """
     heads = network.heads
     lines = len(network.gnss.lines)
     return ParameterValues(
@@ -109,7 +118,10 @@ def layout_of(network: Network, left_out: NDArray[np.bool_]) -> ParameterLayout:
 
     Args:
         network: what is estimated and what is held.
-        left_out: (points,) object points that are not adjusted.
+        left_out: object points that are not adjusted, shape (points,).
+
+    Returns:
+        Columns of stations, attitudes, heads, cameras, lines and tied points, in this order.
 
     Raises:
         NetworkError: a constraint names what is not there.
@@ -188,7 +200,18 @@ def layout_of(network: Network, left_out: NDArray[np.bool_]) -> ParameterLayout:
 def apply_corrections(
     state: ParameterValues, layout: ParameterLayout, dx: Array, dpoints: Array
 ) -> ParameterValues:
-    """The state with corrections dx (columns,) and those of eliminated points (n, 3) applied."""
+    """The state with corrections applied.
+
+    Args:
+        state: current values; it is not changed.
+        layout: columns of the corrections.
+        dx: corrections of the columns, shape (columns,); rotations as vectors about the camera's
+            or rig's own axes, rad.
+        dpoints: corrections of the eliminated points, shape (p, 3), m.
+
+    Returns:
+        The corrected values.
+    """
 
     def part(columns: Indices) -> Array:
         return (
