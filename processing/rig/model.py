@@ -121,14 +121,17 @@ class Sensor:
 
     @property
     def pitch_mm(self) -> float:
+        """Pixel pitch."""
         return self.pitch_um * 1e-3
 
     @property
     def skew_per_mm(self) -> tuple[float, float]:
+        """Perspective skew along x and y, 1/mm."""
         return (self.skew_x_ppm_per_mm * 1e-6, self.skew_y_ppm_per_mm * 1e-6)
 
     @property
     def full_scale_dn(self) -> int:
+        """Largest DN, 2^bits - 1."""
         return (1 << self.bits) - 1
 
     @property
@@ -251,14 +254,17 @@ class VirtualImage:
 
     @property
     def pitch_mm(self) -> float:
+        """Pixel pitch."""
         return self.pitch_um * 1e-3
 
     @property
     def colour_width_px(self) -> int:
+        """Whole colour pixels in a row."""
         return math.floor(self.width_px / self.colour_ratio + 1e-9)
 
     @property
     def colour_height_px(self) -> int:
+        """Whole colour pixels in a column."""
         return math.floor(self.height_px / self.colour_ratio + 1e-9)
 
 
@@ -287,21 +293,51 @@ class Rig:
     probe_serials: Mapping[str, str] = field(default_factory=dict, hash=False)
 
     def cone(self, name: str | None) -> Cone:
-        """The cone of that name; KeyError, None's too, names those there are."""
+        """The cone of that name.
+
+        Args:
+            name: of a cone; None names none.
+
+        Returns:
+            The cone.
+
+        Raises:
+            KeyError: there is no such cone; the message names those there are.
+        """
         for cone in self.cones:
             if cone.name == name:
                 return cone
         raise KeyError(f"no cone {name!r}; the rig has {', '.join(c.name for c in self.cones)}")
 
     def cone_of(self, sensor_name: str) -> Cone:
-        """The cone that carries a sensor."""
+        """The cone that carries a sensor.
+
+        Args:
+            sensor_name: of a sensor.
+
+        Returns:
+            The cone.
+
+        Raises:
+            KeyError: there is no such sensor.
+        """
         for cone in self.cones:
             if any(sensor.name == sensor_name for sensor in cone.sensors):
                 return cone
         raise KeyError(f"no sensor {sensor_name!r} in rig {self.name}")
 
     def sensor(self, name: str) -> Sensor:
-        """The sensor of that name."""
+        """The sensor of that name.
+
+        Args:
+            name: of a sensor.
+
+        Returns:
+            The sensor.
+
+        Raises:
+            KeyError: there is no such sensor.
+        """
         return next(s for s in self.cone_of(name).sensors if s.name == name)
 
     @property
@@ -319,10 +355,12 @@ class Rig:
 
     @property
     def pan_cones(self) -> tuple[Cone, ...]:
+        """Cones of role `pan`, in file order."""
         return tuple(cone for cone in self.cones if cone.role == "pan")
 
     @property
     def colour_cones(self) -> tuple[Cone, ...]:
+        """Cones of role `colour`, in file order."""
         return tuple(cone for cone in self.cones if cone.role == "colour")
 
     @property

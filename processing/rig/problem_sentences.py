@@ -66,6 +66,9 @@ def findings_of(error: ValidationError, renamed: Mapping[str, str] | None = None
     Args:
         error: the refusal.
         renamed: former keys, with the dots of their tables, and their present names.
+
+    Returns:
+        Keys and what is wrong with them, without what only follows from other findings.
     """
     return [
         (detail["loc"], _found(detail, renamed or {}))
@@ -77,7 +80,16 @@ def findings_of(error: ValidationError, renamed: Mapping[str, str] | None = None
 def sentences(
     findings: Iterable[Finding], file: str = "", line_of: LineOf | None = None
 ) -> list[str]:
-    """One sentence for each finding: file, line where it is known, key, and what is wrong."""
+    """One sentence for each finding: file, line where it is known, key, and what is wrong.
+
+    Args:
+        findings: keys and what is wrong with them.
+        file: name of the file; empty: none is named.
+        line_of: finds the line of a key; None: no line is named.
+
+    Returns:
+        Sentences in the order of `findings`.
+    """
     found = []
     for location, text in findings:
         line = line_of(location) if line_of else None
@@ -87,7 +99,18 @@ def sentences(
 
 
 def key_of(location: Location) -> str:
-    """A key as it is named in sentences: `cone[0].sensor[1].pitch_um`."""
+    """A key as it is named in sentences.
+
+    Args:
+        location: keys of tables and indices of lists, from the outside.
+
+    Returns:
+        The key with dots and brackets.
+
+    Example:
+        >>> key_of(("cone", 0, "sensor", 1, "pitch_um"))
+        'cone[0].sensor[1].pitch_um'
+    """
     key = ""
     for part in location:
         key += f"[{part}]" if isinstance(part, int) else f".{part}" if key else part
@@ -95,7 +118,14 @@ def key_of(location: Location) -> str:
 
 
 def shown(value: object) -> str:
-    """A value in 60 characters at most."""
+    """A value in 60 characters at most.
+
+    Args:
+        value: as found in a file.
+
+    Returns:
+        Its `repr`, cut off with "..." where it is longer.
+    """
     text = repr(value)
     return text if len(text) <= 60 else text[:57] + "..."
 
@@ -134,6 +164,18 @@ def line_finder(data: bytes) -> LineOf:
     """A function that finds the line of a key in a TOML document that parses.
 
     A key is on the last line of the shortest beginning of the document that holds it.
+
+    Args:
+        data: the document, UTF-8.
+
+    Returns:
+        The function; of a key that the document does not hold it finds the innermost table around
+        it that it does hold. None where there is none, or the document is too large.
+
+    Example:
+        >>> line_of = line_finder(b'name = "a"\\n[[cone]]\\nprobe = "0"\\n')
+        >>> line_of(("cone", 0, "probe")), line_of(("cone", 0, "role")), line_of(("title",))
+        (3, 2, None)
     """
     lines = data.decode("utf-8").splitlines(keepends=True)
     parsed: dict[int, Any] = {0: {}}

@@ -134,15 +134,30 @@ class RigFile(_Table):
 
 
 def shipped_rigs() -> dict[str, Path]:
-    """Rig files that come with the package, by name."""
+    """Rig files that come with the package.
+
+    Returns:
+        Paths by name, sorted.
+    """
     return {path.stem: path for path in sorted((Path(__file__).parent / "files").glob("*.toml"))}
 
 
 def find_rig(name_or_path: str) -> Rig:
     """Load a shipped rig by its name, or any rig file by its path.
 
+    Args:
+        name_or_path: a shipped rig has precedence over a file of the same name.
+
+    Returns:
+        The rig.
+
     Raises:
         RigError: no such rig, or a file with mistakes (all of them listed).
+
+    Example:
+        >>> rig = find_rig("ultracam-x")
+        >>> len(rig.cones), len(rig.sensors), rig.master_cone
+        (8, 13, '0')
     """
     shipped = shipped_rigs()
     if name_or_path in shipped:
@@ -156,6 +171,12 @@ def find_rig(name_or_path: str) -> Rig:
 
 def load_rig(path: Path) -> Rig:
     """Read and validate a rig file.
+
+    Args:
+        path: of a TOML file of at most `RIG_FILE_MAX_BYTES`.
+
+    Returns:
+        The rig.
 
     Raises:
         RigError: with one sentence per mistake: file, key, value, and what would be right.
@@ -177,7 +198,15 @@ def load_rig(path: Path) -> Rig:
 
 
 def rig_from_mapping(content: Mapping[str, Any], file: str, line_of: LineOf | None = None) -> Rig:
-    """Build a rig from parsed TOML; `file` names it in the error sentences.
+    """Build a rig from parsed TOML.
+
+    Args:
+        content: tables of the file.
+        file: its name in the error sentences.
+        line_of: finds the line of a key for the sentences.
+
+    Returns:
+        The rig.
 
     Raises:
         RigError: with one sentence per mistake.

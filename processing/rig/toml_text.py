@@ -22,6 +22,12 @@ class TomlError(ProcessingError, ValueError):
 def parse_toml(data: bytes) -> dict[str, Any]:
     """Parse a TOML document.
 
+    Args:
+        data: the document.
+
+    Returns:
+        Its tables.
+
     Raises:
         TomlError: not UTF-8, not TOML, a number of more digits than Python reads, or nested more
             than `DEPTH_MAX` deep.
@@ -38,7 +44,19 @@ def parse_toml(data: bytes) -> dict[str, Any]:
 
 
 def is_nested_deeper(content: object, depth: int) -> bool:
-    """Whether tables or lists lie more than `depth` within one another."""
+    """Whether tables or lists lie more than `depth` within one another.
+
+    Args:
+        content: a parsed document.
+        depth: levels that are allowed below the document itself.
+
+    Returns:
+        True where there are more.
+
+    Example:
+        >>> is_nested_deeper({"a": [[1]]}, 2), is_nested_deeper({"a": [[1]]}, 1)
+        (False, True)
+    """
     level: list[object] = [content]
     for _ in range(depth + 1):
         level = [

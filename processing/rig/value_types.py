@@ -17,7 +17,18 @@ _NAME: Final = re.compile(_NAME_PATTERN)
 
 
 def plain_name(name: str) -> bool:
-    """Whether a sensor or file name is safe in a path: letters, digits, `_`, `-`, inner dots."""
+    """Whether a sensor or file name is safe in a path: letters, digits, `_`, `-`, inner dots.
+
+    Args:
+        name: to be checked.
+
+    Returns:
+        True where it is safe and has 64 characters at most.
+
+    Example:
+        >>> plain_name("SU-01.raw"), plain_name("../SU01"), plain_name(".hidden")
+        (True, False, False)
+    """
     return _NAME.fullmatch(name) is not None and ".." not in name
 
 
@@ -28,7 +39,17 @@ def _visible(text: str) -> str:
 
 
 def named(text: str) -> str:
-    """The text, if it is safe in a path; ValueError if not."""
+    """The text, if it is safe in a path.
+
+    Args:
+        text: to be checked by `plain_name`.
+
+    Returns:
+        The text itself.
+
+    Raises:
+        ValueError: it is not safe.
+    """
     if not plain_name(text):
         raise ValueError("letters, digits, '_', '-' and inner dots only, 64 at most")
     return text
