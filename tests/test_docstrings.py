@@ -26,6 +26,7 @@ COMPLETE: tuple[str, ...] = (
     "processing/mosaic",
     "processing/pipelines",
     "processing/quality",
+    "processing/radiometry",
     "processing/rig",
 )
 """Packages whose docstrings are complete."""

@@ -66,7 +66,20 @@ class RadiometricCalibration:
 
 
 def neutral_radiometry(sensor: Sensor) -> RadiometricCalibration:
-    """The calibration of an uncalibrated sensor: the rig's black level, gain one, no defect."""
+    """The calibration of an uncalibrated sensor: the rig's black level, gain one, no defect.
+
+    Args:
+        sensor: size, black level and calibration temperature are used.
+
+    Returns:
+        Maps of the sensor's shape that share one value each.
+
+    Example:
+        >>> from processing.rig import find_rig
+        >>> calibration = neutral_radiometry(find_rig("ultracam-x-mini").sensor("SU00"))
+        >>> calibration.gain.shape, float(calibration.bias_dn[0, 0])
+        ((832, 1248), 64.0)
+    """
     shape = (sensor.height_px, sensor.width_px)
     return RadiometricCalibration(
         bias_dn=np.broadcast_to(np.float32(sensor.black_dn), shape),
@@ -82,6 +95,12 @@ def load_radiometry(path: Path) -> RadiometricCalibration:
     """Read `<sensor>.npz`, which holds the names of `RadiometricCalibration`; the last is optional.
 
     Nothing is unpickled, and no array is read before its announced size was checked.
+
+    Args:
+        path: of the file.
+
+    Returns:
+        The calibration, maps float32 and uint8.
 
     Raises:
         CalibrationError: the file is missing, too large, damaged, or holds other than it should.
@@ -132,6 +151,11 @@ def check_radiometry(
     name: str, calibration: RadiometricCalibration, *, sensor: Sensor | None = None
 ) -> None:
     """Refuse maps of unlike shapes or impossible values; with a sensor, maps of another size.
+
+    Args:
+        name: what the sentences begin with.
+        calibration: to be checked.
+        sensor: whose size the maps have; None: any size.
 
     Raises:
         CalibrationError: what was found and what would be right, beginning with `name`.

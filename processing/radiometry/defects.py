@@ -31,6 +31,14 @@ def spread_defects(defect: Array, shifts: int, sign: int) -> tuple[Array, Array]
 
     Returns:
         The map (h, w) uint8, and (row, column) of its defects, (n, 2) int32.
+
+    Example:
+        Two shifts towards higher rows: a defect in row 0 spoils rows 0 to 2.
+
+        >>> defect = np.array([[1], [0], [0], [0]], np.uint8)
+        >>> mask, places = spread_defects(defect, 2, 1)
+        >>> mask.ravel(), places.tolist()
+        (array([1, 1, 1, 0], dtype=uint8), [[0, 0], [1, 0], [2, 0]])
     """
     mask = defect.copy()
     for k in range(1, shifts + 1):
@@ -48,11 +56,17 @@ def interpolate_defects(level1, mask, places, period):
     Directions of nearly the least gradient share, for their noise is not the same. Where two good
     pixels lie on either side, all four are taken: a line through two cuts off every crest.
 
-    Pixels `period` apart in row or column are of one colour; no others are compared.
-
     The gradient of a direction is the mean of what the pixels of a 5 x 5 neighbourhood differ from
     their neighbour in that direction, good ones only: many chords, so that noise does not choose.
     Only good pixels are read, so the order of the work does not matter.
+
+    Args:
+        level1: Level-1 words, shape (h, w), uint16; filled in place, 0 where nothing is in reach.
+        mask: defects, shape (h, w), uint8.
+        places: (row, column) of the defects, shape (n, 2), int32.
+        period: pixels so far apart in row or column are of one colour; no others are compared.
+
+    Source: docs/explanation/mathematics/radiometry.md#defects.
     """
     height, width = level1.shape
     for index in prange(places.shape[0]):

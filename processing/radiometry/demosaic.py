@@ -25,7 +25,14 @@ _LETTERS: Final = {"R": 0, "G": 1, "B": 2}
 
 
 def is_bayer(sensor: Sensor) -> bool:
-    """Whether a sensor's pixels lie behind a colour filter array."""
+    """Whether a sensor's pixels lie behind a colour filter array.
+
+    Args:
+        sensor: `colour_filter_array` is used.
+
+    Returns:
+        False for "none".
+    """
     return sensor.colour_filter_array != "none"
 
 
@@ -50,6 +57,14 @@ def demosaic(level1: Array, colour_filter_array: str, *, out: Array) -> None:
 
     Raises:
         ValueError: no colour filter array, or arrays that do not fit each other.
+
+    Example:
+        A grey surface stays grey: words of 1000 in every colour.
+
+        >>> out = np.zeros((3, 6, 6), np.uint16)
+        >>> demosaic(np.full((6, 6), 1000, np.uint16), "RGGB", out=out)
+        >>> out[:, 2, 3]
+        array([1000, 1000, 1000], dtype=uint16)
     """
     if sorted(colour_filter_array) != ["B", "G", "G", "R"]:
         raise ValueError(f"colour filter array {colour_filter_array!r} is no R, B and two greens")

@@ -21,6 +21,13 @@ def sampled_histogram(frame: NDArray[Any], bits: int) -> tuple[int, ...]:
 
     Returns:
         BINS counts; the last holds what is saturated or within a 64th of it.
+
+    Example:
+        2048 of 12 bits is half of the range: bin 32 of 64.
+
+        >>> counts = sampled_histogram(np.full((16, 16), 2048, np.uint16), 12)
+        >>> counts.index(4), sum(counts)
+        (32, 4)
     """
     sample = frame[EVERY // 2 :: EVERY, EVERY // 2 :: EVERY]
     bins = np.minimum(sample.astype(np.int64) * BINS >> bits, BINS - 1)

@@ -98,12 +98,30 @@ class Corrector:
 
 
 def level1_counts_per_dn(bits: int) -> float:
-    """Level-1 counts of one DN for a sensor of so many bits: full scale is half of the range."""
+    """Level-1 counts of one DN: full scale is half of the range of words.
+
+    Args:
+        bits: of the sensor's converter, 1 to 16.
+
+    Returns:
+        2^(15 - bits).
+
+    Example:
+        >>> level1_counts_per_dn(12), level1_counts_per_dn(16)
+        (8.0, 0.5)
+    """
     return float(2.0 ** (15 - bits))
 
 
 def corrector_for(sensor: Sensor, calibration: RadiometricCalibration | None) -> Corrector:
-    """Make a calibration ready for the pass; None takes the neutral one.
+    """Make a calibration ready for the pass.
+
+    Args:
+        sensor: whose frames are corrected.
+        calibration: of the sensor; None takes the neutral one.
+
+    Returns:
+        Maps as fixed point, or scalars where all pixels have the same calibration.
 
     Raises:
         CalibrationError: the maps are not of the sensor's size, or out of range.
@@ -157,15 +175,39 @@ def level1_from_level0(
     +1) are partly exposed and become no data, and a defect spoils N more rows.
 
     Args:
-        raw: the frame, (height, width) uint16, DN.
+        corrector: from `corrector_for`.
+        raw: the frame, shape (height, width), uint16, DN.
         temperature_c: of the sensor; None takes the calibration's reference temperature.
-        out: (height, width) uint16, contiguous; overwritten.
+        exposure_time_s: of the frame; the dark signal grows with it.
+        tdi_shifts: N of the frame.
+        out: shape (height, width), uint16, contiguous; overwritten.
         scale: multiplies the signal, after the offset was taken off. What it carries beyond the
             range of words counts as saturated.
         measure_lines: whether the means of bundles along lines are wanted.
 
+    Returns:
+        What the pass saw of the frame.
+
     Raises:
         ValueError: `raw` or `out` is not a uint16 frame of the sensor's size.
+
+    Source: docs/explanation/mathematics/radiometry.md#offset-and-gain and #tdi.
+
+    Example:
+        12 bits, black 64 DN, gain 1.25: 164 DN become (164 - 64) * 1.25 * 8 = 1000 counts.
+
+        >>> from dataclasses import replace
+        >>> from processing.rig import find_rig
+        >>> sensor = replace(find_rig("ultracam-x-mini").sensor("SU00"), width_px=64, height_px=48)
+        >>> neutral = neutral_radiometry(sensor)
+        >>> calibration = replace(neutral, gain=np.full((48, 64), 1.25, np.float32))
+        >>> out = np.zeros((48, 64), np.uint16)
+        >>> seen = level1_from_level0(
+        ...     corrector_for(sensor, calibration), np.full((48, 64), 164, np.uint16),
+        ...     temperature_c=20.0, exposure_time_s=0.002, tdi_shifts=0, out=out,
+        ... )
+        >>> int(out[10, 10]), seen.mean_dn
+        (1000, 125.0)
     """
     sensor = corrector.sensor
     shape = (sensor.height_px, sensor.width_px)
@@ -248,7 +290,18 @@ def level1_from_level0(
 def min_raw_value(sensor: Sensor) -> int:
     """The raw word below which a pixel was not read out: without light it shows its black level.
 
-    Zero or less where black is not above the noise.
+    Args:
+        sensor: black level, read noise and format of its words are used.
+
+    Returns:
+        The word; zero or less where black is not above the noise.
+
+    Example:
+        Black 64 DN, read noise 30 e / 20 e per DN = 1.5 DN: ten times that below black.
+
+        >>> from processing.rig import find_rig
+        >>> min_raw_value(find_rig("ultracam-x-mini").sensor("SU00"))
+        49
     """
     noise_dn = sensor.read_noise_e / sensor.electrons_per_dn
     least_dn = int(sensor.black_dn - _UNREAD_NOISES * max(noise_dn, 1.0))
@@ -256,8 +309,15 @@ def min_raw_value(sensor: Sensor) -> int:
 
 
 def unread_fraction(sensor: Sensor, raw: Array) -> float | None:
-    """Share of words far below black among those compared, of a frame (h, w) that was not corrected
-    here; None where black is not above the noise."""
+    """Share of words far below black, of a frame that was not corrected here.
+
+    Args:
+        sensor: black level, read noise and format of its words are used.
+        raw: the frame, shape (h, w), uint16; every 256th column is compared.
+
+    Returns:
+        0 to 1; None where black is not above the noise.
+    """
     least = min_raw_value(sensor)
     if least <= 0:
         return None
@@ -266,7 +326,16 @@ def unread_fraction(sensor: Sensor, raw: Array) -> float | None:
 
 
 def exposed_rows(sensor: Sensor, tdi_shifts: int) -> tuple[int, int]:
-    """First and last raw row that is fully exposed after so many TDI shifts."""
+    """First and last raw row that is fully exposed.
+
+    Args:
+        sensor: height and `tdi_row_sign` are used.
+        tdi_shifts: N of the frame; below zero counts as zero.
+
+    Returns:
+        (first, last), both included: (N, height - 1), or (0, height - 1 - N) where charge moves to
+        lower rows.
+    """
     shifts = max(int(tdi_shifts), 0)
     if sensor.tdi_row_sign > 0:
         return shifts, sensor.height_px - 1

@@ -57,15 +57,30 @@ def radiance_from_raw(
 
     Args:
         sensor: format of its words, and the black level where `black` is None.
-        words: (h, w) uint16 as stored.
-        exposure_time_s, gain: of this exposure.
+        calibration: of the head.
+        raw: words as stored, shape (h, w), uint16.
+        exposure_time_s: of this exposure, positive.
+        gain: of this exposure, linear, positive.
         black: word without light, as the head reports it for this frame.
 
     Returns:
-        (h, w) float32, W/m2/sr/nm. Noise may leave it below zero.
+        Shape (h, w), float32, W/m2/sr/nm. Noise may leave it below zero.
 
     Raises:
         ValueError: a frame of the wrong shape or type, or a time or gain that is not positive.
+
+    Source: MicaSense, "RedEdge camera radiometric calibration model".
+
+    Example:
+        L = (word - black) a1 / (gain t 65536): half of the range at a1 = 1e-4, 1 ms.
+
+        >>> from dataclasses import replace
+        >>> from processing.rig import find_rig
+        >>> sensor = replace(find_rig("rededge").sensor("G"), width_px=2, height_px=1)
+        >>> response = RadianceCalibration(1e-4, 0.0, 0.0, (0.5, 0.0), (), 560.0, 20.0)
+        >>> words = np.full((1, 2), 32768 + 4800, np.uint16)
+        >>> radiance_from_raw(sensor, response, words, exposure_time_s=0.001)
+        array([[0.05, 0.05]], dtype=float32)
     """
     shape = (sensor.height_px, sensor.width_px)
     if raw.shape != shape or raw.dtype != np.uint16:
@@ -93,13 +108,35 @@ def radiance_from_raw(
 
 
 def saturated_pixels(sensor: Sensor, raw: Array) -> Array:
-    """Where a raw frame is at full scale, (h, w) bool."""
+    """Where a raw frame is at full scale.
+
+    Args:
+        sensor: format of its words.
+        raw: words as stored, shape (h, w), uint16.
+
+    Returns:
+        Shape (h, w), bool.
+
+    Example:
+        12 bits, left-justified: 4095 * 16.
+
+        >>> from processing.rig import find_rig
+        >>> saturated_pixels(find_rig("rededge").sensor("G"), np.array([[65504, 65520]], np.uint16))
+        array([[False,  True]])
+    """
     full: Array = raw >= sensor.full_scale_dn * sensor.raw_units_per_dn
     return full
 
 
 def radiance_as_json(calibration: RadianceCalibration) -> dict[str, Any]:
-    """The content of `<sensor>.json`."""
+    """The content of `<sensor>.json`.
+
+    Args:
+        calibration: to be written.
+
+    Returns:
+        The fields by name, tuples as lists.
+    """
     content = asdict(calibration)
     return {
         key: list(value) if isinstance(value, tuple) else value for key, value in content.items()
@@ -108,6 +145,12 @@ def radiance_as_json(calibration: RadianceCalibration) -> dict[str, Any]:
 
 def load_radiance(path: Path) -> RadianceCalibration:
     """Read `<sensor>.json`, which holds exactly the fields of `RadianceCalibration`.
+
+    Args:
+        path: of the file.
+
+    Returns:
+        The calibration.
 
     Raises:
         CalibrationError: the file is missing, too large, damaged, or holds other than it should.
@@ -123,10 +166,10 @@ def load_radiance(path: Path) -> RadianceCalibration:
         raise CalibrationError(f"{path}: cannot be read ({reason}); give a JSON file") from error
     except (ValueError, RecursionError) as error:
         raise CalibrationError(f"{path.name}: not valid JSON ({error})") from error
-    return radiance_from_mapping(content, path.name)
+    return _radiance_from_mapping(content, path.name)
 
 
-def radiance_from_mapping(content: Any, name: str) -> RadianceCalibration:
+def _radiance_from_mapping(content: Any, name: str) -> RadianceCalibration:
     """Build a calibration from parsed JSON; `name` begins the error sentences.
 
     Raises:

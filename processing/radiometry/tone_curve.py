@@ -41,11 +41,22 @@ class ToneCurve:
 
 
 def histogram(band: Array, scale: float = 1.0) -> Array:
-    """How often each word occurs, (65536,) int64; no data (0) is not counted.
+    """How often each word occurs; no data (0) is not counted.
 
     Args:
-        band: uint16.
+        band: words, any shape, uint16.
         scale: multiplies the signal first, see `scaled_value_table`.
+
+    Returns:
+        Shape (65536,), int64, index is the word.
+
+    Raises:
+        ValueError: a scale that is not positive.
+
+    Example:
+        >>> counts = histogram(np.array([[0, 7, 7, 9]], np.uint16))
+        >>> int(counts[0]), int(counts[7]), int(counts.sum())
+        (0, 2, 3)
     """
     counts: Array = np.bincount(band.ravel(), minlength=VALUE_COUNT).astype(np.int64)
     counts[0] = 0
@@ -60,8 +71,18 @@ def histogram(band: Array, scale: float = 1.0) -> Array:
 def scaled_value_table(scale: float) -> Array:
     """What each of the 65536 words becomes when signal is multiplied by `scale`: data stay data.
 
+    Args:
+        scale: positive.
+
+    Returns:
+        Shape (65536,), int64, 1 to 65535 for data, 0 for no data.
+
     Raises:
         ValueError: a scale that is not positive.
+
+    Example:
+        >>> scaled_value_table(0.1)[[0, 1, 100, 65535]]
+        array([   0,    1,   10, 6554])
     """
     if not (math.isfinite(scale) and scale > 0.0):
         raise ValueError(f"scale is {scale}; signal is multiplied by a positive number")
@@ -73,10 +94,25 @@ def scaled_value_table(scale: float) -> Array:
 
 
 def mission_curve(histograms: Mapping[str, Array]) -> ToneCurve:
-    """The curve of a mission from its summed histograms, by band.
+    """The curve of a mission from its summed histograms.
+
+    Args:
+        histograms: counts by band, shape (65536,) each; bands without data are left out.
+
+    Returns:
+        Limits of each band at 0.1 % and 99.7 %, and one exponent for all, 0.35 to 1.
 
     Raises:
         ValueError: no band holds data.
+
+    Example:
+        The median lies at 16 % of the range and shall lie at 40 %: 0.16^0.5 = 0.4.
+
+        >>> counts = np.zeros(65536, np.int64)
+        >>> counts[[1000, 1160, 2000]] = 10, 980, 10
+        >>> curve = mission_curve({"green": counts})
+        >>> curve.low["green"], curve.high["green"], round(curve.exponent, 6)
+        (1000.0, 2000.0, 0.5)
     """
     low, high, middle = {}, {}, {}
     for band, counts in histograms.items():
@@ -96,7 +132,24 @@ def mission_curve(histograms: Mapping[str, Array]) -> ToneCurve:
 
 
 def lookup_table(curve: ToneCurve, band: str, scale: float = 1.0) -> Array:
-    """The 8-bit value of each word of a band, (65536,) uint8, for signal times `scale`."""
+    """The 8-bit value of each word of a band.
+
+    Args:
+        curve: of the mission; it has the band.
+        band: name of the band.
+        scale: multiplies the signal first, positive.
+
+    Returns:
+        Shape (65536,), uint8; 0 is no data.
+
+    Raises:
+        ValueError: a scale that is not positive.
+
+    Example:
+        >>> curve = ToneCurve({"green": 1000.0}, {"green": 3000.0}, exponent=0.5)
+        >>> lookup_table(curve, "green")[[0, 500, 1500, 3000]]
+        array([  0,   1, 128, 255], dtype=uint8)
+    """
     scaled_values = scaled_value_table(scale).astype(np.float64)
     unit = (scaled_values - curve.low[band]) / (curve.high[band] - curve.low[band])
     table = np.rint(1.0 + 254.0 * np.clip(unit, 0.0, 1.0) ** curve.exponent).astype(np.uint8)
@@ -105,7 +158,14 @@ def lookup_table(curve: ToneCurve, band: str, scale: float = 1.0) -> Array:
 
 
 def curve_as_json(curve: ToneCurve) -> dict[str, Any]:
-    """The curve as JSON-ready data."""
+    """The curve as JSON-ready data.
+
+    Args:
+        curve: to be written.
+
+    Returns:
+        `low` and `high` by band, and `exponent`.
+    """
     return {"low": dict(curve.low), "high": dict(curve.high), "exponent": curve.exponent}
 
 
