@@ -102,8 +102,8 @@ class BoresightCalibration:
 
     `covariance` (10, 10) in the order of `PARAMETERS` (rad, m, s), within what is determined: held
     parameters and unseparated directions have none. `determined` (10,) marks the parameters that
-    are completely determined. `basis` (10, r) are the determined directions, scaled by `WORTH`.
-    Residuals are (n, 3): positions in m (object axes), attitudes in rad (rig's body axes).
+    are completely determined. `basis` (10, r) are the determined directions, scaled by
+    `PARAMETER_SCALES`. Residuals are (n, 3): positions in m (object axes), attitudes in rad (rig's body axes).
     `sigma0` has expected value one.
     """
 
@@ -142,13 +142,19 @@ def calibrate_boresight(
     """Compare inertial with controlled orientation.
 
     Args:
-        controlled, inertial: the same exposures in the same order.
+        image_orientations: adjusted without the trajectory.
+        inertial: the same exposures in the same order.
         given: the values so far; what is held or cannot be separated stays as it is there.
         held: of "boresight", "lever", "time", "shift".
         lever_sigma_m: the given lever arm was surveyed to this and counts as an observation.
 
+    Returns:
+        The mounting with its covariance, residuals, and what the flight does not separate.
+
     Raises:
         ValueError: fewer than three exposures, tables that do not fit, or an unknown group.
+
+    Source: docs/explanation/mathematics/boresight.md#model.
     """
     n = len(image_orientations.centre_m)
     _check(image_orientations, inertial, held)
@@ -212,7 +218,14 @@ def calibrate_boresight(
 
 
 def angle_covariance(found: BoresightCalibration) -> Array:
-    """Covariance (3, 3), rad squared, of roll, pitch and heading of the boresight."""
+    """Covariance of roll, pitch and heading of the boresight.
+
+    Args:
+        found: from `calibrate_boresight`.
+
+    Returns:
+        Shape (3, 3), rad squared, in the order roll, pitch, heading.
+    """
     by = angles_by_rotation_vector("ZYX", found.mounting.imu_from_body)[::-1]
     return np.asarray(by @ found.covariance[:3, :3] @ by.T)
 
@@ -224,7 +237,24 @@ def mounting_of(
     time_offset_s: float = 0.0,
     shift_m: Array | None = None,
 ) -> ImuMounting:
-    """A mounting from a lever arm and roll, pitch, heading of the boresight."""
+    """A mounting from a lever arm and the angles of the boresight.
+
+    Args:
+        antenna_m: from the rig's origin, forward, right, down, shape (3,), m.
+        boresight_rad: roll, pitch, heading of the body against the inertial unit, shape (3,), rad.
+        time_offset_s: as of `ImuMounting`.
+        shift_m: as of `ImuMounting`, shape (3,), m; None: zero.
+
+    Returns:
+        The mounting.
+
+    Example:
+        A rig turned by 90 degrees: its forward axis is the unit's right axis.
+
+        >>> mounting = mounting_of(np.zeros(3), np.array([0.0, 0.0, np.pi / 2]))
+        >>> mounting.imu_from_body.round(6) @ [1.0, 0.0, 0.0]
+        array([0., 1., 0.])
+    """
     return ImuMounting(
         level_from_body(*(float(v) for v in boresight_rad)),
         np.asarray(antenna_m, dtype=np.float64),
@@ -331,7 +361,7 @@ def _observation_covariance(
 
 
 def _named(lost: Array, inertial: InertialOrientations) -> tuple[InseparableParameters, ...]:
-    """Sentences for undetermined directions (10, k), scaled by their worth."""
+    """Sentences for undetermined directions (10, k), scaled by `PARAMETER_SCALES`."""
     if not lost.shape[1]:
         return ()
     together = (lost @ lost.T > _MIN_PARTICIPATION) | (lost @ lost.T < -_MIN_PARTICIPATION)

@@ -56,8 +56,8 @@ class CalibratedConeMounting:
     `correction_rad` against the calibration flown with, `correction_sigma_rad` of the mean, the
     sensor's place in its head taken as calibrated; `scatter_rad` is that of a single exposure.
     `angles_rad` are omega, phi, kappa with `angles_sigma_rad`, which holds the place's share too;
-    so does the turn's `covariance` (3, 3). `turns` (n, 3) are the exposures used, numbers `used`
-    among the records.
+    so does the turn's `covariance` (3, 3). `corrections` (n, 3) are those of the exposures used,
+    numbers `used` among the records.
     """
 
     cone: str
@@ -91,11 +91,20 @@ class PlatformCalibration:
 def calibrate_platform(rig: Rig, records: Sequence[StitchRecord]) -> PlatformCalibration:
     """Average the rotations of every cone except the master over exposures.
 
-    An exposure in which a cone's rotation is an outlier (a blurred head, a cloud) is left out for it.
-    Of converging heads only exposures with all of them count: their datum is their mean.
+    An exposure in which a cone's rotation is an outlier (a blurred head, a cloud) is left out for
+    it. Of converging heads only exposures with all of them count: their datum is their mean.
+
+    Args:
+        rig: the camera, with the calibration that was flown.
+        records: of its exposures, in the order of time.
+
+    Returns:
+        Mean rotations of the cones with enough exposures, and names of the others.
 
     Raises:
         ValueError: a record of another rig or calibration.
+
+    Source: docs/explanation/mathematics/virtual-camera.md#platform-calibration-from-a-flight.
     """
     for record in records:
         if (record.rig, record.calibration_id) != (rig.name, rig.calibration_id):
@@ -126,7 +135,17 @@ def calibrate_platform(rig: Rig, records: Sequence[StitchRecord]) -> PlatformCal
 def calibrated_rig(
     rig: Rig, calibration: PlatformCalibration, *, calibration_id: str, date: str
 ) -> Rig:
-    """The rig with the new angles and their sigmas."""
+    """The rig with the new angles and their sigmas.
+
+    Args:
+        rig: the camera that was calibrated.
+        calibration: of its cones; others keep their angles.
+        calibration_id: of the new calibration.
+        date: of the new calibration, YYYY-MM-DD.
+
+    Returns:
+        A new rig.
+    """
     found = {c.cone: c for c in calibration.cones}
     cones = []
     for cone in rig.cones:
@@ -157,7 +176,16 @@ class ConfoundingEffect:
 
 
 def confounding_effect(rig: Rig, cone: Cone, records: Sequence[StitchRecord]) -> ConfoundingEffect:
-    """Rotation of a cone's image by each of these, at the heights that were flown."""
+    """Rotation of a cone's image by each of these, at the heights that were flown.
+
+    Args:
+        rig: the camera.
+        cone: one of its cones.
+        records: of the exposures; without a height the effects of the base are zero.
+
+    Returns:
+        Rotations about x, y, z, shape (3,) each, rad.
+    """
     heights = [r.height_m for r in records if r.height_m]
     per_m = 1.0 / float(np.mean(heights)) if heights else 0.0
     base_along_m = 0.0
@@ -173,7 +201,22 @@ def confounding_effect(rig: Rig, cone: Cone, records: Sequence[StitchRecord]) ->
 
 
 def shift_px(rig: Rig, correction_rad: Array) -> float:
-    """Displacement by a rotation of the middle of a cone's field, PAN pixels, about x and y alone."""
+    """Displacement by a rotation of the middle of a cone's field, about x and y alone.
+
+    Args:
+        rig: the camera.
+        correction_rad: rotation vector, shape (3,), rad.
+
+    Returns:
+        PAN pixels of the virtual image; zero where the rig has none.
+
+    Example:
+        100 urad of 100.5 mm are 10 um, 1.4 pixels of 7.2 um.
+
+        >>> from processing.rig import find_rig
+        >>> round(shift_px(find_rig("ultracam-x"), np.array([100e-6, 0.0, 0.0])), 3)
+        1.396
+    """
     if rig.virtual_image is None:
         return 0.0
     return (
@@ -229,7 +272,14 @@ def _calibrated(
 
 
 def min_exposures(rig: Rig) -> int:
-    """Below, a cone's mean is not reported."""
+    """Exposures a cone needs; with fewer its mean is not reported.
+
+    Args:
+        rig: its timing is used.
+
+    Returns:
+        `MIN_EXPOSURES_SYNTOPIC` or `MIN_EXPOSURES`.
+    """
     return MIN_EXPOSURES_SYNTOPIC if rig.timing == "syntopic" else MIN_EXPOSURES
 
 
@@ -242,9 +292,15 @@ def _autocorrelation_factor(corrections: Array) -> Array:
 
 
 def base_mm(rig: Rig, cone: Cone) -> tuple[float, float]:
-    """From where the virtual image is seen to where the cone sees from, mm, right and forward.
+    """From where the virtual image is seen to where the cone sees from.
 
-    None forward of cones that fire one after the other over one place.
+    Args:
+        rig: the camera.
+        cone: one of its cones.
+
+    Returns:
+        (right, forward), mm. Forward is zero for cones that fire one after the other over one
+        place; both are zero for converging heads, whose placement takes the height into account.
     """
     forward, right, _ = np.subtract(cone.position_mm, rig.image_position_mm)
     if rig.has_virtual_camera:

@@ -45,10 +45,12 @@ class NormalEquations:
 
     @property
     def size(self) -> int:
+        """Number of offsets, which is that of rates."""
         return len(self.vector) // 2
 
     @property
     def spread_k(self) -> float:
+        """Range of dC that was flown, K; zero without exposures."""
         return self.highest_dc_k - self.lowest_dc_k if self.exposures else 0.0
 
 
@@ -114,7 +116,14 @@ class Observability:
 
 
 def empty_state(rig: Rig) -> ThermalState:
-    """The empty state."""
+    """The state before the first exposure.
+
+    Args:
+        rig: the camera.
+
+    Returns:
+        Normal equations of zero for the cones that can be learned.
+    """
     places, scales = {}, {}
     for cone in mosaic_cones(rig):
         if cone.role == "pan" and len(cone.sensors) >= 2:
@@ -128,6 +137,14 @@ def add_exposure(rig: Rig, state: ThermalState, record: StitchRecord) -> Thermal
     """The state after one more exposure; the order of exposures does not matter.
 
     A cone is skipped where a sensor of it is missing or its temperature was not measured.
+
+    Args:
+        rig: the camera.
+        state: so far; it is not changed.
+        record: of the exposure.
+
+    Returns:
+        The new state.
 
     Raises:
         ValueError: the record is of another rig or calibration.
@@ -155,10 +172,20 @@ def add_exposure(rig: Rig, state: ThermalState, record: StitchRecord) -> Thermal
 
 
 def solve_drift(rig: Rig, state: ThermalState) -> LearnedDrift:
-    """Solve the normal equations; cones with less than `MIN_DC_SPREAD_K` of spread in dC are skipped.
+    """Solve the normal equations.
 
-    Standard deviations hold the scatter about the straight line where it exceeds what the
-    covariances of the stitching predict.
+    Cones with less than `MIN_DC_SPREAD_K` of spread in dC are skipped. Standard deviations hold
+    the scatter about the straight line where it exceeds what the covariances of the stitching
+    predict.
+
+    Args:
+        rig: the camera.
+        state: of all exposures.
+
+    Returns:
+        Corrections to offsets and rates, and why some cones have none.
+
+    Source: docs/explanation/mathematics/drift.md#learning.
     """
     sensors: list[LearnedSensor] = []
     scales: list[LearnedScale] = []
@@ -194,7 +221,16 @@ def solve_drift(rig: Rig, state: ThermalState) -> LearnedDrift:
 
 
 def observability(rig: Rig) -> tuple[Observability, ...]:
-    """What stitching can and cannot determine of the drift of this rig."""
+    """What stitching can and cannot determine of the drift of this rig.
+
+    Args:
+        rig: the camera.
+
+    Returns:
+        One entry per quantity: PAN cones, then scales of layers, then the common scale.
+
+    Source: docs/explanation/mathematics/drift.md#what-is-observable.
+    """
     result = []
     for cone in rig.pan_cones:
         m = len(cone.sensors)
@@ -243,7 +279,14 @@ def observability(rig: Rig) -> tuple[Observability, ...]:
 
 
 def state_json(state: ThermalState) -> dict[str, Any]:
-    """The state as JSON-ready data; reading it back gives the same numbers, bit by bit."""
+    """The state as JSON-ready data; reading it back gives the same numbers, bit by bit.
+
+    Args:
+        state: to be written.
+
+    Returns:
+        What `state_from_json` reads.
+    """
     return {
         "rig": state.rig,
         "calibration_id": state.calibration_id,
@@ -253,7 +296,18 @@ def state_json(state: ThermalState) -> dict[str, Any]:
 
 
 def state_from_json(content: Mapping[str, Any]) -> ThermalState:
-    """Read what `state_json` wrote; KeyError or ValueError where it is not one."""
+    """Read what `state_json` wrote.
+
+    Args:
+        content: parsed JSON.
+
+    Returns:
+        The state.
+
+    Raises:
+        KeyError: a key is missing.
+        ValueError: a number is none, or matrix and vector do not fit.
+    """
     return ThermalState(
         str(content["rig"]),
         str(content["calibration_id"]),

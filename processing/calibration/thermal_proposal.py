@@ -51,6 +51,15 @@ def proposed_rig(
     What stitching cannot see keeps its old value: the sums over the sensors of a cone do not
     change, nor does anything of the master cone's lens. Scales of layers at the calibration
     temperature are not turned into principal distances.
+
+    Args:
+        rig: the camera, with the calibration that was flown.
+        learned: corrections to it.
+        calibration_id: of the proposed calibration.
+        date: of the proposed calibration, YYYY-MM-DD.
+
+    Returns:
+        The proposed rig, and every changed value, old and new.
     """
     sensors = {s.sensor: s for s in learned.sensors}
     scales = {s.cone: s for s in learned.scales}

@@ -40,7 +40,25 @@ class DarkSignal:
     misfit: float
 
     def offset(self, exposure_time_s: float, temperature_c: float) -> Map:
-        """Offset of every pixel, DN."""
+        """Offset of every pixel.
+
+        Args:
+            exposure_time_s: of the frame.
+            temperature_c: of the sensor.
+
+        Returns:
+            Shape (height, width), DN.
+
+        Source: docs/explanation/mathematics/radiometry.md#offset-and-gain.
+
+        Example:
+            6 K above the reference a dark signal of 2 DN/s has doubled: 64 + 4 DN after a second.
+
+            >>> one = np.ones((1, 1), np.float32)
+            >>> signal = DarkSignal(64 * one, 2 * one, 6.0, 0.1, 20.0, 0.1, 0.1, 0.01, 1.0)
+            >>> signal.offset(1.0, 26.0)
+            array([[68.]], dtype=float32)
+        """
         warm = 2.0 ** ((temperature_c - self.reference_c) / self.doubling_k)
         time = np.float32(exposure_time_s * warm)
         return np.asarray(self.bias_dn + self.dark_dn_per_s * time, dtype=np.float32)
@@ -53,10 +71,16 @@ def fit_dark_signal(
 
     Args:
         sets: with two exposure times and two temperatures at least.
+        reference_c: temperature the dark signal is stated for.
         temperature_sigma_c: standard deviation of a probe reading, carried into the doubling.
+
+    Returns:
+        Maps of bias and dark signal, the doubling, and their standard deviations.
 
     Raises:
         ValueError: the sets cannot separate the parameters; the message names what is missing.
+
+    Source: docs/explanation/mathematics/radiometry.md#calibration-fits.
     """
     times = {round(s.condition.exposure_time_s, 9) for s in sets}
     temperatures = np.array([s.condition.temperature_c for s in sets])

@@ -55,20 +55,23 @@ class DefectMap:
 
 
 def find_defects(flat: Array, dark: Array, noise: Array) -> DefectMap:
-    """Find them.
+    """Find pixels, columns and clusters without usable values.
 
     Args:
-        flat: mean signal of even light above the offset, (height, width) DN.
-        dark: dark signal, (height, width), DN/s.
-        noise: temporal variance of the flat frames over what photon transfer predicts, (height,
-            width), about one. It holds few frames, so only what is far off counts.
+        flat: mean signal of even light above the offset, shape (height, width), DN.
+        dark: dark signal, shape (height, width), DN/s.
+        noise: temporal variance of the flat frames over what photon transfer predicts, shape
+            (height, width), about one. It holds few frames, so only what is far off counts.
+
+    Returns:
+        The map of defects, and what it holds.
     """
     relative = relative_response(flat)
     dark_excess = dark - np.float32(np.median(dark))
-    limit = max(PIXEL_SIGMAS * robust_sigma(relative), MIN_RESPONSE_LOSS)
+    limit = max(PIXEL_SIGMAS * _robust_sigma(relative), MIN_RESPONSE_LOSS)
     causes = {
         "response": np.abs(relative) > limit,
-        "dark signal": np.abs(dark_excess) > DARK_SIGMAS * robust_sigma(dark_excess),
+        "dark signal": np.abs(dark_excess) > DARK_SIGMAS * _robust_sigma(dark_excess),
         "noise": noise > NOISE_FACTOR**2,
     }
     found = np.logical_or.reduce(list(causes.values()))
@@ -91,15 +94,34 @@ def find_defects(flat: Array, dark: Array, noise: Array) -> DefectMap:
 
 
 def relative_response(flat: Array) -> Array:
-    """Response against the smooth field around it, less one; what is dark all over counts as -1."""
+    """Response against the smooth field around it, less one.
+
+    Args:
+        flat: mean signal of even light above the offset, shape (height, width), DN.
+
+    Returns:
+        Shape (height, width), float32; a pixel that is dark all over has -1.
+
+    Example:
+        >>> flat = np.full((64, 64), 1000.0)
+        >>> flat[10, 20] = 900.0
+        >>> round(float(relative_response(flat)[10, 20]), 3)
+        -0.1
+    """
     smooth = smooth_field(flat)
     return np.asarray(flat / smooth - 1.0, dtype=np.float32)
 
 
 def smooth_field(values: Array) -> Array:
-    """The smooth part of a map, (height, width) float32: a polynomial, then medians of blocks.
+    """The smooth part of a map: a polynomial, fitted to medians of blocks.
 
     Neither a cluster nor a column moves a median of a block by more than a fraction of the noise.
+
+    Args:
+        values: shape (height, width), both 2 at least.
+
+    Returns:
+        Shape (height, width), float32.
     """
     height, width = values.shape
     rows = np.array_split(np.arange(height), max(2, height // _BLOCK_PX))
@@ -111,7 +133,12 @@ def smooth_field(values: Array) -> Array:
     )
     across = np.polynomial.legendre.legvander(2.0 * x / (width - 1) - 1.0, _DEGREE)
     down = np.polynomial.legendre.legvander(2.0 * y / (height - 1) - 1.0, _DEGREE)
-    chosen = [(i, j) for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)]
+    # A few blocks do not determine a high power; it would swing between their middles.
+    chosen = [
+        (i, j)
+        for i in range(min(_DEGREE + 1, len(rows)))
+        for j in range(min(_DEGREE + 1 - i, len(columns)))
+    ]
     design = np.stack([np.outer(down[:, i], across[:, j]).ravel() for i, j in chosen], axis=1)
     weight = np.ones(medians.size)
     coefficients: Array = np.zeros(len(chosen))
@@ -132,7 +159,7 @@ def smooth_field(values: Array) -> Array:
     return np.asarray(every_y @ table @ every_x.T, dtype=np.float32)
 
 
-def robust_sigma(values: Array) -> float:
+def _robust_sigma(values: Array) -> float:
     """Standard deviation from the median absolute deviation."""
     middle = np.median(values)
     return float(1.4826 * np.median(np.abs(values - middle)))
@@ -147,10 +174,10 @@ def _columns(values: Array, cause: str, *, floor: bool) -> list[DefectColumn]:
     difference = values - np.median(np.stack(neighbours), axis=0)
     size = min(COLUMN_RUN_PX, max(values.shape[0] // 4, 4))
     # Single outliers are not a column: they are held at what a good pixel may have.
-    sigma = robust_sigma(difference)
+    sigma = _robust_sigma(difference)
     calm = np.clip(difference, -_QUIET_SIGMAS * sigma, _QUIET_SIGMAS * sigma)
     running = ndimage.uniform_filter1d(calm, size, axis=0, mode="reflect")
-    limit = COLUMN_SIGMAS * max(robust_sigma(running), sigma / np.sqrt(size))
+    limit = COLUMN_SIGMAS * max(_robust_sigma(running), sigma / np.sqrt(size))
     limit = max(limit, _MIN_COLUMN_LOSS if floor else 0.0)
     found = []
     for column in np.flatnonzero((np.abs(running) > limit).any(axis=0)):

@@ -40,14 +40,25 @@ def flat_residual(
     gain_dn_per_e: float,
     dark_dn2: float,
 ) -> FlatResidual:
-    """Correct a frame and compare.
+    """Correct a frame and compare its noise with the prediction.
 
     Nothing smooth is taken off: a corner that is corrected wrongly counts. Defects, partly exposed
     rows and saturated pixels do not.
 
     Args:
-        raw: (height, width) DN of even light.
-        gain_dn_per_e, dark_dn2: of photon transfer.
+        sensor: that took the frame.
+        calibration: of the sensor.
+        raw: even light, shape (height, width), DN.
+        exposure_time_s: of the frame.
+        temperature_c: of the sensor.
+        tdi_shifts: N of the frame.
+        gain_dn_per_e: system gain, from photon transfer.
+        dark_dn2: temporal variance without light, from photon transfer.
+
+    Returns:
+        Mean signal, residual, and the residual over the prediction.
+
+    Source: docs/explanation/mathematics/radiometry.md#noise-model.
     """
     out = np.empty_like(raw)
     level1_from_level0(

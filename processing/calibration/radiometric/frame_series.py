@@ -63,7 +63,7 @@ def _trimmed_mean(values: NDArray[Any]) -> float:
 
 @dataclass
 class FrameAccumulator:
-    """Sums the frames of a set; `finished` returns the set."""
+    """Sums the frames of a set; `result` returns the set."""
 
     condition: SeriesCondition
     black_dn: float
@@ -76,7 +76,12 @@ class FrameAccumulator:
     _clipped: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, bool))
 
     def add(self, raw: NDArray[np.uint16], *, temperature_c: float) -> None:
-        """Take one frame, (height, width) DN."""
+        """Take one frame.
+
+        Args:
+            raw: shape (height, width), DN.
+            temperature_c: of the sensor.
+        """
         values = raw.astype(np.float32) - np.float32(self.black_dn)
         level = float(values.mean(dtype=np.float64)) if self.condition.light == "flat" else 1.0
         if not self._levels:
@@ -93,7 +98,10 @@ class FrameAccumulator:
         self._temperatures.append(temperature_c)
 
     def result(self) -> FrameSet:
-        """The set.
+        """The set of the frames taken so far.
+
+        Returns:
+            Mean, temporal variance, temperatures and clipped pixels.
 
         Raises:
             ValueError: fewer than two frames; one has no temporal variance.
@@ -115,5 +123,13 @@ class FrameAccumulator:
 
 
 def select_light(sets: Sequence[FrameSet], light: str) -> list[FrameSet]:
-    """The sets taken in the dark (`dark`), or before the light (`flat`)."""
+    """The sets taken in one kind of light.
+
+    Args:
+        sets: to choose from.
+        light: `dark` or `flat` (before the light).
+
+    Returns:
+        The sets in their order.
+    """
     return [s for s in sets if s.condition.light == light]

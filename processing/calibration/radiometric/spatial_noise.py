@@ -41,7 +41,7 @@ def _low_pass() -> NDArray[np.float64]:
     return np.convolve(kernel, _BINOMIAL)
 
 
-def high_passed(values: Array, good: Array) -> Array:
+def _high_passed(values: Array, good: Array) -> Array:
     """A map (height, width) less its smooth part, zero where `good` is not; float32."""
     kernel = _low_pass()
     mask = good.astype(np.float32)
@@ -57,12 +57,17 @@ def spatial_noise(values: Array, good: Array, *, temporal_variance: float) -> Sp
     """Spread of a map over its good pixels.
 
     Args:
-        values: (height, width), a mean of several frames.
-        good: (height, width) bool.
+        values: a mean of several frames, shape (height, width).
+        good: pixels that count, shape (height, width), bool.
         temporal_variance: what is left of temporal noise in `values`, its unit squared.
+
+    Returns:
+        Standard deviations in the unit of `values`.
+
+    Source: EMVA Standard 1288, release 4.0, section 8.
     """
     height, width = values.shape
-    flat = high_passed(values, good)
+    flat = _high_passed(values, good)
     kernel = _low_pass()
     middle = float(kernel[len(kernel) // 2])
     power = float(np.sum(kernel**2))

@@ -24,11 +24,11 @@ _BLOCK_PX: Final = 16
 
 @dataclass(frozen=True)
 class ApertureModel:
-    """`coefficients` (4,) of (r / reach_mm)^2, ^4, ^6, ^8; `cofactor` (4, 4) their covariance.
+    """`coefficients` (4,) of (r / reach_mm)^2, ^4, ^6, ^8; `covariance` (4, 4) theirs.
 
-    `light` is what each measured aperture passes against 1/N^2, the base aperture being one: how
-    well the diaphragm's scale holds. `misfit_percent` by aperture is the root mean square of what
-    the model leaves of block means.
+    `illumination` is what each measured aperture passes against 1/N^2, the base aperture being
+    one: how well the diaphragm's scale holds. `misfit_percent` by aperture is the root mean square
+    of what the model leaves of block means.
     """
 
     base_f_number: float
@@ -39,7 +39,24 @@ class ApertureModel:
     misfit_percent: dict[float, float]
 
     def ratio(self, r2_mm2: Array, f_number: float) -> Map:
-        """Field of light at an aperture over that at the base aperture, one on the axis."""
+        """Field of light at an aperture over that at the base aperture, one on the axis.
+
+        Args:
+            r2_mm2: squared distance from the axis, any shape, mm squared.
+            f_number: of the aperture.
+
+        Returns:
+            The shape of `r2_mm2`.
+
+        Source: docs/explanation/mathematics/radiometry.md#calibration-fits.
+
+        Example:
+            f/8 against f/4: (4/8)^2 - 1 = -0.75 of a fall of 20 % at the corner.
+
+            >>> model = ApertureModel(4.0, 30.0, np.array([-0.2, 0, 0, 0]), np.eye(4), {}, {})
+            >>> model.ratio(np.array([0.0, 900.0]), 8.0)
+            array([1.  , 1.15], dtype=float32)
+        """
         rho2 = r2_mm2 / self.reach_mm**2
         shape = sum(c * rho2**p for c, p in zip(self.coefficients, _POWERS, strict=True))
         return np.asarray(
@@ -54,13 +71,18 @@ def fit_aperture(
     r2_mm2: Array,
     good: Array,
 ) -> ApertureModel:
-    """Fit the model.
+    """Fit the model of vignetting by aperture.
 
     Args:
-        base: f-number and mean signal per monitored light and second, (height, width).
+        base: f-number and mean signal per monitored light and second, shape (height, width).
         others: the same at other apertures; none: the field is taken as it is at all apertures.
-        r2_mm2: squared distance of every pixel from the axis.
-        good: (height, width) bool.
+        r2_mm2: squared distance of every pixel from the axis, shape (height, width).
+        good: pixels that count, shape (height, width), bool.
+
+    Returns:
+        Coefficients with their covariance, and how well each aperture fits.
+
+    Source: docs/explanation/mathematics/radiometry.md#calibration-fits.
     """
     reach2 = float(r2_mm2.max())
     rho2 = _blocks(r2_mm2 / reach2, good)
