@@ -19,6 +19,7 @@ COMPLETE: tuple[str, ...] = (
     "drivers/transport",
     "drivers/triggers",
     "processing/bundle",
+    "processing/calibration",
     "processing/errors.py",
     "processing/geometry",
     "processing/image",

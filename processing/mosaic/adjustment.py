@@ -63,6 +63,15 @@ def normal_equations(blocks: Sequence[ObservationBlock], unknowns: int) -> tuple
 
     Returns:
         Normal matrix (u, u) and right-hand side (u,).
+
+    Example:
+        One unknown, observed as 2 and 4 with weights 3 and 1: N = 4, right-hand side 10.
+
+        >>> block = ObservationBlock(
+        ...     np.array([0]), np.ones((1, 2)), np.array([2.0, 4.0]), np.array([3.0, 1.0])
+        ... )
+        >>> normal_equations([block], 1)
+        (array([[4.]]), array([10.]))
     """
     normal = np.zeros((unknowns, unknowns))
     right = np.zeros(unknowns)
@@ -107,6 +116,20 @@ def solve(
 
     Source: docs/explanation/mathematics/mosaicking.md#datum-by-inner-constraints and
         #undetermined-directions.
+
+    Example:
+        Two unknowns whose difference was observed as 2; the datum is that their sum is zero.
+
+        >>> block = ObservationBlock(
+        ...     np.array([0, 1]), np.array([[1.0], [-1.0]]), np.array([2.0]), np.array([1.0])
+        ... )
+        >>> normal, right = normal_equations([block], 2)
+        >>> found = solve(
+        ...     normal, right, np.ones((1, 2)), np.zeros(1), fixed_at=np.zeros(2),
+        ...     min_information=1e-6
+        ... )
+        >>> found.dp.round(6), found.rank, found.constrained_rank
+        (array([ 1., -1.]), 1, 2)
     """
     unknowns, conditions = len(right), len(constraints)
     rows = constraints / np.linalg.norm(constraints, axis=1, keepdims=True)
@@ -148,6 +171,13 @@ def redundancy_numbers(block: ObservationBlock, cofactor: Array) -> Array:
 
     Returns:
         (m,), 0 to 1.
+
+    Example:
+        A mean of four observations: each keeps 3/4 of its own error.
+
+        >>> block = ObservationBlock(np.array([0]), np.ones((1, 4)), np.zeros(4), np.ones(4))
+        >>> redundancy_numbers(block, np.array([[0.25]]))
+        array([0.75, 0.75, 0.75, 0.75])
     """
     q = cofactor[np.ix_(block.columns, block.columns)]
     numbers = np.empty(len(block.weight))

@@ -177,6 +177,15 @@ def variance_factor(series: ContrastSeries) -> float:
         At least 1; 1 for less than four exposures.
 
     Source: docs/explanation/mathematics/validity.md#over-a-flight.
+
+    Example:
+        Differences of one contrast are 1, covariances 1 each: q = 1 / 2, the median of chi-square
+        with one degree of freedom is 0.455.
+
+        >>> y = np.array([[0.0], [1.0], [0.0], [1.0]])
+        >>> series = ContrastSeries((1, 2, 3, 4), y, np.ones((4, 1, 1)), np.zeros(4))
+        >>> round(variance_factor(series), 3), round(float(chi2.ppf(0.5, 1)), 3)
+        (1.099, 0.455)
     """
     size = series.y.shape[1]
     if len(series.numbers) < 4:

@@ -280,6 +280,13 @@ def similarity_directions(
     Returns:
         Columns of shift x, shift y, scale and rotation, (n, 4), px and for scales ppm, by px and by
         px per mm.
+
+    Example:
+        A sensor 10 mm to the right: shift x, shift y, scale moves it right, rotation moves it up.
+
+        >>> similarity_directions([(10.0, 0.0)], 0.0072) + 0.0
+        array([[ 1.,  0., 10.,  0.],
+               [ 0.,  1.,  0., 10.]])
     """
     rows = []
     for x_mm, y_mm in places_mm:
@@ -301,6 +308,12 @@ def orthogonal_complement(directions: Array) -> Array:
 
     Returns:
         Basis as rows, (n - d, n).
+
+    Example:
+        What a common shift of two sensors cannot produce is their difference.
+
+        >>> np.abs(orthogonal_complement(np.array([[1.0], [1.0]]))).round(4)
+        array([[0.7071, 0.7071]])
     """
     full, _, _ = np.linalg.svd(directions, full_matrices=True)
     return np.asarray(full[:, directions.shape[1] :].T)

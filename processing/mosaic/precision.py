@@ -339,6 +339,11 @@ def datum_design(xy_mm: Array) -> Array:
 
     Returns:
         (2 n, 4), rows x and y of each point in turn, columns shift x, shift y, scale, rotation.
+
+    Example:
+        >>> datum_design(np.array([[10.0, 5.0]]))
+        array([[ 1.,  0., 10., -5.],
+               [ 0.,  1.,  5., 10.]])
     """
     design = np.zeros((2 * len(xy_mm), 4))
     design[0::2, 0], design[1::2, 1] = 1.0, 1.0
