@@ -37,7 +37,14 @@ class HeadDevice(DeviceDriver):
         self._last_slot = -1
 
     def recycle(self, slot: int) -> None:
-        """Hand a slot back; from any thread. ValueError for a slot that was not handed out."""
+        """Return a slot of a frame that is no longer needed; from any thread.
+
+        Args:
+            slot: `Frame.slot` of that frame.
+
+        Raises:
+            ValueError: the slot was not handed out, or is returned twice.
+        """
         with self._slots:
             if slot not in self._slots_in_use:
                 raise ValueError(f"{self.name}: slot {slot} was not handed out; recycle it once")
@@ -45,11 +52,24 @@ class HeadDevice(DeviceDriver):
             self._slot_returned(slot)
 
     def statistics(self) -> Mapping[str, int]:
-        """Counters since creation, by stable name; see the driver's page."""
+        """Counters since creation; see the driver's page.
+
+        Returns:
+            Counts by stable name, sorted.
+        """
         return dict(sorted(self.counters.items()))
 
     def adjust(self, exposure_time_us: float, gain_db: float, tdi_shifts: int) -> None:
-        """See `drivers.contract.Head`; a driver that can overrides this."""
+        """Refused; a driver that can change settings while it runs overrides this.
+
+        Args:
+            exposure_time_us: exposure time, us.
+            gain_db: gain, dB.
+            tdi_shifts: number of TDI shifts.
+
+        Raises:
+            DeviceError: always.
+        """
         raise DeviceError(
             f"{self.name}: settings of this head cannot be changed while it runs; change them in "
             "the configuration and start again"

@@ -110,15 +110,29 @@ _GROUPS: Final = {
 
 
 def pixels_in_a_group(packing: Packing) -> int:
-    """A row has to have a multiple of so many pixels."""
+    """Pixels that a packing stores together; the width of a frame is a multiple of it.
+
+    Args:
+        packing: the packing.
+
+    Returns:
+        1, 2 or 4.
+    """
     return _GROUPS[packing].pixels if packing in _GROUPS else 1
 
 
 def packed_nbytes(packing: Packing, pixel_count: int) -> int:
-    """Bytes that so many pixels take.
+    """Bytes of packed pixels.
+
+    Args:
+        packing: the packing.
+        pixel_count: number of pixels.
+
+    Returns:
+        Number of bytes.
 
     Raises:
-        ValueError: they do not fill their last group.
+        ValueError: the pixels do not fill their last group.
     """
     if packing in _GROUPS:
         group = _GROUPS[packing]
@@ -179,7 +193,15 @@ def _unpack_groups(group: _Group, source: NDArray[np.uint8], target: NDArray[np.
 
 
 def bytes_at(address: int, count: int) -> NDArray[np.uint8]:
-    """So many bytes at an address."""
+    """Bytes of memory as an array, without a copy.
+
+    Args:
+        address: of the first byte, in this process.
+        count: number of bytes.
+
+    Returns:
+        Shape (count,); valid as long as the memory is.
+    """
     import numpy as np
 
     memory: Any = (ctypes.c_uint8 * count).from_address(address)
@@ -187,7 +209,15 @@ def bytes_at(address: int, count: int) -> NDArray[np.uint8]:
 
 
 def words_at(address: int, count: int) -> NDArray[np.uint16]:
-    """So many 16-bit words at an address, such as a slot of `FrameMemory`, to be written to."""
+    """16-bit words of memory as an array to write to, without a copy.
+
+    Args:
+        address: of the first word, such as that of a slot of `FrameMemory`.
+        count: number of words.
+
+    Returns:
+        Shape (count,); valid as long as the memory is.
+    """
     import numpy as np
 
     memory: Any = (ctypes.c_uint16 * count).from_address(address)

@@ -8,7 +8,8 @@ import pytest
 
 from drivers.cameras.v4l2 import uapi
 from drivers.cameras.v4l2.camera import V4l2Camera
-from drivers.cameras.v4l2.node import Control, VideoNode
+from drivers.cameras.v4l2.control import Control
+from drivers.cameras.v4l2.node import VideoNode
 from drivers.cameras.v4l2.settings import V4l2Settings
 from drivers.contract import DeviceError
 

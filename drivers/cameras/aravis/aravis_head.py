@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import ClassVar, Final
 
 from drivers.cameras.aravis.camera import AravisCamera, ClockLatch, ControlDeniedError
+from drivers.cameras.aravis.frame_record import frame_record, frame_status
 from drivers.cameras.aravis.gvcp import (
     ACTION_LATE,
     DEFAULT_HEARTBEAT_S,
@@ -29,7 +30,6 @@ from drivers.cameras.aravis.stream import FrameStream, ReceivedFrame
 from drivers.cameras.head_device import HeadDevice
 from drivers.contract import (
     DeviceError,
-    Frame,
     FrameMemory,
     FrameStatus,
     LifeCycle,
@@ -47,8 +47,6 @@ CONTROL_WAIT_MARGIN_S: Final = 0.1
 TRIGGER_TIMEOUT_S: Final = 1.0
 CLOCK_DRIFT: Final = 100e-6
 """Maximum drift of a head's clock against the host's between two latches, relative."""
-NOT_FRAMES: Final = ("aborted", "cleared", "filling", "unknown")
-"""Status of buffers that are returned empty when a stream ends."""
 
 
 class AravisHeadLostError(DriverError):
@@ -98,10 +96,18 @@ class AravisHead(AravisSettings, HeadDevice):
         self._of_stream: Counter[str] = Counter()
 
     def bind(self, sink: Sink | None = None) -> Mapping[str, str]:
-        """Open the head, write its settings, return its identity. See `drivers.contract.Device`.
+        """Open the head and write its settings. See `drivers.contract.Head`.
 
-        If another controller has control, the call waits for the head's heartbeat time-out and
-        `sink` receives an event.
+        If another controller has control, the call waits for the head's heartbeat time-out.
+
+        Args:
+            sink: receives an event while another controller has control.
+
+        Returns:
+            Identity, size of a frame, packet size, chunks, sigma of the clock and temperature.
+
+        Raises:
+            DeviceError: it does not answer, refuses a setting, or stays under another's control.
         """
         self.emitter.sink = sink
         try:
@@ -122,7 +128,11 @@ class AravisHead(AravisSettings, HeadDevice):
         }
 
     def trigger(self) -> None:
-        """Software trigger or action command; from any thread. See `drivers.contract.Head`."""
+        """Software trigger or action command; from any thread. See `drivers.contract.Head`.
+
+        Raises:
+            DeviceError: the head waits for its line, is not running, is busy, or refuses.
+        """
         if self.trigger_source == "line":
             raise DeviceError(
                 f"{self.name}: the head waits for its line {self.trigger_line}; set "
@@ -147,7 +157,16 @@ class AravisHead(AravisSettings, HeadDevice):
             self._control.release()
 
     def adjust(self, exposure_time_us: float, gain_db: float, tdi_shifts: int) -> None:
-        """Use these exposure settings from now on, also after the head is reopened."""
+        """Use these exposure settings from now on, also after the head is reopened.
+
+        Args:
+            exposure_time_us: exposure time, us.
+            gain_db: gain, dB.
+            tdi_shifts: number of TDI shifts; 0 without TDI.
+
+        Raises:
+            DeviceError: the head is not running, is busy, or refuses a value.
+        """
         wanted = {
             "exposure_time_us": exposure_time_us,
             "gain_db": gain_db,
@@ -165,7 +184,11 @@ class AravisHead(AravisSettings, HeadDevice):
             self._control.release()
 
     def statistics(self) -> Mapping[str, int]:
-        """Frames by status and reason, underruns, packets missing and resent, openings."""
+        """Counters since creation.
+
+        Returns:
+            Frames by status and reason, underruns, packets missing and resent, openings; by name.
+        """
         found = self.counters + self._of_stream
         names = self.counters.keys() | self._of_stream.keys()
         return {name: found[name] for name in sorted(names)}
@@ -202,7 +225,15 @@ class AravisHead(AravisSettings, HeadDevice):
         self.counters["actions"] += 1
 
     def clock_at(self, mono_ns: int) -> tuple[int, int] | None:
-        """The head's clock at a host time near now, and its sigma; None while it is unknown."""
+        """The head's clock at a host time near now.
+
+        Args:
+            mono_ns: CLOCK_MONOTONIC, ns.
+
+        Returns:
+            Time on the head's clock, ns, and its sigma, ns, with CLOCK_DRIFT since the last latch;
+            None while it is unknown.
+        """
         session = self._session
         latch = None if session is None else session.latch
         if latch is None:
@@ -350,7 +381,7 @@ class AravisHead(AravisSettings, HeadDevice):
 
     def _deliver_frame(self, session: _Session, received: ReceivedFrame, sink: Sink) -> None:
         now_ns = self.clock.mono_ns()
-        status = _status(session.camera, received)
+        status = frame_status(session.camera.geometry, received)
         reason = received.reason.replace("-", "_")
         if status is None:
             self.counters[f"buffers_{reason}"] += 1
@@ -364,41 +395,16 @@ class AravisHead(AravisSettings, HeadDevice):
         if status is not FrameStatus.CORRUPT:
             session.stream.unpack(received.slot)
         self._mark_in_use(received.slot)
-        sink(self._frame(session, received, status, now_ns))
-
-    def _frame(
-        self, session: _Session, received: ReceivedFrame, status: FrameStatus, now_ns: int
-    ) -> Frame:
-        camera, latch = session.camera, session.latch
-        geometry = camera.geometry
-        if received.chunk_timestamp is not None:
-            device_ns: int | None = camera.ns_from_ticks(received.chunk_timestamp)
-        else:
-            device_ns = received.leader_ns or None
-        exposure_us = received.chunk_exposure_us
-        return Frame(
-            head=self.name,
-            slot=received.slot,
-            status=status,
-            frame_id=received.frame_id
-            if received.chunk_frame_id is None
-            else received.chunk_frame_id,
-            counter=received.chunk_counter,
-            width_px=geometry.width_px if received.width_px is None else received.width_px,
-            height_px=geometry.height_px if received.height_px is None else received.height_px,
-            pixel_format=geometry.pixel_format
-            if received.pixel_format_code in (None, geometry.pixel_format_code)
-            else f"0x{received.pixel_format_code:08x}",
-            device_ns=device_ns,
-            device_clock_ns=None if latch is None else latch.device_clock_ns,
-            device_clock_mono_ns=None if latch is None else latch.mono_ns,
-            latch_sigma_ns=None if latch is None else latch.sigma_ns,
-            mono_ns=now_ns,
-            exposure_time_us=camera.exposure_time_us if exposure_us is None else exposure_us,
-            temperature_c=session.temperature_c
-            if received.chunk_temperature_c is None
-            else received.chunk_temperature_c,
-            settings=_exposure_settings(camera.settings_of(exposure_us), received),
+        sink(
+            frame_record(
+                self.name,
+                session.camera,
+                received,
+                status,
+                latch=session.latch,
+                temperature_c=session.temperature_c,
+                mono_ns=now_ns,
+            )
         )
 
     def _check(self, session: _Session) -> bool:
@@ -480,28 +486,3 @@ class AravisHead(AravisSettings, HeadDevice):
             session.stream.close()
             session.camera.release()
             gc.collect()
-
-
-def _exposure_settings(
-    settings: Mapping[str, float | int | str], received: ReceivedFrame
-) -> Mapping[str, float | int | str]:
-    """The head's settings, updated with the chunk data of this frame."""
-    reported_settings = {"ExposureTime": received.chunk_exposure_us, "Gain": received.chunk_gain}
-    return {
-        **settings,
-        **{key: value for key, value in reported_settings.items() if value is not None},
-    }
-
-
-def _status(camera: AravisCamera, received: ReceivedFrame) -> FrameStatus | None:
-    """The status of a returned buffer; None if it contains no frame at all."""
-    if received.reason in NOT_FRAMES:
-        return None
-    if received.reason == "size-mismatch":
-        return FrameStatus.CORRUPT
-    if received.reason != "success":
-        return FrameStatus.INCOMPLETE
-    geometry = camera.geometry
-    found = (received.width_px, received.height_px, received.pixel_format_code)
-    configured = (geometry.width_px, geometry.height_px, geometry.pixel_format_code)
-    return FrameStatus.COMPLETE if found == configured else FrameStatus.CORRUPT

@@ -150,6 +150,7 @@ class AravisCamera:
         return self._configuration.written
 
     def start(self) -> None:
+        """Start acquisition; raises the error of Aravis."""
         self._configuration.lock(True)
         self._camera.start_acquisition()
 
@@ -185,11 +186,20 @@ class AravisCamera:
             self._camera.get_device().execute_command("ArvGevSCPSFireTestPacket")
 
     def other_senders(self) -> int:
-        """Number of dropped datagrams of other senders at the control socket."""
+        """Dropped datagrams of other senders at the control socket.
+
+        Returns:
+            Their number since the head was opened.
+        """
         return 0 if self._control is None else self._control.dropped_datagrams()
 
     def adjust(self, exposure_time_us: float, gain_db: float, tdi_shifts: int) -> None:
         """Write exposure settings while the head runs; features that it does not have are skipped.
+
+        Args:
+            exposure_time_us: exposure time, us.
+            gain_db: gain, dB.
+            tdi_shifts: number of TDI shifts.
 
         Raises:
             DeviceError: it refuses one.
@@ -206,7 +216,15 @@ class AravisCamera:
             ) from None
 
     def settings_of(self, exposure_us: float | None) -> Mapping[str, float | int | str]:
-        """The settings of a frame, by its exposure time; they may be from before `adjust`."""
+        """The settings of a frame, which may be from before `adjust`.
+
+        Args:
+            exposure_us: exposure time of the frame, us; None if it is unknown.
+
+        Returns:
+            The latest settings whose exposure time is within EXPOSURE_TIME_TOLERANCE of it; the
+            present ones if there are none.
+        """
         for settings in (self.frame_settings, *reversed(self._earlier)):
             time_us = float(settings["ExposureTime"])
             if (
@@ -221,7 +239,11 @@ class AravisCamera:
         self._camera.software_trigger()
 
     def latch(self) -> ClockLatch | None:
-        """Read the head's clock; the best of three attempts. None if the head has no latch."""
+        """Read the head's clock; raises the error of Aravis.
+
+        Returns:
+            The attempt with the shortest round trip; None if the head has no latch.
+        """
         if self._latch_features is None:
             return None
         command, value, is_ns = self._latch_features
@@ -238,7 +260,11 @@ class AravisCamera:
         return best
 
     def temperature_c(self) -> float | None:
-        """The head's temperature in degrees Celsius; None if the head has none."""
+        """Read the head's thermometer.
+
+        Returns:
+            Temperature, degC; None if the head has none.
+        """
         name = self._temperature_feature
         return None if name is None else self._features.number(name)
 
@@ -252,7 +278,14 @@ class AravisCamera:
             device.get_float_feature_value(name)
 
     def ns_from_ticks(self, ticks: int) -> int:
-        """Device clock in ns; exact also for a tick frequency that is no power of ten."""
+        """A device clock in ns; exact also for a tick frequency that is no power of ten.
+
+        Args:
+            ticks: count of the clock.
+
+        Returns:
+            Nanoseconds, rounded down.
+        """
         return ticks * NS_PER_S // self._tick_hz
 
     # Reading and writing features

@@ -10,7 +10,18 @@ from drivers.contract import DeviceError
 
 
 def local_interface(head_name: str, address: str) -> str:
-    """The address of the local interface towards a head. DeviceError: there is none."""
+    """The local interface towards a head.
+
+    Args:
+        head_name: name of the head, for the message.
+        address: IPv4 address of the head.
+
+    Returns:
+        IPv4 address of the interface.
+
+    Raises:
+        DeviceError: no interface reaches the head.
+    """
     try:
         return interface_towards(address)
     except OSError as error:
@@ -21,7 +32,15 @@ def local_interface(head_name: str, address: str) -> str:
 
 
 def open_camera(head_name: str, interface: str, address: str) -> Any:
-    """The Aravis camera at an IP address; without an interface, by its name.
+    """Open a camera of Aravis.
+
+    Args:
+        head_name: name of the head, for the message.
+        interface: IPv4 address of the local interface; empty to open by name.
+        address: IPv4 address of the head, or its name.
+
+    Returns:
+        The camera of Aravis.
 
     Raises:
         DeviceError: it does not answer.

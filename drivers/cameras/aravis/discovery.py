@@ -24,7 +24,10 @@ class FoundHead:
 
 
 def heads() -> list[FoundHead]:
-    """Every head that answers Aravis' discovery; takes about a second.
+    """Discover heads; takes about a second.
+
+    Returns:
+        Every head that answers Aravis' discovery, sorted by address.
 
     Raises:
         DeviceError: Aravis is not installed.

@@ -37,6 +37,9 @@ class Features:
     def kind(self, name: str) -> str | None:
         """The type of a feature's value.
 
+        Args:
+            name: GenICam name.
+
         Returns:
             `boolean`, `integer`, `float`, `enumeration`, `string` or `command`; None if the head's
             description has no feature of this name, or only a category.
@@ -58,7 +61,14 @@ class Features:
         return None
 
     def is_available(self, name: str) -> bool:
-        """Whether the head has the feature and offers it in its present state."""
+        """Whether the head has the feature and offers it in its present state.
+
+        Args:
+            name: GenICam name.
+
+        Returns:
+            False also if the head does not answer.
+        """
         if self.kind(name) is None:
             return False
         try:
@@ -67,7 +77,14 @@ class Features:
             return False
 
     def is_locked(self, name: str) -> bool:
-        """Whether another setting of the head locks the feature."""
+        """Whether another setting of the head locks the feature.
+
+        Args:
+            name: GenICam name.
+
+        Returns:
+            False also if the head does not answer.
+        """
         node = self._device.get_feature(name)
         try:
             return bool(node is not None and node.is_locked())
@@ -75,7 +92,14 @@ class Features:
             return False
 
     def is_writable(self, name: str) -> bool:
-        """Whether the feature is available, not locked and not read-only."""
+        """Whether the feature is available, not locked and not read-only.
+
+        Args:
+            name: GenICam name.
+
+        Returns:
+            False also if the head does not answer.
+        """
         if not self.is_available(name) or self.is_locked(name):
             return False
         try:
@@ -85,7 +109,14 @@ class Features:
         return bool(mode != self._library.GcAccessMode.RO)
 
     def entries(self, name: str) -> list[str]:
-        """The entries that an enumeration offers in the head's present state."""
+        """The entries that an enumeration offers in the head's present state.
+
+        Args:
+            name: GenICam name.
+
+        Returns:
+            Names of the entries; empty if the feature is no enumeration or is not available.
+        """
         if self.kind(name) != "enumeration":
             return []
         try:
@@ -95,7 +126,14 @@ class Features:
         return [str(entry) for entry in found or ()]
 
     def bounds(self, name: str) -> tuple[float, float]:
-        """Lowest and highest value of a number; infinite where the head states none."""
+        """Lowest and highest value of a number.
+
+        Args:
+            name: GenICam name.
+
+        Returns:
+            Both bounds, inclusive, in the feature's unit; infinite if the head states none.
+        """
         try:
             if self.kind(name) == "integer":
                 low, high = self._device.get_integer_feature_bounds(name)
@@ -108,7 +146,14 @@ class Features:
         return float(low), float(high)
 
     def increment(self, name: str) -> int:
-        """Step of an integer; 1 where the head states none."""
+        """Step of an integer.
+
+        Args:
+            name: GenICam name.
+
+        Returns:
+            The step; 1 if the head states none.
+        """
         try:
             return max(1, int(self._device.get_integer_feature_increment(name)))
         except self._failed:
@@ -116,6 +161,12 @@ class Features:
 
     def get(self, name: str) -> FeatureValue:
         """The value of a feature.
+
+        Args:
+            name: GenICam name.
+
+        Returns:
+            Its value in the type of the feature.
 
         Raises:
             FeatureError: the head has no such feature, or does not return it.
@@ -143,7 +194,14 @@ class Features:
         raise FeatureError(f"the head has no feature {name}")
 
     def number(self, name: str) -> float | None:
-        """The value of a number; None if the head does not offer it or it is not finite."""
+        """The value of a number.
+
+        Args:
+            name: GenICam name.
+
+        Returns:
+            The value; None if the head does not offer it or it is not finite.
+        """
         if not self.is_available(name):
             return None
         try:
@@ -155,7 +213,14 @@ class Features:
         return float(value)
 
     def text(self, name: str) -> str:
-        """The value of an enumeration or text; empty if the head does not offer it."""
+        """The value of an enumeration or text.
+
+        Args:
+            name: GenICam name.
+
+        Returns:
+            The value; empty if the head does not offer it.
+        """
         if not self.is_available(name):
             return ""
         try:
@@ -167,6 +232,10 @@ class Features:
         """Write a feature and read it back.
 
         A feature that already has the value is not written.
+
+        Args:
+            name: GenICam name.
+            value: in the type of the feature; any value executes a command.
 
         Returns:
             The value the head holds afterwards; a number may be rounded to the head's step.
@@ -199,7 +268,15 @@ class Features:
         return found
 
     def write_only(self, name: str, value: int) -> None:
-        """Write an integer that the head does not return. FeatureError: it refuses it."""
+        """Write an integer that the head does not return.
+
+        Args:
+            name: GenICam name.
+            value: the integer.
+
+        Raises:
+            FeatureError: the head has no such feature or refuses the value.
+        """
         if self.kind(name) != "integer":
             raise FeatureError(f"the head has no feature {name}")
         try:
@@ -208,7 +285,14 @@ class Features:
             raise FeatureError(f"{name} = {value} is refused: {message_of(error)}") from None
 
     def execute(self, name: str) -> None:
-        """Execute a command. FeatureError: the head has none, or refuses it."""
+        """Execute a command.
+
+        Args:
+            name: GenICam name.
+
+        Raises:
+            FeatureError: the head has no such command or refuses it.
+        """
         if self.kind(name) != "command":
             raise FeatureError(f"the head has no command {name}")
         try:
@@ -217,11 +301,26 @@ class Features:
             raise FeatureError(f"{name} is refused: {message_of(error)}") from None
 
     def first_available(self, names: Sequence[str]) -> str | None:
-        """The first of these features that the head offers."""
+        """The first feature that the head offers.
+
+        Args:
+            names: GenICam names, in the order of preference.
+
+        Returns:
+            One of them; None if the head offers none.
+        """
         return next((name for name in names if self.is_available(name)), None)
 
     def first_entry(self, name: str, wanted: Sequence[str]) -> str | None:
-        """The first of these entries that an enumeration offers."""
+        """The first entry that an enumeration offers.
+
+        Args:
+            name: GenICam name.
+            wanted: entries, in the order of preference.
+
+        Returns:
+            One of them; None if the enumeration offers none.
+        """
         offered = self.entries(name)
         return next((entry for entry in wanted if entry in offered), None)
 

@@ -26,7 +26,15 @@ _PACKINGS: Final = {
 
 
 def packing_of(pixel_format: str) -> Packing | None:
-    """The packing of a pixel format; None for an unsupported format.
+    """The packing of a pixel format.
+
+    Args:
+        pixel_format: GenICam name.
+
+    Returns:
+        The packing; None for an unsupported format.
+
+    Source: PFNC 2.4, section 5; GigE Vision 2.0, table 26-1.
 
     Example:
         >>> packing_of("BayerRG12p")
@@ -38,6 +46,12 @@ def packing_of(pixel_format: str) -> Packing | None:
 
 def widest_format(offered: Iterable[str]) -> str | None:
     """The format with the most bits per pixel; unpacked words before packed ones.
+
+    Args:
+        offered: GenICam names.
+
+    Returns:
+        One of them; None if none is supported.
 
     Example:
         >>> widest_format(["Mono8", "Mono12Packed", "Mono12", "RGB8"])
@@ -53,7 +67,15 @@ def widest_format(offered: Iterable[str]) -> str | None:
 
 
 def packing_problem(packing: Packing, width_px: int) -> str | None:
-    """The reason why a packing does not fit a width; None if it fits."""
+    """The reason why a packing does not fit a width.
+
+    Args:
+        packing: the packing.
+        width_px: columns of a frame.
+
+    Returns:
+        A sentence; None if it fits.
+    """
     group = pixels_in_a_group(packing)
     if width_px % group == 0:
         return None

@@ -40,7 +40,14 @@ PRIVILEGED: Final = 0b11
 
 
 def is_ip_address(address: str) -> bool:
-    """Whether a head is configured by its IPv4 address; USB3 Vision heads are not."""
+    """Whether a head is configured by its IPv4 address; USB3 Vision heads are not.
+
+    Args:
+        address: the setting `address`.
+
+    Returns:
+        True for four decimal numbers.
+    """
     try:
         ipaddress.IPv4Address(address)
     except ValueError:
@@ -49,10 +56,20 @@ def is_ip_address(address: str) -> bool:
 
 
 def control_privilege(address: str, *, timeout_s: float) -> int | None:
-    """The head's control channel privilege: 0 is free; None if it does not answer in time.
+    """The head's control channel privilege.
 
     Faults of the head or network never raise. Some heads take any read of this register for a
     heartbeat of their controller. So it must not be polled while waiting for another controller.
+
+    Args:
+        address: IPv4 address of the head.
+        timeout_s: longest wait for the answer, s.
+
+    Returns:
+        0 if nobody has control, else the bits of exclusive and control access; None if the head
+        does not answer in time.
+
+    Source: GigE Vision 2.0, sections 14.3.1 and 28.1.
     """
     answer = _read_register(address, CONTROL_CHANNEL_PRIVILEGE, timeout_s)
     if answer is None:
@@ -64,7 +81,15 @@ def control_privilege(address: str, *, timeout_s: float) -> int | None:
 
 
 def heartbeat_timeout_s(address: str, *, timeout_s: float) -> float:
-    """The head's heartbeat time-out; the standard's 3 s if it does not report one."""
+    """The head's heartbeat time-out.
+
+    Args:
+        address: IPv4 address of the head.
+        timeout_s: longest wait for the answer, s.
+
+    Returns:
+        Time-out limited to 0.5 to 30 s; the standard's 3 s if the head does not report one.
+    """
     answer = _read_register(address, HEARTBEAT_TIMEOUT, timeout_s)
     if answer is None or answer[0] != 0:
         return DEFAULT_HEARTBEAT_S
@@ -83,10 +108,20 @@ class ActionKeys:
 def send_action(
     address: str, keys: ActionKeys, *, device_ns: int | None, timeout_s: float
 ) -> int | None:
-    """Send an action command; returns the head's status, None if it did not answer in time.
+    """Send an action command.
 
-    `device_ns` is the time of exposure on the head's clock; None is immediate. The command is never
-    repeated, since a second one might cause a second exposure.
+    The command is never repeated, since a second one might cause a second exposure.
+
+    Args:
+        address: IPv4 address of the head.
+        keys: its addressees.
+        device_ns: time of exposure on the head's clock, ns; None for an immediate command.
+        timeout_s: longest wait for the answer, s.
+
+    Returns:
+        The head's status; None if it did not answer in time.
+
+    Source: GigE Vision 2.0, section 14.5.
     """
     body = struct.pack(">III", keys.device_key, keys.group_key, keys.group_mask)
     flags = ACK_REQUIRED

@@ -96,14 +96,27 @@ class HeadConfiguration:
         self._write_strobe()
 
     def lock(self, locked: bool) -> None:
-        """Report to the description that the stream runs; the start may depend on it."""
+        """Report to the description that the stream runs; the start may depend on it.
+
+        Args:
+            locked: whether the stream runs (feature TLParamsLocked).
+        """
         features = self._features
         if features.kind("TLParamsLocked") == "integer" and features.is_available("TLParamsLocked"):
             with contextlib.suppress(FeatureError):
                 features.set("TLParamsLocked", int(locked))
 
     def adjust(self, exposure_time_us: float, gain_db: float, tdi_shifts: int) -> None:
-        """Write exposure settings while the head runs. FeatureError: it refuses one."""
+        """Write exposure settings while the head runs.
+
+        Args:
+            exposure_time_us: exposure time, us.
+            gain_db: gain, dB.
+            tdi_shifts: number of TDI shifts.
+
+        Raises:
+            FeatureError: the head refuses one.
+        """
         features = self._features
         if self.gain_feature in GAINS_DB or gain_db:
             features.set(self.gain_feature or "Gain", self._gain_value(gain_db))
@@ -112,7 +125,14 @@ class HeadConfiguration:
         features.set(self.exposure_feature, self._exposure_value(exposure_time_us))
 
     def exposure_time_us(self) -> float:
-        """The exposure time that the head holds."""
+        """The exposure time that the head holds.
+
+        Returns:
+            Exposure time, us.
+
+        Raises:
+            FeatureError: it cannot be read.
+        """
         value = self._features.number(self.exposure_feature)
         if value is None:
             raise FeatureError(f"{self.exposure_feature} cannot be read")
@@ -395,7 +415,11 @@ class HeadConfiguration:
     # Chunks
 
     def switch_on_chunks(self) -> list[str]:
-        """Let the head append what it knows of each frame; the names of the chunks it appends."""
+        """Let the head append what it knows of each frame.
+
+        Returns:
+            Names of the chunks that it appends; empty if it has none.
+        """
         features = self._features
         if not features.is_available("ChunkModeActive"):
             return []

@@ -17,6 +17,9 @@ state. Two heads that are opened in parallel miss features or cause a segmentati
 def aravis() -> Any:
     """The Aravis namespace of PyGObject.
 
+    Returns:
+        The module, loaded at the first call.
+
     Raises:
         MissingExtraError: it is not installed; the message contains the command that installs it.
     """
@@ -32,7 +35,14 @@ def aravis() -> Any:
 
 @functools.cache
 def aravis_error() -> type[Exception]:
-    """The exception type of Aravis calls."""
+    """The exception type of Aravis calls.
+
+    Returns:
+        GLib.Error.
+
+    Raises:
+        MissingExtraError: Aravis is not installed.
+    """
     aravis()
     from gi.repository import GLib
 
@@ -41,7 +51,14 @@ def aravis_error() -> type[Exception]:
 
 
 def inet_address() -> Any:
-    """GLib's class of IP addresses."""
+    """GLib's class of IP addresses.
+
+    Returns:
+        Gio.InetAddress.
+
+    Raises:
+        MissingExtraError: Aravis is not installed.
+    """
     aravis()
     from gi.repository import Gio
 
@@ -49,5 +66,12 @@ def inet_address() -> Any:
 
 
 def message_of(error: Exception) -> str:
-    """The message of an Aravis exception."""
+    """The message of an Aravis exception.
+
+    Args:
+        error: the exception.
+
+    Returns:
+        Its message without domain and code.
+    """
     return str(getattr(error, "message", error))

@@ -47,7 +47,17 @@ Condition = tuple[int, int, int, int]
 
 
 def interface_towards(address: str) -> str:
-    """The address of this computer from which the kernel reaches a head. OSError: no route."""
+    """The address of this computer from which the kernel reaches a head.
+
+    Args:
+        address: IPv4 address of the head.
+
+    Returns:
+        IPv4 address of the interface.
+
+    Raises:
+        OSError: there is no route.
+    """
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.connect((address, 1))
         return str(probe.getsockname()[0])
@@ -84,7 +94,10 @@ class SocketCapture:
             found.close()
 
     def take(self) -> socket.socket:
-        """The first captured socket; the caller closes it.
+        """The first captured socket.
+
+        Returns:
+            A duplicate of it; the caller closes it.
 
         Raises:
             DeviceError: there is none.
@@ -140,10 +153,15 @@ class ControlSocketFilter:
         filter_by_source(control, address, port)
 
     def dropped_datagrams(self) -> int:
-        """Number of dropped datagrams of other senders."""
+        """Datagrams of other senders that were dropped.
+
+        Returns:
+            Their number since the filter was attached.
+        """
         return _drops(self._control)
 
     def close(self) -> None:
+        """Close this descriptor of the socket; the filter stays attached."""
         self._control.close()
 
 
@@ -193,14 +211,21 @@ class StreamSocketFilter:
         return f"{self._address}:{self.source_port}" if self.source_port else self._address
 
     def set_receive_buffer(self, nbytes: int) -> None:
-        """Set the receive buffer of the stream's socket."""
+        """Set the receive buffer of the stream's socket.
+
+        Args:
+            nbytes: requested bytes; the kernel limits them to net.core.rmem_max.
+        """
         self._stream.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, nbytes)
 
     def poll(self, received_packets: int) -> int:
-        """Count datagrams of other senders, lock the head's port; returns the total count.
+        """Count datagrams of other senders, and lock the head's port once it is known.
 
         Args:
             received_packets: number of packets that Aravis has received from the head.
+
+        Returns:
+            Number of datagrams of other senders since creation.
         """
         self._is_certain |= self.source_port != 0 and received_packets > 0
         if not self._is_certain:
@@ -218,6 +243,7 @@ class StreamSocketFilter:
         return self._received + _drops(self._others)
 
     def close(self) -> None:
+        """Close both descriptors; the stream's socket stays connected."""
         self._others.close()
         self._stream.close()
 
@@ -248,7 +274,16 @@ class StreamSocketFilter:
 
 
 def filter_by_source(udp: socket.socket, address: str, port: int | None = None) -> None:
-    """Make the kernel drop datagrams of a UDP socket from other addresses (or ports)."""
+    """Make the kernel drop datagrams of a UDP socket from other senders.
+
+    Args:
+        udp: the socket.
+        address: IPv4 address of the accepted sender.
+        port: its port; None for any.
+
+    Raises:
+        OSError: the kernel refuses the filter.
+    """
     conditions = [(LOAD_WORD, IP_HEADER + 12, JUMP_EQUAL, _as_number(address))]
     if port is not None:
         conditions.append((LOAD_HALF, 0, JUMP_EQUAL, port))
@@ -256,10 +291,17 @@ def filter_by_source(udp: socket.socket, address: str, port: int | None = None) 
 
 
 def filter_packet_sockets(known: set[str], source: tuple[str, int], to: tuple[str, int]) -> int:
-    """Restrict packet sockets that are not in `known` to datagrams from `source` to `to`.
+    """Restrict new packet sockets of this process to the datagrams of one stream.
 
-    Only unfragmented datagrams are accepted. Replaces the filter of Aravis, which ignores the
-    source port (0: any). Returns the number of sockets.
+    Only unfragmented datagrams are accepted. Replaces the filter of Aravis.
+
+    Args:
+        known: inodes of the sockets that are left alone.
+        source: IPv4 address and port of the sender; port 0 for any.
+        to: IPv4 address and port of the receiver.
+
+    Returns:
+        Number of sockets.
     """
     program = [
         (LOAD_HALF, 12, JUMP_EQUAL, 0x0800),
@@ -285,14 +327,27 @@ def filter_packet_sockets(known: set[str], source: tuple[str, int], to: tuple[st
 
 
 def socket_inodes() -> set[str]:
-    """Inodes of all sockets of this process, to detect new ones later."""
+    """Inodes of all sockets of this process, to detect new ones later.
+
+    Returns:
+        Such as "socket:[12345]".
+    """
     return {inode for _, inode in _sockets()}
 
 
 def attach_filter(to: socket.socket, conditions: list[Condition]) -> None:
-    """Filter a socket: every condition (load, offset, jump, value) must hold.
+    """Filter a socket: every condition must hold.
 
     JUMP_EQUAL requires the value, JUMP_BITS that none of its bits is set.
+
+    Args:
+        to: the socket.
+        conditions: load, offset (bytes), jump and value of each.
+
+    Raises:
+        OSError: the kernel refuses the filter.
+
+    Source: Linux, Documentation/networking/filter.rst.
     """
     code = b""
     for index, (load, offset, jump, value) in enumerate(conditions):
@@ -310,10 +365,16 @@ def attach_filter(to: socket.socket, conditions: list[Condition]) -> None:
 
 
 def socket_at(port: int) -> socket.socket:
-    """A duplicate descriptor of this process's UDP socket that is bound to `port`.
+    """A duplicate descriptor of this process's UDP socket at a port.
+
+    Args:
+        port: local port.
+
+    Returns:
+        The socket; the caller closes it.
 
     Raises:
-        OSError: there is none.
+        FileNotFoundError: there is none.
     """
 
     def is_it(found: socket.socket) -> bool:

@@ -17,7 +17,11 @@ SUFFIX: Final = ".toml"
 
 @functools.cache
 def preset_names() -> tuple[str, ...]:
-    """The names of all presets, sorted."""
+    """The names of all presets.
+
+    Returns:
+        The names, sorted.
+    """
     folder = resources.files("drivers.cameras.aravis").joinpath("presets")
     return tuple(
         sorted(f.name.removesuffix(SUFFIX) for f in folder.iterdir() if f.name.endswith(SUFFIX))
@@ -26,7 +30,13 @@ def preset_names() -> tuple[str, ...]:
 
 @functools.cache
 def preset_features(name: str) -> dict[str, FeatureValue]:
-    """The features of a preset in their order; none for an empty name.
+    """The features of a preset.
+
+    Args:
+        name: name of the preset; empty for none.
+
+    Returns:
+        Values by GenICam name, in their order; empty for an empty name.
 
     Raises:
         KeyError: there is no such preset.

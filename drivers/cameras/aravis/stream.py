@@ -126,11 +126,22 @@ class FrameStream:
             self.queue_slot(slot)
 
     def queue_slot(self, slot: int) -> None:
-        """Queue this slot for Aravis; from any thread."""
+        """Queue a slot for Aravis; from any thread.
+
+        Args:
+            slot: number of the slot.
+        """
         self._stream.push_buffer(self._buffers[slot])
 
     def pop(self, timeout_s: float) -> ReceivedFrame | None:
-        """Wait for a frame, at most `timeout_s`. The caller owns the slot until `queue_slot`."""
+        """Wait for a frame. The caller owns its slot until `queue_slot`.
+
+        Args:
+            timeout_s: longest wait, s.
+
+        Returns:
+            The frame; None if none came in time.
+        """
         buffer = self._stream.timeout_pop_buffer(round(timeout_s * 1e6))
         if buffer is None:
             return None
@@ -157,7 +168,11 @@ class FrameStream:
         )
 
     def unpack(self, slot: int) -> None:
-        """Convert the received pixels of a slot to right-justified 16-bit words; after `pop`."""
+        """Convert the received pixels of a slot to right-justified 16-bit words; after `pop`.
+
+        Args:
+            slot: number of the slot.
+        """
         if self._packing is Packing.WORDS:
             return
         address = self._memory.address(slot)
@@ -165,9 +180,11 @@ class FrameStream:
         unpack(self._packing, packed, words_at(address, self._pixel_count))
 
     def counted(self) -> Counter[str]:
-        """Aravis' statistics of this stream, and `underruns` in frames.
+        """Aravis' statistics of this stream.
 
-        `other_senders` are dropped datagrams of other senders.
+        Returns:
+            Counts by the names of STATISTIC_NAMES; also `underruns` in frames, `stream_restarts`,
+            and `other_senders`, dropped datagrams of other senders.
         """
         found: Counter[str] = Counter()
         for theirs, ours in STATISTIC_NAMES.items():
@@ -190,6 +207,9 @@ class FrameStream:
 
         Aravis drops up to 100 frames after a block number that was too large, or if the head counts
         from 1 again. The sign is a complete frame of ignored packets with no frame delivered since.
+
+        Returns:
+            Whether it was restarted.
         """
         if self._ignored_packets() - self._ignored < self._packets_per_frame:
             return False
@@ -251,7 +271,11 @@ class FrameStream:
 
 
 def receive_buffer_limit() -> int:
-    """The largest socket buffer the kernel grants, net.core.rmem_max in bytes."""
+    """The largest socket buffer that the kernel grants.
+
+    Returns:
+        net.core.rmem_max, bytes; the kernel's default if it cannot be read.
+    """
     try:
         return int(Path("/proc/sys/net/core/rmem_max").read_text(encoding="ascii"))
     except (OSError, ValueError):

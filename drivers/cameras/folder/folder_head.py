@@ -81,7 +81,17 @@ class FolderHead(HeadDevice):
         return []
 
     def bind(self, sink: Sink | None = None) -> Mapping[str, str]:
-        """Find the files and read the first. See `drivers.contract.Head`."""
+        """Find the files and read the first. See `drivers.contract.Head`.
+
+        Args:
+            sink: not used.
+
+        Returns:
+            Model, serial number of the recorded head, folder, number of files and size of a frame.
+
+        Raises:
+            DeviceError: the folder has no suitable file, or the first one cannot be read.
+        """
         from drivers.cameras.folder.frames import FrameFileError, frame_files, read_frame
 
         pattern = self.pattern.replace("{head}", self.name)
@@ -121,7 +131,12 @@ class FolderHead(HeadDevice):
         )
 
     def trigger(self) -> None:
-        """Play the next file; from any thread. See `drivers.contract.Head`."""
+        """Play the next file; from any thread. See `drivers.contract.Head`.
+
+        Raises:
+            DeviceError: the head plays by its interval, is not running, has played all files, or
+                MAX_QUEUED_TRIGGERS triggers are waiting.
+        """
         if self.trigger_source != "software":
             raise DeviceError(
                 f"{self.name}: the head plays by its interval; set trigger_source = "

@@ -49,7 +49,14 @@ class FrameFile:
 
 
 def frame_files(folder: Path, pattern: str) -> list[Path]:
-    """The files that fit the pattern, numbers in their names in the order of numbers.
+    """The files of a folder that match a pattern.
+
+    Args:
+        folder: where the pattern begins.
+        pattern: as of `pathlib.Path.glob`.
+
+    Returns:
+        The files, sorted by name; numbers within names are compared as numbers.
 
     Raises:
         OSError: the folder cannot be read.
@@ -69,6 +76,9 @@ def read_frame(path: Path, *, max_nbytes: int) -> FrameFile:
     Args:
         path: the file.
         max_nbytes: nothing larger than this is unpacked.
+
+    Returns:
+        The pixels, and the metadata if the file is a Level-0 frame.
 
     Raises:
         FrameFileError: it is none, is damaged, or does not fit.

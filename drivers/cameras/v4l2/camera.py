@@ -10,9 +10,10 @@ from collections.abc import Mapping
 from typing import Final, TypeAlias
 
 from drivers.cameras.v4l2 import uapi
+from drivers.cameras.v4l2.control import Control
 from drivers.cameras.v4l2.discovery import path_of, serial_number
 from drivers.cameras.v4l2.formats import FORMATS, PixelFormat, format_of_code
-from drivers.cameras.v4l2.node import Control, FrameLayout, VideoNode
+from drivers.cameras.v4l2.node import FrameLayout, VideoNode
 from drivers.cameras.v4l2.settings import V4l2Settings, assignments
 from drivers.contract import DeviceError
 
@@ -70,6 +71,7 @@ class V4l2Camera:
 
     @property
     def identity(self) -> dict[str, str]:
+        """model, serial, driver, bus and path."""
         return {
             "model": self.node.card,
             "serial": self.serial,
@@ -79,13 +81,27 @@ class V4l2Camera:
         }
 
     def exposure_time_us(self, values: Mapping[str, float | int | str]) -> float | None:
-        """The exposure time among control values; the configured one if no control reports it."""
+        """The exposure time among control values.
+
+        Args:
+            values: as returned by `control_values`.
+
+        Returns:
+            Exposure time, us; the configured one if no control reports it, None if there is none.
+        """
         if self._exposure is not None and self._exposure.name in values:
             return float(values[self._exposure.name]) * self._exposure_unit_us
         return self._settings.exposure_time_us or None
 
     def temperature_c(self) -> float | None:
-        """The reading of the head's own thermometer; None if it has none."""
+        """Read the head's own thermometer.
+
+        Returns:
+            Temperature, degC; None if no control is configured or it cannot be read.
+
+        Raises:
+            OSError: ENODEV, the head is lost.
+        """
         name = self._settings.temperature_control
         if not name:
             return None
@@ -93,7 +109,14 @@ class V4l2Camera:
         return None if value is None else value * self._settings.temperature_unit_c
 
     def control_values(self) -> dict[str, float | int | str]:
-        """Every control of picture and camera as it stands, and the pixel format."""
+        """Read every control of picture and camera.
+
+        Returns:
+            Values by name of control, and the pixel format; unreadable controls are omitted.
+
+        Raises:
+            OSError: ENODEV, the head is lost.
+        """
         chosen = {
             name: control
             for name, control in self.controls.items()
@@ -102,14 +125,26 @@ class V4l2Camera:
         return {"PixelFormat": self.format.name, **self.node.read_all(chosen)}
 
     def press_button(self, name: str) -> None:
-        """Press a button; OSError where the head refuses."""
+        """Press a button.
+
+        Args:
+            name: name of the control.
+
+        Raises:
+            OSError: the head refuses or is lost.
+        """
         self.node.write(self.controls[name], 1)
 
     def adjust(self, exposure_time_us: float, gain_db: float) -> None:
-        """Write another exposure time, and a gain counted from the one it was opened with.
+        """Write another exposure time and gain.
+
+        Args:
+            exposure_time_us: exposure time, us; rounded to the step of the control.
+            gain_db: gain relative to the one at opening, dB.
 
         Raises:
             DeviceError: the head has no such control, or refuses; it is left as it was.
+            OSError: the head is lost.
         """
         writes, refusals = self._adjustments(exposure_time_us, gain_db), list[str]()
         before = [(key, control, self.node.read(control)) for key, control, _ in writes]

@@ -29,7 +29,11 @@ class FoundNode:
 
 
 def capture_nodes() -> list[FoundNode]:
-    """Every capture node of this host; nodes of other kinds are left out."""
+    """Every capture node of this host; nodes of other kinds are omitted.
+
+    Returns:
+        The nodes, sorted by number.
+    """
     found = []
     for path in sorted(NODES.glob("video*"), key=lambda p: (len(p.name), p.name)):
         try:
@@ -53,14 +57,28 @@ def capture_nodes() -> list[FoundNode]:
 
 
 def path_of(device: str) -> str | None:
-    """The node of a path, or of a bus as printed by v4l2-ctl; None if there is none."""
+    """The node of a configured device.
+
+    Args:
+        device: a path, or a bus as printed by v4l2-ctl.
+
+    Returns:
+        Path of the node; None if there is none.
+    """
     if device.startswith("/"):
         return device if Path(device).exists() else None
     return next((node.path for node in capture_nodes() if node.bus == device), None)
 
 
 def serial_number(path: str) -> str:
-    """The serial number of the USB device behind a node; empty where it has none."""
+    """The serial number of the USB device behind a node.
+
+    Args:
+        path: path of the node.
+
+    Returns:
+        The serial number; empty if it has none.
+    """
     try:
         place = (SYSFS / Path(path).resolve().name / "device").resolve(strict=True)
     except OSError:

@@ -63,5 +63,12 @@ FORMATS: Final = {
 
 
 def format_of_code(code: int) -> PixelFormat | None:
-    """The format of a code, where it is one of ours."""
+    """A supported format by its code.
+
+    Args:
+        code: V4L2 pixel format, four characters as a number.
+
+    Returns:
+        The format; None if it is not supported.
+    """
     return next((found for found in FORMATS.values() if found.code == code), None)

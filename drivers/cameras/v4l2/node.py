@@ -14,13 +14,13 @@ import errno
 import fcntl
 import mmap
 import os
-import re
 import select
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 from drivers.cameras.v4l2 import uapi
+from drivers.cameras.v4l2.control import NUMBERS, Control, control_name
 
 if TYPE_CHECKING:
     import numpy as np
@@ -28,14 +28,6 @@ if TYPE_CHECKING:
 
 NS_PER_S: Final = 1_000_000_000
 NS_PER_US: Final = 1_000
-_NUMBERS: Final = (
-    uapi.CTRL_TYPE_INTEGER,
-    uapi.CTRL_TYPE_BOOLEAN,
-    uapi.CTRL_TYPE_MENU,
-    uapi.CTRL_TYPE_INTEGER64,
-    uapi.CTRL_TYPE_BITMASK,
-    uapi.CTRL_TYPE_INTEGER_MENU,
-)
 
 
 @dataclass(frozen=True)
@@ -47,26 +39,6 @@ class FrameLayout:
     code: int
     row_nbytes: int
     nbytes: int
-
-
-@dataclass(frozen=True)
-class Control:
-    """A control of the head, named as v4l2-ctl does."""
-
-    id: int
-    name: str
-    type: int
-    minimum: int
-    maximum: int
-    flags: int
-
-    @property
-    def is_button(self) -> bool:
-        return self.type == uapi.CTRL_TYPE_BUTTON
-
-    @property
-    def is_readable_number(self) -> bool:
-        return self.type in _NUMBERS and not self.flags & uapi.CTRL_FLAG_WRITE_ONLY
 
 
 @dataclass(frozen=True)
@@ -119,30 +91,49 @@ class VideoNode:
 
     @property
     def is_multi_planar(self) -> bool:
+        """Whether the node has the multi-planar API."""
         return self.buffer_type == uapi.BUF_TYPE_VIDEO_CAPTURE_MPLANE
 
     def close(self) -> None:
-        """Let go of mappings and descriptor: a device that was unplugged waits for both."""
+        """Release mappings and descriptor: a device that was unplugged waits for both."""
         self.free_buffers()
         if self._fd >= 0:
             os.close(self._fd)
             self._fd = -1
 
     def wait(self, timeout_s: float) -> int:
-        """Wait for a frame; the bits of poll(2), 0 where none came in time."""
+        """Wait for a frame.
+
+        Args:
+            timeout_s: longest wait, s.
+
+        Returns:
+            Event bits of poll(2); 0 if none came in time.
+        """
         poll = select.poll()
         poll.register(self._fd, select.POLLIN)
         found = poll.poll(timeout_s * 1e3)
         return found[0][1] if found else 0
 
     def check_alive(self) -> None:
-        """Raises OSError (ENODEV) where the device is gone."""
+        """Check that the device exists.
+
+        Raises:
+            OSError: ENODEV, the device is gone.
+        """
         self._call(uapi.QUERYCAP, uapi.Capability())
 
     # Format
 
     def formats(self) -> list[int]:
-        """Codes of the formats the head offers."""
+        """The formats that the head offers.
+
+        Returns:
+            V4L2 pixel formats, four characters as a number each.
+
+        Raises:
+            OSError: the head is lost.
+        """
         codes: list[int] = []
         for index in range(256):
             description = uapi.FormatDescription(index=index, type=self.buffer_type)
@@ -156,12 +147,31 @@ class VideoNode:
         return codes
 
     def layout(self) -> FrameLayout:
-        """What the head is set to."""
+        """The present layout of a frame.
+
+        Returns:
+            Size in pixels, format, bytes of a row and of a frame.
+
+        Raises:
+            OSError: the head is lost, or the format has several planes.
+        """
         form = uapi.Format(type=self.buffer_type)
         return self._layout(self._call(uapi.G_FMT, form))
 
     def set_layout(self, width_px: int, height_px: int, code: int) -> FrameLayout:
-        """Ask for a format; what the head made of it, which may be something else."""
+        """Request a layout of a frame.
+
+        Args:
+            width_px: columns.
+            height_px: rows.
+            code: V4L2 pixel format.
+
+        Returns:
+            What the head accepted, which may be another layout.
+
+        Raises:
+            OSError: the head refuses, streams (EBUSY), or is lost.
+        """
         form = self._call(uapi.G_FMT, uapi.Format(type=self.buffer_type))
         pix = form.fmt.pix_mp if self.is_multi_planar else form.fmt.pix
         pix.width, pix.height, pix.pixelformat = width_px, height_px, code
@@ -174,10 +184,28 @@ class VideoNode:
         return self._layout(self._call(uapi.S_FMT, form))
 
     def set_input(self, number: int) -> None:
+        """Select a video input.
+
+        Args:
+            number: number of the input, from 0.
+
+        Raises:
+            OSError: the head has no such input, or is lost.
+        """
         self._call(uapi.S_INPUT, ctypes.c_int(number))
 
     def set_interval(self, interval_s: float) -> float:
-        """Ask for a frame interval; what the head made of it."""
+        """Request a frame interval.
+
+        Args:
+            interval_s: time from frame to frame, s; rounded to microseconds.
+
+        Returns:
+            The interval that the head accepted, s; 0 if it reports none.
+
+        Raises:
+            OSError: the head refuses or is lost.
+        """
         parm = self._call(uapi.G_PARM, uapi.StreamParm(type=self.buffer_type))
         fraction = parm.parm.capture.timeperframe
         fraction.numerator, fraction.denominator = round(interval_s * 1e6), 1_000_000
@@ -201,7 +229,17 @@ class VideoNode:
     # Buffers
 
     def make_buffers(self, count: int) -> int:
-        """Have the kernel make buffers and map them; how many it made."""
+        """Request buffers from the kernel and map them.
+
+        Args:
+            count: requested number.
+
+        Returns:
+            Number of buffers that the kernel made.
+
+        Raises:
+            OSError: the head streams already, or is lost.
+        """
         request = uapi.RequestBuffers(count=count, type=self.buffer_type, memory=uapi.MEMORY_MMAP)
         self._call(uapi.REQBUFS, request)
         for index in range(request.count):
@@ -230,7 +268,14 @@ class VideoNode:
                 self._call(uapi.REQBUFS, request)
 
     def content(self, filled: FilledBuffer) -> NDArray[np.uint8]:
-        """What a filled buffer holds. Not to be kept: a view holds the mapping open."""
+        """The bytes of a filled buffer, without a copy.
+
+        Args:
+            filled: as dequeued.
+
+        Returns:
+            Shape (n,). Not to be retained: a view keeps the mapping open.
+        """
         import numpy as np
 
         mapped, length = self._maps[filled.index]
@@ -238,12 +283,26 @@ class VideoNode:
         return np.frombuffer(mapped, np.uint8, max(0, end - filled.offset), filled.offset)
 
     def queue(self, index: int) -> None:
-        """Give a buffer to the kernel."""
+        """Give a buffer to the kernel.
+
+        Args:
+            index: number of the buffer.
+
+        Raises:
+            OSError: the kernel refuses (EINVAL), or the head is lost.
+        """
         buffer, _planes = self._buffer(index)
         self._call(uapi.QBUF, buffer)
 
     def dequeue(self) -> FilledBuffer | None:
-        """The next filled buffer; None where there is none yet."""
+        """Take the next filled buffer.
+
+        Returns:
+            The buffer; None if there is none yet.
+
+        Raises:
+            OSError: the stream failed (EIO) or the head is lost (ENODEV).
+        """
         buffer, planes = self._buffer(0)
         try:
             self._call(uapi.DQBUF, buffer)
@@ -268,9 +327,19 @@ class VideoNode:
         )
 
     def stream_on(self) -> None:
+        """Start streaming.
+
+        Raises:
+            OSError: the head refuses or is lost.
+        """
         self._call(uapi.STREAMON, ctypes.c_int(self.buffer_type))
 
     def stream_off(self) -> None:
+        """Stop streaming; the kernel returns all buffers.
+
+        Raises:
+            OSError: the head is lost.
+        """
         self._call(uapi.STREAMOFF, ctypes.c_int(self.buffer_type))
 
     def _buffer(self, index: int) -> tuple[uapi.Buffer, Any]:
@@ -284,7 +353,14 @@ class VideoNode:
     # Controls
 
     def controls(self) -> dict[str, Control]:
-        """All controls that are no classes, strings or compounds, by name."""
+        """All controls except classes, strings and compounds.
+
+        Returns:
+            Controls by name.
+
+        Raises:
+            OSError: the head is lost.
+        """
         found: dict[str, Control] = {}
         query = uapi.QueryExtCtrl(id=uapi.CTRL_FLAG_NEXT_CTRL)
         while True:
@@ -294,7 +370,7 @@ class VideoNode:
                 if error.errno in (errno.EINVAL, errno.ENOTTY):
                     return found
                 raise
-            usable = query.type in (*_NUMBERS, uapi.CTRL_TYPE_BUTTON) and query.elems <= 1
+            usable = query.type in (*NUMBERS, uapi.CTRL_TYPE_BUTTON) and query.elems <= 1
             if usable and not query.flags & uapi.CTRL_FLAG_DISABLED:
                 name = control_name(_text(query.name))
                 found[name] = Control(
@@ -308,12 +384,32 @@ class VideoNode:
             query = uapi.QueryExtCtrl(id=query.id | uapi.CTRL_FLAG_NEXT_CTRL)
 
     def read(self, control: Control) -> int:
+        """Read a control.
+
+        Args:
+            control: a control with a value.
+
+        Returns:
+            Its value, in the control's own unit.
+
+        Raises:
+            OSError: it cannot be read now, or the head is lost.
+        """
         one = uapi.ExtControl(id=control.id)
         self._control(uapi.G_EXT_CTRLS, one)
         is_wide = control.type == uapi.CTRL_TYPE_INTEGER64
         return int(one.u.value64 if is_wide else one.u.value)
 
     def write(self, control: Control, value: int) -> None:
+        """Write a control.
+
+        Args:
+            control: the control.
+            value: value in the control's own unit; 1 for a button.
+
+        Raises:
+            OSError: the head refuses or is lost.
+        """
         one = uapi.ExtControl(id=control.id)
         if control.type == uapi.CTRL_TYPE_INTEGER64:
             one.u.value64 = value
@@ -322,7 +418,17 @@ class VideoNode:
         self._control(uapi.S_EXT_CTRLS, one)
 
     def read_all(self, controls: Mapping[str, Control]) -> dict[str, int]:
-        """The values of those that can be read now; the others are left out."""
+        """Read several controls.
+
+        Args:
+            controls: controls by name.
+
+        Returns:
+            Values by name of those that can be read now.
+
+        Raises:
+            OSError: ENODEV, the head is lost.
+        """
         found: dict[str, int] = {}
         for name, control in controls.items():
             if not control.is_readable_number:
@@ -348,16 +454,6 @@ class VideoNode:
             except InterruptedError:
                 continue
             return argument
-
-
-def control_name(title: str) -> str:
-    """A control's title as v4l2-ctl writes it.
-
-    Example:
-        >>> control_name("Exposure Time, Absolute")
-        'exposure_time_absolute'
-    """
-    return re.sub(r"[^a-z0-9]+", "_", title.lower()).strip("_")
 
 
 def _text(value: bytes) -> str:

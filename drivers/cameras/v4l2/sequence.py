@@ -25,7 +25,7 @@ class SequenceCounter:
 
     Example:
         >>> count = SequenceCounter()
-        >>> [count.take(n).counter for n in (0, 1, 4)]
+        >>> [count.advance(n).counter for n in (0, 1, 4)]
         [1, 2, 5]
     """
 
@@ -34,7 +34,16 @@ class SequenceCounter:
         self._counter = 0
 
     def advance(self, sequence: int) -> SequenceCount:
-        """The next frame's number. A step back goes on counting by one, since the true count is unknown."""
+        """Count the next frame.
+
+        A step back counts as one frame, since the true count is unknown.
+
+        Args:
+            sequence: the kernel's sequence number, 32 bits.
+
+        Returns:
+            The frame's count and the number of frames lost before it.
+        """
         if self._last is None:
             # A stream starts at 0; what is missing before the first frame was lost.
             step = (sequence + 1) % MODULUS

@@ -96,6 +96,13 @@ class V4l2Settings(Configured):
 
 
 def assignments(controls: tuple[str, ...]) -> list[tuple[str, int]]:
-    """Names and numbers of the setting `controls`."""
+    """Names and numbers of the setting `controls`.
+
+    Args:
+        controls: texts of the form name=number; others are omitted.
+
+    Returns:
+        Name and value of each, in the order of the setting.
+    """
     found = [ASSIGNMENT.fullmatch(text) for text in controls]
     return [(match[1], int(match[2])) for match in found if match]

@@ -341,9 +341,16 @@ QUERY_EXT_CTRL: Final = _request(_READ | _WRITE, 103, QueryExtCtrl)
 
 
 def fourcc(code: str) -> int:
-    """A pixel format's four characters as the kernel's number; "Y16" stands for "Y16 ".
+    """A pixel format's four characters as the kernel's number.
 
-    Y16_BE is written "Y16 -BE", as the kernel's own tools do.
+    Args:
+        code: up to four characters, padded with blanks; "-BE" at the end sets the flag of
+            big-endian formats, as the kernel's own tools write it.
+
+    Returns:
+        The number, 32 bits.
+
+    Source: Linux, include/uapi/linux/videodev2.h, v4l2_fourcc and v4l2_fourcc_be.
     """
     big_endian = code.endswith("-BE")
     number = int.from_bytes(code.removesuffix("-BE").ljust(4).encode("ascii"), "little")
@@ -351,6 +358,13 @@ def fourcc(code: str) -> int:
 
 
 def fourcc_name(number: int) -> str:
-    """The four characters of a pixel format's number, blanks at the end taken off."""
+    """The four characters of a pixel format's number.
+
+    Args:
+        number: 32 bits.
+
+    Returns:
+        The characters without blanks at the end, with "-BE" for big-endian formats.
+    """
     text = (number & 0x7FFF_FFFF).to_bytes(4, "little").decode("ascii", errors="replace")
     return text.rstrip() + ("-BE" if number & 1 << 31 else "")

@@ -77,7 +77,17 @@ class V4l2Head(V4l2Settings, HeadDevice):
     _adjusted: tuple[float, float] | None = None
 
     def bind(self, sink: Sink | None = None) -> Mapping[str, str]:
-        """Open the head, write its settings, say what was found. See `drivers.contract.Head`."""
+        """Open the head and write its settings. See `drivers.contract.Head`.
+
+        Args:
+            sink: not used.
+
+        Returns:
+            Identity, size of a frame, exposure time, number of controls and temperature.
+
+        Raises:
+            DeviceError: it does not answer, refuses a setting, or is closed meanwhile.
+        """
         self._open_device()
         session = self._session
         if session is None:
@@ -96,7 +106,11 @@ class V4l2Head(V4l2Settings, HeadDevice):
         }
 
     def trigger(self) -> None:
-        """Press the trigger button; from any thread. See `drivers.contract.Head`."""
+        """Press the trigger button; from any thread. See `drivers.contract.Head`.
+
+        Raises:
+            DeviceError: the head waits for its line, is not running, or refuses.
+        """
         if self.trigger_source != "software":
             raise DeviceError(
                 f"{self.name}: the head waits for its line; set trigger_source = "
@@ -114,7 +128,16 @@ class V4l2Head(V4l2Settings, HeadDevice):
             ) from None
 
     def adjust(self, exposure_time_us: float, gain_db: float, tdi_shifts: int) -> None:
-        """Write the controls; also when the head is opened again. See `drivers.contract.Head`."""
+        """Write the controls; also when the head is opened again. See `drivers.contract.Head`.
+
+        Args:
+            exposure_time_us: exposure time, us.
+            gain_db: gain relative to the configured one, dB.
+            tdi_shifts: 0; the head has no TDI.
+
+        Raises:
+            DeviceError: the head has no such control, refuses, is not running, or is lost.
+        """
         if tdi_shifts:
             raise DeviceError(
                 f"{self.name}: {tdi_shifts} TDI shifts are asked for; this head has none, set "
