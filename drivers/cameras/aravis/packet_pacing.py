@@ -35,6 +35,11 @@ def packet_delay_ticks(
         head_link_mbps: rate of the head's link, whose time for the packet is subtracted; 0: none.
         tick_hz: frequency of the timestamp counter.
 
+    Returns:
+        The pause in ticks, at least 0.
+
+    Source: GigE Vision 2.0, section 28, stream channel packet delay.
+
     Example:
         >>> packet_delay_ticks(8962, 100.0, 0.0, 1_000_000_000)  # 9000 bytes at 12.5 MB/s
         720000
@@ -49,10 +54,19 @@ def packet_delay_ticks(
 def write_pacing(
     features: Features, settings: AravisSettings, packet_size: int, tick_hz: int
 ) -> tuple[dict[str, FeatureValue], list[str]]:
-    """Limit the rate of a head; what it holds afterwards, and one sentence per refusal.
+    """Limit the rate of a head.
 
     Without `stream_rate_mbps` the head keeps its pause, which is reported. Features that are
     configured by name are left as they are.
+
+    Args:
+        features: the head's features.
+        settings: the configured settings.
+        packet_size: size of the IP packet in bytes.
+        tick_hz: frequency of the head's timestamp counter.
+
+    Returns:
+        What the head holds afterwards, by feature, and one sentence per refusal.
     """
     written: dict[str, FeatureValue] = {}
     refusals: list[str] = []
