@@ -79,14 +79,14 @@ def check_content(
     Returns:
         Shifted and mismatched frames; empty where every frame has enough matches.
     """
-    settings = settings or TiePointSettings()
+    settings, image = settings or TiePointSettings(), rig.virtual_image
     attempted, found = _counts(tie_points)
     suspicious = {
         name
         for name, count in attempted.items()
         if count >= MIN_ATTEMPTED and found[name] < SUSPICIOUS_SHARE * count
     }
-    if not suspicious:
+    if not suspicious or image is None:
         return ContentCheck()
     ratio = exact_colour_ratio(rig) or 1.0
     searches = pan_searches(rig, placements, frames, settings)
@@ -107,7 +107,7 @@ def check_content(
             other = search.pair[search.pair[0] == name]
             if other not in suspicious or len(suspicious) == len(attempted):
                 shifts[name] += _wide_search_shifts(
-                    placements, frames, search, rough, settings, name
+                    placements, frames, search, rough, settings, name, image.pitch_mm
                 )
     shifted, mismatched = {}, {}
     for name in sorted(suspicious):
@@ -129,7 +129,7 @@ def moved_placements(
     Args:
         placements: predictions of the first search, by sensor name.
         check: what the first search found.
-        pitch_mm: pixel pitch of the PAN sensors, to which `check.shifted_px` refers.
+        pitch_mm: pixel pitch of the virtual image, to which `check.shifted_px` refers.
 
     Returns:
         Placements by sensor name, those of shifted frames with a translated layer.
@@ -193,8 +193,9 @@ def _wide_search_shifts(
     textured: NDArray[np.bool_],
     settings: TiePointSettings,
     name: str,
+    pitch_mm: float,
 ) -> list[Array]:
-    """Displacement of points of frame `name` from their prediction, px in the VIP."""
+    """Displacement of points of frame `name` from their prediction, px of `pitch_mm` in the VIP."""
     if search.region is not None:
         return []
     a, b = search.pair
@@ -233,7 +234,6 @@ def _wide_search_shifts(
     differences = vip_mm_from_raw(placements[a], found[good, 0:2]) - vip_mm_from_raw(
         placements[b], found[good, 2:4]
     )
-    pitch_mm = placements[a].sensor.pitch_mm
     # Frame a lies where its neighbour shows the ground: it goes by what it is off.
     return [(-row if name == a else row) / pitch_mm for row in differences]
 

@@ -6,8 +6,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 
+from processing.geometry.placement import nominal_placements
+from processing.matching.content_check import check_content, moved_placements
+from processing.matching.tie_points import match_tie_points
+from processing.radiometry.level1 import level1_counts_per_dn
 from tests.processing.injected_errors import InjectedExposure, rendered, with_platform_rotation
 
 pytestmark = [pytest.mark.trust, pytest.mark.timeout(300)]
@@ -129,3 +134,24 @@ def test_a_cone_rotated_beyond_the_search_is_found_corrected_and_named(
     assert outcome.verdict == "usable" and outcome.figure("platform_causes") == cone
     assert outcome.inner_px < 0.02
     assert outcome.stated_sigma_px < 3.0 * outcome.true_sigma_px < 6.0 * outcome.stated_sigma_px
+
+
+def test_a_shifted_frame_is_sought_where_it_lies_at_any_pitch_of_the_image(
+    error_free: InjectedExposure,
+) -> None:
+    rig = error_free.rig
+    assert rig.virtual_image is not None
+    counts = level1_counts_per_dn(rig.sensors[0].bits)
+    frames = {name: frame * np.uint16(counts) for name, frame in error_free.frames.items()}
+    frames["SU20"] = np.roll(frames["SU20"], 24, axis=1)
+    placed = nominal_placements(rig, {}, {})
+    tie_points = match_tie_points(rig, placed, frames)
+    layers = []
+    for factor in (1.0, 1.5):
+        image = replace(rig.virtual_image, pitch_um=factor * rig.virtual_image.pitch_um)
+        content = check_content(replace(rig, virtual_image=image), placed, frames, tie_points)
+        assert set(content.shifted_px) == {"SU20"}
+        layers.append(moved_placements(placed, content, image.pitch_mm)["SU20"].layer)
+    assert np.allclose(layers[0], layers[1], atol=1e-9)
+    moved_px = layers[0][:2, 2] / rig.sensor("SU20").pitch_mm
+    assert np.hypot(*moved_px) == pytest.approx(24.0, abs=1.0)
