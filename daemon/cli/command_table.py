@@ -88,6 +88,7 @@ TABLE: Final = {
             "calibrate", _LABORATORY, "Compute calibrations, each a new file.", "calibrate:app"
         ),
         _command("adjust", _LABORATORY, "Adjust a bundle from a project of text files."),
+        _command("init", _BENCH, "Write rig.toml and service.toml for the connected devices."),
         _command("schema", _BENCH, "Print the JSON Schema of rig.toml or service.toml."),
         _command("demo", _BENCH, "Fly the first flight with emulated devices."),
         _command("sim", _BENCH, "Run the emulated devices of a rig until Ctrl-C."),

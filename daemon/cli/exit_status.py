@@ -57,6 +57,7 @@ PROBLEMS: Final = {
     "sim": "the emulator did not start",
     "bench": "a needed program or file is missing",
     "kernels": "a kernel cannot be compiled",
+    "init": "no head answers, or the check of the written files fails",
     "schema": "the schema cannot be read",
     "disk-health": "no disk can be read",
     "install": "a step failed",

@@ -37,18 +37,18 @@ def find(ports: Sequence[str], *, as_json: bool, ask: bool) -> NoReturn:
     except MissingExtraError as error:
         # Everything else is found without it.
         console.print(str(error), style="yellow", markup=False, soft_wrap=True)
-    progress = _Progress(names)
+    progress = SearchProgress(names)
     with Live(console=console, get_renderable=progress.table, refresh_per_second=4, transient=True):
         found = search(names, ask=ask, on_progress=progress.on_progress)
     sections = toml_sections(found)
     if as_json:
-        typer.echo(json.dumps({"ports": [_as_json(one) for one in found], "toml": sections}))
+        typer.echo(json.dumps({"ports": [result_json(one) for one in found], "toml": sections}))
     else:
         _print(console, found, sections)
     raise typer.Exit(status_of(is_good=any(one.detected for one in found)))
 
 
-class _Progress:
+class SearchProgress:
     """Progress at each port, reported by the threads that probe it."""
 
     def __init__(self, ports: Sequence[str]) -> None:
@@ -98,7 +98,8 @@ def toml_sections(found: Sequence[DetectionResult]) -> str:
     return "\n\n".join(sections) + ("\n" if sections else "")
 
 
-def _as_json(one: DetectionResult) -> dict[str, Any]:
+def result_json(one: DetectionResult) -> dict[str, Any]:
+    """What was found at a port, as JSON types."""
     detected = one.detected
     if detected is None:
         return {"port": one.port, "found": False, "sentence": one.sentence}
@@ -116,7 +117,8 @@ def _as_json(one: DetectionResult) -> dict[str, Any]:
     }
 
 
-def _print(console: Console, found: Sequence[DetectionResult], sections: str) -> None:
+def result_table(found: Sequence[DetectionResult]) -> Table:
+    """What was found at each port, or the reason why nothing was."""
     table = light_table("", ("port", "protocol", "received"), ("baud",))
     for one in found:
         if one.detected is None:
@@ -127,7 +129,11 @@ def _print(console: Console, found: Sequence[DetectionResult], sections: str) ->
             received += f"; missing: {one.detected.missing}"
         speed = "" if one.baudrate is None else f"{one.baudrate} {one.parity}"
         table.add_row(one.port, Text(one.detected.protocol, "green"), received, speed)
-    console.print(table)
+    return table
+
+
+def _print(console: Console, found: Sequence[DetectionResult], sections: str) -> None:
+    console.print(result_table(found))
     if not sections:
         console.print(
             "Nothing was found. Check power and cables; see docs/reference/drivers for each device."

@@ -65,7 +65,7 @@ def show(
     """
     from processing.geometry import topology
     from processing.mosaic import mosaic_plots as draw
-    from processing.pipelines.perspective import has_diverging_axes
+    from processing.pipelines.perspective import has_head_images
 
     rig = find_rig(name)
     counts = topology.counts(rig)
@@ -78,6 +78,7 @@ def show(
             json.dumps(
                 _row(rig)
                 | {
+                    "calibrated": rig.is_calibrated,
                     "parameters": counts.parameters,
                     "constraints": counts.constraints,
                     "independent": counts.parameters - counts.constraints,
@@ -104,7 +105,8 @@ def show(
         )
         return
     console = Console()
-    console.print(f"{rig.name}  {rig.title}; {rig.timing}")
+    calibration = rig.calibration_date and f"calibrated {rig.calibration_date}"
+    console.print(f"{rig.name}  {rig.title}; {rig.timing}; {calibration or 'uncalibrated'}")
     figures = ("f mm", "forward mm", "right mm", "param.", "constr.")
     cones = light_table("Cones", ("cone", "bands", "sensors"), figures)
     layers = {layer.cone: layer for layer in counts.cones}
@@ -129,7 +131,7 @@ def show(
             f"{overlap.rectangle.height_mm / pitch_mm:.0f}",
         )
     console.print(strips)
-    if has_diverging_axes(rig):
+    if has_head_images(rig):
         console.print(
             "Nothing is stitched: each head is an image of its own "
             "(docs/how-to/processing/midas.md)",

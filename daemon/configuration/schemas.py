@@ -28,6 +28,7 @@ SCHEMA_FILES: Final = {
     "rig": Path(processing.rig.__file__).with_name("rig.schema.json"),
     "service": Path(__file__).with_name("service.schema.json"),
 }
+"""JSON Schemas that come with the package, by the name of what they describe."""
 _TYPES: Final[Mapping[type, Mapping[str, Any]]] = {
     bool: {"type": "boolean"},
     int: {"type": "integer"},
@@ -40,6 +41,16 @@ _TYPES: Final[Mapping[type, Mapping[str, Any]]] = {
     },
 }
 """Of a setting, by the type of its default."""
+
+
+def schema_file_name(name: str) -> str:
+    """Name of the schema file next to a TOML file: "rig" or "service"."""
+    return SCHEMA_FILES[name].name
+
+
+def schema_line(name: str) -> str:
+    """First line of a TOML file, from which editors find its schema in the same folder."""
+    return f"#:schema ./{schema_file_name(name)}"
 
 
 def rig_schema() -> dict[str, Any]:

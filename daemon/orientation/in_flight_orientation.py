@@ -48,6 +48,7 @@ def orientation_json(
         "format": FORMAT,
         "exposure": exposure.number,
         "simulated": exposure.simulated,
+        **({} if rig.is_calibrated else {"uncalibrated": True}),
         "places": PLACES,
         "angles": ANGLES,
         "antenna_m": list(mount.antenna_m),

@@ -52,6 +52,7 @@ def header_lines(about: OrientationSetInfo) -> list[str]:
     return [
         f"exterior orientation of mission {about.mission}, rig {about.rig.name}",
         *(["SIMULATED: emulated hardware, no survey"] if about.simulated else []),
+        *([] if about.rig.is_calibrated else ["UNCALIBRATED: the camera's geometry is nominal"]),
         f"trajectory: {about.trajectory}",
         f"coordinate system: {system.name} ({system.crs.name}), metres",
         f"heights: {system.height_system}",
@@ -195,5 +196,7 @@ def certificate(rig: Rig) -> Mapping[str, object]:
         "valid": (
             "for images stitched with this calibration, as long as quality.json of an exposure "
             "does not say CALIBRATION_EXPIRED"
-        ),
+        )
+        if rig.is_calibrated
+        else "not: the rig is uncalibrated, its values are nominal",
     }

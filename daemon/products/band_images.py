@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from daemon.mission.canonical_json import canonical_bytes
 from daemon.mission.exposure import Exposure
 from daemon.mission.layout import Mission
-from daemon.mission.store.level2 import pictures, simulated_mark
+from daemon.mission.store.level2 import pictures, product_marks
 from daemon.products.product_files import Contents, FramesRead, ProductFiles, report_json
 from processing.geometry.conditions import Conditions
 from processing.image.band_registration import RegisteredBand
@@ -71,7 +71,7 @@ def build_bands(
     report["units"] = dict(product.units)
     report["bands"] = [_registration(band) for band in product.registrations]
     contents: Contents = {}
-    mark = simulated_mark(report)
+    mark = product_marks(report)
     for cone in pipeline.rig.cones:
         name = cone.bands[0]
         if name not in product.bands:

@@ -100,12 +100,14 @@ def _frame_settings(settings: Mapping[str, float | int | str]) -> FrameSettings:
 
 
 def capture_flags(exposure: Exposure, rig: Rig) -> Flag:
-    """Flags of an exposure from capture, and whether its calibration was too old."""
+    """Flags of an exposure from capture, and whether its calibration is missing or too old."""
     return Flag(exposure.flags) | _calibration_flag(exposure, rig)
 
 
 def _calibration_flag(exposure: Exposure, rig: Rig) -> Flag:
-    """Whether the calibration was too old; one without a known time is not evaluated."""
+    """Missing or too old; the age at an exposure without a known time is not evaluated."""
+    if not rig.is_calibrated:
+        return Flag.UNCALIBRATED
     if exposure.mark_gps_ns is None:
         return Flag(0)
     flown = GPS_EPOCH + datetime.timedelta(seconds=exposure.mark_gps_ns // 1_000_000_000)

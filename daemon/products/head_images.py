@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from daemon.mission.canonical_json import canonical_bytes
 from daemon.mission.exposure import Exposure
 from daemon.mission.store.level0 import tiff_parts
-from daemon.mission.store.level2 import pictures, simulated_mark
+from daemon.mission.store.level2 import pictures, product_marks
 from daemon.products.product_files import Contents, FramesRead, ProductFiles, report_json
 from processing.geometry.conditions import Conditions
 from processing.pipelines.perspective import HeadPipeline, HeadsProduct
@@ -42,7 +42,7 @@ def build_heads(
             "f_mm": head.image.f_mm,
             "pitch_um": head.image.pitch_um,
             "geometry": "strict perspective, principal point at the centre",
-            **simulated_mark(report),
+            **product_marks(report),
         }
         contents[f"{name}.tif"] = tiff_parts(list(head.bands.values()), about)
     if product.heads:

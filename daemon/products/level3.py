@@ -153,7 +153,8 @@ def pansharpen(
         raise Level3Error(f"rig {rig.name} has no virtual image; there is no PAN to sharpen with")
     pan = _pan(mission, number)
     colour = _colour(mission, number)
-    is_simulated = read_description(mission.level2(number) / "pan.tif").get("simulated") is True
+    described = read_description(mission.level2(number) / "pan.tif")
+    marks = {key: True for key in ("simulated", "uncalibrated") if described.get(key) is True}
     try:
         sharp = pansharpened(pan, colour, rig.virtual_image.colour_ratio)
     except ValueError as error:
@@ -173,7 +174,7 @@ def pansharpen(
                     "bands": list(bands),
                     "exposure": number,
                     "level": 3,
-                    **({"simulated": True} if is_simulated else {}),
+                    **marks,
                     "tone_curve_sha256": tones.sha256 if depth == 8 else "",
                     "scale": [tones.scales[number].get(band, 1.0) for band in bands],
                 }

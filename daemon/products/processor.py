@@ -25,7 +25,7 @@ from daemon.products.product_files import FramesRead, ProductFiles
 from daemon.products.stitched_image import build_stitched
 from processing.pipelines.bands import BAND_THRESHOLDS, BandPipeline, BandPipelineSettings
 from processing.pipelines.exposure_pipeline import ExposurePipeline
-from processing.pipelines.perspective import HeadPipeline, HeadSettings, has_diverging_axes
+from processing.pipelines.perspective import HeadPipeline, HeadSettings, has_head_images
 from processing.pipelines.stitched import Conditions, Pipeline, PipelineSettings
 from processing.quality.report import Thresholds
 from processing.quality.requirements import QualityRequirements
@@ -107,7 +107,7 @@ def build_processor(
         "thresholds": replace(Thresholds(), **given),
         "requirements": quality_requirements_of(plan_file),
     }
-    if rig.virtual_image is None and not has_diverging_axes(rig):
+    if rig.virtual_image is None and not has_head_images(rig):
         radiance = radiance_of(rig, radiometry or own_radiance)
         common["thresholds"] = replace(BAND_THRESHOLDS, **given)
         pipeline = BandPipeline(rig, radiance, BandPipelineSettings(**common))

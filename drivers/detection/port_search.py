@@ -90,6 +90,7 @@ def search(
     baudrates: Sequence[int] = BAUDRATES,
     clock: Clock | None = None,
     open_port: PortOpener = open_serial_port,
+    timeout_s: float = SEARCH_TIMEOUT_S,
 ) -> list[DetectionResult]:
     """The device at every port; all ports are searched in parallel.
 
@@ -100,6 +101,7 @@ def search(
         baudrates: bit/s, in the order of the search.
         clock: of the listening times.
         open_port: opens a port with a baud rate and a parity.
+        timeout_s: after it, a port that is still being searched is reported as not answering.
 
     Returns:
         One result for each port, in the order of `ports`, without repeated ports.
@@ -114,10 +116,10 @@ def search(
     threads = [threading.Thread(target=search_port, args=(port,), daemon=True) for port in names]
     for thread in threads:
         thread.start()
-    deadline = time.monotonic() + SEARCH_TIMEOUT_S
+    deadline = time.monotonic() + timeout_s
     for thread in threads:
         thread.join(max(0.0, deadline - time.monotonic()))
-    stuck = f"did not answer within {SEARCH_TIMEOUT_S:g} s; unplug it, plug it in and try again"
+    stuck = f"did not answer within {timeout_s:g} s; unplug it, plug it in and try again"
     return [found.get(port, DetectionResult(port, None, sentence=stuck)) for port in names]
 
 

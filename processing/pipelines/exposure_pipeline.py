@@ -26,7 +26,7 @@ from processing.pipelines.stopwatch import Stopwatch
 from processing.quality.evaluation import evaluate
 from processing.quality.figures import FigureGroup, QualityFigures
 from processing.quality.figures.stitching import MethodFigures
-from processing.quality.report import QualityReport, Thresholds
+from processing.quality.report import NO_FLAGS, Flag, QualityReport, Thresholds
 from processing.quality.requirements import QualityRequirements
 from processing.quality.valid_area import ValidArea, valid_area_figures
 from processing.radiometry.level1 import Corrector, FrameStatistics, level1_from_level0
@@ -210,7 +210,7 @@ class ExposurePipeline(ABC, Generic[SettingsT, CorrectedT, AdjustedT, ImageT, Pr
         )
         return evaluate(
             figures,
-            capture_flags=conditions.flags,
+            capture_flags=conditions.flags | self._calibration_flag,
             missing_sensors=missing,
             missing_probes=temperatures.missing,
             probes_out_of_range=temperatures.out_of_range,
@@ -228,6 +228,10 @@ class ExposurePipeline(ABC, Generic[SettingsT, CorrectedT, AdjustedT, ImageT, Pr
         report: QualityReport,
     ) -> ProductT:
         """The result, with the seconds of all stages."""
+
+    @property
+    def _calibration_flag(self) -> Flag:
+        return NO_FLAGS if self.rig.is_calibrated else Flag.UNCALIBRATED
 
     def _missing(self, exposure: ExposureInput) -> tuple[str, ...]:
         return tuple(s.name for s in self.rig.sensors if s.name not in exposure.frames)

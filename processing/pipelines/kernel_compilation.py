@@ -17,7 +17,7 @@ from numba.core.dispatcher import Dispatcher
 
 from processing.pipelines.bands import BandPipeline
 from processing.pipelines.parallel_compilation import Progress, compile_recorded
-from processing.pipelines.perspective import HeadPipeline, has_diverging_axes
+from processing.pipelines.perspective import HeadPipeline, has_head_images
 from processing.pipelines.stitched import Pipeline, PipelineSettings
 from processing.pipelines.synthetic_frames import synthetic_radiometry
 from processing.radiometry.calibration import RadiometricCalibration
@@ -120,7 +120,7 @@ def compile_for(
     demosaic(np.zeros((8, 8), np.uint16), "RGGB", out=np.zeros((3, 8, 8), np.uint16))
     if rig.virtual_image is not None:
         Pipeline(rig, radiometry, settings).warm_up()
-    elif has_diverging_axes(rig):
+    elif has_head_images(rig):
         HeadPipeline(rig, radiometry).warm_up()
     else:
         BandPipeline(rig).warm_up()

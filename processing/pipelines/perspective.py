@@ -1,7 +1,8 @@
 """Each head of a rig as an image of its own, resampled once to strict perspective.
 
-For rigs with diverging axes (oblique heads) nothing is stitched: distortion, principal point and
-the drift of sensor and lens are taken out, and the image is a central perspective of `f_mm`.
+For rigs without a virtual image, such as oblique heads, nothing is stitched: distortion, principal
+point and the drift of sensor and lens are taken out, and the image is a central perspective of
+`f_mm`.
 
 Source: Jacobsen (2008) ("perfect perspective based on a resampling").
 """
@@ -85,20 +86,29 @@ class HeadsProduct:
     timings_s: Mapping[str, float] = field(default_factory=dict)
 
 
-def has_diverging_axes(rig: Rig) -> bool:
-    """Whether a rig without a virtual image has heads of which each is an image of its own.
+def has_head_images(rig: Rig) -> bool:
+    """Whether each head of a rig is an image of its own.
+
+    Without a virtual image, heads of one band each are registered to the colour master. Heads of
+    several bands, of the same band, with diverging axes, and PAN heads without colour are not.
 
     Args:
         rig: the camera.
 
     Returns:
-        True where a cone has several bands, or two optical axes differ by more than
-        `DIVERGING_AXES_RAD`; False for rigs with a virtual image.
+        False for rigs with a virtual image, which are stitched.
     """
     if rig.virtual_image is not None:
         return False
-    if any(len(cone.bands) > 1 for cone in rig.cones):
+    bands = [cone.bands for cone in rig.cones]
+    if any(len(one) > 1 for one in bands) or len(set(bands)) < len(bands):
         return True
+    is_pan = rig.colour_master_cone is None and bool(rig.pan_cones)
+    return is_pan or has_diverging_axes(rig)
+
+
+def has_diverging_axes(rig: Rig) -> bool:
+    """Whether the axes of two heads differ by more than `DIVERGING_AXES_RAD`."""
     axes = np.array([rotation_matrix(*c.rotation_rad)[:, 2] for c in rig.cones])
     return bool(np.arccos(np.clip(axes @ axes.T, -1.0, 1.0)).max() > DIVERGING_AXES_RAD)
 
@@ -158,7 +168,7 @@ _HeadStages = Stages[_CorrectedHeads, _Lattices, _Heads]
 class HeadPipeline(
     ExposurePipeline[HeadSettings, _CorrectedHeads, _Lattices, _Heads, HeadsProduct]
 ):
-    """A rig with diverging axes, and its radiometric calibrations.
+    """A rig whose heads are images of their own, and its radiometric calibrations.
 
     Args:
         rig: every cone has one sensor.

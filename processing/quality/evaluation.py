@@ -82,6 +82,11 @@ _CAPTURE: Final[Mapping[Flag, tuple[Verdict, str]]] = {
         Verdict.USABLE,
         "The calibration has expired; go on, and have the camera calibrated.",
     ),
+    Flag.UNCALIBRATED: (
+        Verdict.USABLE,
+        "The rig is uncalibrated: places in the image are nominal; calibrate the camera with this "
+        "flight, then process it again.",
+    ),
     Flag.OVERLAP: (
         Verdict.REFLY,
         "The overlap is below plan; fly this part of the line again.",

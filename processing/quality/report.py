@@ -48,6 +48,7 @@ class Flag(enum.IntFlag):
     GSD = 1 << 28
     FRAME_AMBIGUOUS = 1 << 29
     NOT_MIRRORED = 1 << 30
+    UNCALIBRATED = 1 << 31
 
 
 NO_FLAGS: Final = Flag(0)

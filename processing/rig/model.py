@@ -24,6 +24,9 @@ VIRTUAL_CAMERA: Final = "virtual"
 CALIBRATION_VALID_DAYS: Final = 730
 """Default of the rig file: customers require a calibration of the last two years."""
 
+UNCALIBRATED: Final = "uncalibrated"
+"""How the id of a rig without calibration begins; no calibration may have such an id."""
+
 SIDE_MAX_PX: Final = 65_535
 SENSOR_MAX_PIXELS: Final = 200_000_000
 IMAGE_MAX_PIXELS: Final = 500_000_000
@@ -275,7 +278,8 @@ class Rig:
     `master_cone` is None where all PAN heads converge and none of them is the virtual image plane:
     the virtual camera then stands in the middle of their projection centres. The calibration is
     trusted for `calibration_valid_days` after its date; `probe_serials` are those of the probes it
-    was made with.
+    was made with. The values of an uncalibrated rig are nominal: its `calibration_date` is empty,
+    and its `calibration_id` is `UNCALIBRATED` with a digest of the file.
     """
 
     name: str
@@ -344,6 +348,11 @@ class Rig:
     def sensors(self) -> tuple[Sensor, ...]:
         """All sensors in file order."""
         return tuple(sensor for cone in self.cones for sensor in cone.sensors)
+
+    @property
+    def is_calibrated(self) -> bool:
+        """Whether the rig file has the table `[calibration]`."""
+        return self.calibration_date != ""
 
     @property
     def serials(self) -> dict[str, str]:

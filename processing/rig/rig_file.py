@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import datetime
+import hashlib
+import json
 import stat
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
@@ -22,6 +25,7 @@ from processing.errors import ProcessingError
 from processing.rig.model import (
     CALIBRATION_VALID_DAYS,
     IMAGE_MAX_PIXELS,
+    UNCALIBRATED,
     Cone,
     Rig,
     Timing,
@@ -60,6 +64,12 @@ def _date(text: str) -> str:
     return text
 
 
+def _of_a_calibration(text: str) -> str:
+    if text.startswith(UNCALIBRATED):
+        raise ValueError("leave out [calibration] for a rig that is uncalibrated")
+    return text
+
+
 def _fitting(image: VirtualImage) -> VirtualImage:
     """An image of as many pixels as fit into memory, and of whole colour pixels."""
     if image.width_px * image.height_px > IMAGE_MAX_PIXELS:
@@ -82,9 +92,12 @@ class _Table(BaseModel):
 
 
 class CalibrationTable(_Table):
-    """The calibration of a rig; it is trusted for `valid_days` after its date."""
+    """The calibration of a rig; it is trusted for `valid_days` after its date.
 
-    id: Text
+    A rig without this table is uncalibrated: its values are nominal, and no exposure is `good`.
+    """
+
+    id: Annotated[Text, AfterValidator(_of_a_calibration)]
     date: Annotated[Text, AfterValidator(_date)]
     valid_days: Annotated[int, Strict(), Field(ge=1, le=2**53)] = CALIBRATION_VALID_DAYS
 
@@ -107,7 +120,7 @@ class RigFile(_Table):
     master_cone: ConeName | None = None
     colour_master_cone: ConeName | None = None
     reference_cone: Text
-    calibration: CalibrationTable
+    calibration: CalibrationTable | None = None
     virtual_image: Annotated[VirtualImage, AfterValidator(_fitting)] | None = None
     probe_serials: dict[str, Text] = {}
     defaults: DefaultsTable = DefaultsTable()
@@ -116,6 +129,7 @@ class RigFile(_Table):
     @property
     def rig(self) -> Rig:
         """The rig that the file describes."""
+        calibration = self.calibration
         return Rig(
             name=self.name,
             title=self.title,
@@ -124,9 +138,11 @@ class RigFile(_Table):
             master_cone=self.master_cone,
             colour_master_cone=self.colour_master_cone,
             reference_cone=self.reference_cone,
-            calibration_id=self.calibration.id,
-            calibration_date=self.calibration.date,
-            calibration_valid_days=self.calibration.valid_days,
+            calibration_id=UNCALIBRATED if calibration is None else calibration.id,
+            calibration_date="" if calibration is None else calibration.date,
+            calibration_valid_days=(
+                CALIBRATION_VALID_DAYS if calibration is None else calibration.valid_days
+            ),
             virtual_image=self.virtual_image,
             cones=self.cone,
             probe_serials=self.probe_serials,
@@ -226,7 +242,16 @@ def rig_from_mapping(content: Mapping[str, Any], file: str, line_of: LineOf | No
     findings += [*_lens_findings(content), *_name_findings(content, cones)]
     if rig_file is None or findings:
         raise RigError(sentences(findings, file, line_of))
-    return rig_file.rig
+    rig = rig_file.rig
+    if rig.is_calibrated:
+        return rig
+    return replace(rig, calibration_id=f"{UNCALIBRATED}-{_digest(content)}")
+
+
+def _digest(content: Mapping[str, Any]) -> str:
+    """Eight hexadecimal digits of the values of a file, whatever its form and comments."""
+    text = json.dumps(content, sort_keys=True, default=str)
+    return hashlib.sha256(text.encode("utf-8")).hexdigest()[:8]
 
 
 def _tables(content: Mapping[str, Any], key: str) -> list[Mapping[str, Any]]:

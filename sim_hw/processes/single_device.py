@@ -1,7 +1,7 @@
 """`python -m sim_hw.processes.single_device KIND --at WHERE`: one emulated device in a process of its own.
 
-For trying a driver, or a fault, without a rig. It moves straight north, is strobed once a second,
-prints "ready" as a JSON line, and ends with a signal or with its parent.
+For trying a driver, or a fault, without a rig. It moves straight north, is strobed once a second
+(unless `--no-strobe`), prints "ready" as a JSON line, and ends with a signal or with its parent.
 """
 
 from __future__ import annotations
@@ -65,6 +65,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         help="where it is found: a name for its serial port, the address of a head, HOST:PORT of a "
         "trigger unit",
     )
+    add("--no-strobe", action="store_true", help="no strobe, as without a trigger cable")
     add("--fault", action="append", default=[], metavar="NAME@TIME[,DURATION]")
     add("--scenario", type=Path, help="a file with faults")
     given = parser.parse_args(arguments)
@@ -88,7 +89,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     begin(time.monotonic_ns())
     print(json.dumps({"event": "ready", "kind": given.kind, "at": given.at}), flush=True)
     while not stopping.wait(STROBE_EVERY_S):
-        on_strobe()
+        if not given.no_strobe:
+            on_strobe()
     device.close()
     return 0
 

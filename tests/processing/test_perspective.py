@@ -11,7 +11,7 @@ from processing.geometry.conditions import Conditions
 from processing.pipelines.perspective import (
     HeadPipeline,
     HeadSettings,
-    has_diverging_axes,
+    has_head_images,
     perspective_of,
     raw_of_perspective,
 )
@@ -95,9 +95,9 @@ def _waves(cone: Cone, rig: Rig) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_only_rigs_whose_heads_have_diverging_axes_are_images_of_their_own() -> None:
-    assert has_diverging_axes(find_rig("midas"))
-    assert not has_diverging_axes(find_rig("rededge"))
-    assert not has_diverging_axes(find_rig("ultracam-x"))
+    assert has_head_images(find_rig("midas"))
+    assert not has_head_images(find_rig("rededge"))
+    assert not has_head_images(find_rig("ultracam-x"))
     with pytest.raises(ValueError, match="there is no"):
         HeadPipeline(find_rig("ultracam-x"))
 

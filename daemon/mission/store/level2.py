@@ -40,11 +40,13 @@ class ProductError(DaemonError, ValueError):
 
 
 SIMULATED = "SIMULATED"
-"""The flag of a quality report."""
+UNCALIBRATED = "UNCALIBRATED"
+"""Flags of a quality report that every product states."""
 
-_COMMENT = b"SIMULATED: emulated hardware, no survey"
-JPEG_COMMENT = b"\xff\xfe" + (len(_COMMENT) + 2).to_bytes(2, "big") + _COMMENT
-"""A comment segment, ITU-T T.81, B.2.4.5; it follows the marker that begins an image."""
+_COMMENTS = {
+    SIMULATED: b"SIMULATED: emulated hardware, no survey",
+    UNCALIBRATED: b"UNCALIBRATED: the geometry of the camera is nominal",
+}
 
 
 @dataclass(frozen=True)
@@ -88,7 +90,7 @@ def level2_contents(
         RecordError: a report that JSON cannot hold.
     """
     contents: dict[str, Sequence[bytes | memoryview]] = {}
-    mark = simulated_mark(report_json)
+    mark = product_marks(report_json)
     if pan is not None:
         contents["pan.tif"] = tiff_parts([pan], {"bands": ["pan"], "exposure": number, **mark})
     if colour:
@@ -249,19 +251,35 @@ def _npz(arrays: Mapping[str, NDArray[Any]]) -> bytes:
     return buffer.getvalue()
 
 
-def simulated_mark(report_json: Mapping[str, Any]) -> dict[str, bool]:
-    """Description of an image of emulated hardware; empty for any other."""
+def product_marks(report_json: Mapping[str, Any]) -> dict[str, bool]:
+    """What every product of emulated hardware, and of an uncalibrated rig, states of itself."""
     flags = report_json.get("flags")
-    return {"simulated": True} if isinstance(flags, list) and SIMULATED in flags else {}
+    return {
+        name.lower(): True
+        for name in (SIMULATED, UNCALIBRATED)
+        if isinstance(flags, list) and name in flags
+    }
+
+
+def jpeg_comment(text: bytes) -> bytes:
+    """A comment segment; it follows the marker that begins an image.
+
+    Source: ITU-T T.81, B.2.4.5.
+    """
+    return b"\xff\xfe" + (len(text) + 2).to_bytes(2, "big") + text
 
 
 def pictures(
     quicklook: NDArray[np.uint8], report_json: Mapping[str, Any]
 ) -> dict[str, Sequence[bytes | memoryview]]:
-    """The quick look and its thumbnail; those of emulated hardware say so in a comment."""
+    """The quick look and its thumbnail; comments have what `product_marks` states."""
     full_size, small = jpeg_bytes(quicklook), thumbnail_bytes(quicklook)
-    if simulated_mark(report_json):
-        full_size, small = (jpeg[:2] + JPEG_COMMENT + jpeg[2:] for jpeg in (full_size, small))
+    comments = b"".join(
+        jpeg_comment(text)
+        for name, text in _COMMENTS.items()
+        if name.lower() in product_marks(report_json)
+    )
+    full_size, small = (jpeg[:2] + comments + jpeg[2:] for jpeg in (full_size, small))
     return {"quicklook.jpg": [full_size], "thumbnail.jpg": [small]}
 
 

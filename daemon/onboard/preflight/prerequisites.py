@@ -77,7 +77,16 @@ def libraries(configuration: Configuration, rig: Rig) -> Iterator[CheckResult]:
 def calibration(configuration: Configuration, rig: Rig) -> Iterator[CheckResult]:
     """The age of the calibration, and its files of every sensor that flies."""
     name = rig.calibration_id
-    age_days = (_today() - datetime.date.fromisoformat(rig.calibration_date)).days
+    age_days = 0
+    if rig.is_calibrated:
+        age_days = (_today() - datetime.date.fromisoformat(rig.calibration_date)).days
+    else:
+        yield passed(
+            "calibration",
+            "rig",
+            f"caution: rig {rig.name} is uncalibrated; no exposure gets a better verdict than "
+            "usable. Calibrate the camera with its first flight",
+        )
     if age_days > rig.calibration_valid_days:
         yield failed(
             "calibration",
@@ -100,7 +109,7 @@ def calibration(configuration: Configuration, rig: Rig) -> Iterator[CheckResult]
             f"{folder} has no calibration of {', '.join(missing)}; add {missing[0]}.npz (or "
             f"{missing[0]}.json for radiance). Pixels of these heads are taken as ideal",
         )
-    elif age_days <= rig.calibration_valid_days:
+    elif rig.is_calibrated and age_days <= rig.calibration_valid_days:
         yield passed("calibration", name, date=rig.calibration_date)
 
 

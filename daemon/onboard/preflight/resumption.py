@@ -134,6 +134,8 @@ def rig_differences(flown: Path, configured: Path) -> list[str]:
 
 
 def _calibration_label(rig: Rig) -> str:
+    if not rig.is_calibrated:
+        return f"nominal values ({rig.calibration_id})"
     return f"calibration {rig.calibration_id} ({rig.calibration_date})"
 
 

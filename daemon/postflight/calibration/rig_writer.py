@@ -27,14 +27,15 @@ def rig_toml(rig: Rig, *, remark: str = "") -> bytes:
             "reference_cone": rig.reference_cone,
         }
     )
-    lines += ["", "[calibration]"]
-    lines += _pairs(
-        {
-            "id": rig.calibration_id,
-            "date": rig.calibration_date,
-            "valid_days": rig.calibration_valid_days,
-        }
-    )
+    if rig.is_calibrated:
+        lines += ["", "[calibration]"]
+        lines += _pairs(
+            {
+                "id": rig.calibration_id,
+                "date": rig.calibration_date,
+                "valid_days": rig.calibration_valid_days,
+            }
+        )
     if rig.virtual_image is not None:
         lines += ["", "[virtual_image]", *_pairs(_values(rig.virtual_image))]
     if rig.probe_serials:

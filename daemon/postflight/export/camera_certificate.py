@@ -16,7 +16,7 @@ from daemon.mission.exposure_batch import ExposureFailure
 from daemon.mission.layout import Mission
 from daemon.mission.store.durable import make_directories, replace_file
 from daemon.orientation.exterior_orientation import sealed_exposures
-from processing.pipelines.perspective import has_diverging_axes, perspective_of
+from processing.pipelines.perspective import has_head_images, perspective_of
 from processing.rig import Rig, VirtualImage, load_rig
 
 AXES = (
@@ -35,8 +35,14 @@ def certificate_of(rig: Rig) -> dict[str, Any]:
     """The certificate as JSON types.
 
     Raises:
-        CameraCertificateError: a rig whose bands are registered to one of them.
+        CameraCertificateError: an uncalibrated rig, or one whose bands are registered to one of
+            them.
     """
+    if not rig.is_calibrated:
+        raise CameraCertificateError(
+            f"rig {rig.name} is uncalibrated, so nothing can be certified; calibrate the camera, "
+            "then process the mission again with its rig file"
+        )
     if rig.virtual_image is not None:
         images = [("stitched PAN image", rig.virtual_image, [s.serial for s in rig.sensors])]
         if rig.colour_cones:
@@ -45,7 +51,7 @@ def certificate_of(rig: Rig) -> dict[str, Any]:
             "for images stitched with this calibration, as long as quality.json of an exposure "
             "does not say CALIBRATION_EXPIRED"
         )
-    elif has_diverging_axes(rig):
+    elif has_head_images(rig):
         images = [(c.name, perspective_of(c), [s.serial for s in c.sensors]) for c in rig.cones]
         valid = "for images resampled to strict perspective with this calibration"
     else:

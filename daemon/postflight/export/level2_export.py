@@ -173,7 +173,9 @@ def _shot(rig: Rig, picture: Level2Image, crs: str, *, simulated: bool) -> Pictu
         omega_phi_kappa_deg=eo.omega_phi_kappa_deg,
         centre_m=(east, north, height),
         crs=crs,
-        remark=("SIMULATED: " if simulated else "") + _REMARK,
+        remark=("SIMULATED: " if simulated else "")
+        + ("" if rig.is_calibrated else "UNCALIBRATED: ")
+        + _REMARK,
     )
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numba
 import numpy as np
 import pytest
@@ -21,17 +23,18 @@ from processing.quality.figures.stitching import MethodFigures
 from processing.quality.report import Flag, QualityReport, Thresholds, Verdict
 from processing.quality.requirements import QualityRequirements
 from processing.quality.valid_area import area_of
-from processing.rig import find_rig
+from processing.rig import Rig, find_rig
 
 RIG = find_rig("rededge")
+UNCALIBRATED = replace(RIG, calibration_date="")
 FRAMES = {sensor.name: np.zeros((2, 2), np.uint16) for sensor in RIG.sensors}
 
 
 class Recorded(ExposurePipeline[StageSettings, str, str, str, QualityReport]):
     """Records its stages; each hands on its name."""
 
-    def __init__(self, settings: StageSettings | None = None) -> None:
-        super().__init__(RIG, settings or StageSettings())
+    def __init__(self, settings: StageSettings | None = None, rig: Rig = RIG) -> None:
+        super().__init__(rig, settings or StageSettings())
         self.stages: list[str] = []
         self.threads = 0
 
@@ -118,3 +121,12 @@ def test_parts_of_a_stage_are_added_up(monkeypatch: pytest.MonkeyPatch) -> None:
         with clock.stage(stage):
             pass
     assert clock.seconds == {"radiometry": 0.75, "resampling": 2.0}
+
+
+def test_no_exposure_of_an_uncalibrated_rig_is_good() -> None:
+    """What only the pipeline knows: the conditions state nothing of a calibration."""
+    calibrated = Recorded().process(FRAMES, Conditions())
+    report = Recorded(rig=UNCALIBRATED).process(FRAMES, Conditions())
+    assert report.flags == calibrated.flags | Flag.UNCALIBRATED
+    assert report.verdict is not Verdict.GOOD
+    assert any("calibrate the camera" in finding.sentence for finding in report.findings)

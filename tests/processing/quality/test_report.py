@@ -165,7 +165,7 @@ def test_bits_keep_their_places_for_ever() -> None:
         *("TEMPERATURE_RANGE", "DC_DISAGREEMENT", "TIE_POINTS", "SIGMA0", "DISPLACED_SENSOR"),
         *("CALIBRATION_EXPIRED", "UNDEREXPOSED", "OVEREXPOSED", "BLUR", "TILT", "DRIFT"),
         *("OVERLAP", "GNSS", "DISK_LOW", "PROCESSING_BEHIND", "SIMULATED", "NOT_PROCESSED"),
-        *("TIME_HOLDOVER", "SUN", "GSD", "FRAME_AMBIGUOUS", "NOT_MIRRORED"),
+        *("TIME_HOLDOVER", "SUN", "GSD", "FRAME_AMBIGUOUS", "NOT_MIRRORED", "UNCALIBRATED"),
     ]
     assert {name: int(Flag[name]) for name in names} == {
         name: 1 << bit for bit, name in enumerate(names)

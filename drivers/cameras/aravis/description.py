@@ -1,0 +1,114 @@
+"""Description of a GenICam head for a new configuration: size, format and trigger of its frames."""
+
+from __future__ import annotations
+
+import gc
+import re
+from collections.abc import Iterable
+from typing import Any, Final
+
+from drivers.cameras.aravis.camera_access import local_interface, open_camera
+from drivers.cameras.aravis.discovery import FoundHead
+from drivers.cameras.aravis.feature_access import FeatureError, Features
+from drivers.cameras.aravis.formats import widest_format
+from drivers.cameras.aravis.gvcp import is_ip_address
+from drivers.cameras.aravis.library import OPENING, aravis_error, message_of
+from drivers.cameras.head_description import HeadDescription
+from drivers.contract import DeviceError
+
+FILTER_ARRAYS: Final = {"RG": "RGGB", "BG": "BGGR", "GR": "GRBG", "GB": "GBRG"}
+_FORMAT: Final = re.compile(r"(?:Mono|Bayer(RG|GR|GB|BG))(\d+)\w*")
+
+
+def describe(head: FoundHead) -> HeadDescription:
+    """Open a head, read its size and formats, and release it; nothing is written to it.
+
+    Raises:
+        DeviceError: it does not answer, another program controls it, or it has no usable format.
+    """
+    name = f"head {head.model or 'without model'} at {head.address}"
+    with OPENING:
+        is_address = is_ip_address(head.address)
+        interface = local_interface(name, head.address) if is_address else ""
+        camera = open_camera(name, interface, head.address)
+        try:
+            return _described(name, head, camera)
+        except (FeatureError, aravis_error()) as error:
+            raise DeviceError(
+                f"{name}: its properties cannot be read ({message_of(error)}); check power and "
+                "cable, then try again"
+            ) from None
+        finally:
+            del camera
+            gc.collect()
+
+
+def _described(name: str, head: FoundHead, camera: Any) -> HeadDescription:
+    device = camera.get_device()
+    if camera.is_gv_device() and not device.is_controller():
+        raise DeviceError(f"{name}: another program controls the head; end that program")
+    features = Features(device)
+    pixel_format = usual_format(features.entries("PixelFormat"))
+    if pixel_format is None:
+        raise DeviceError(
+            f"{name}: it has no pixel format of 8 to 16 bits, monochrome or Bayer; it cannot be used"
+        )
+    pattern, bits = _pattern_and_bits(pixel_format)
+    serial = head.serial or _text(camera.get_device_serial_number())
+    width, height = (int(features.get(key)) for key in ("Width", "Height"))
+    return HeadDescription(
+        driver="aravis",
+        model=head.model or _text(camera.get_model_name()),
+        serial=serial,
+        place=head.address,
+        width_px=width,
+        height_px=height,
+        pixel_format=pixel_format,
+        bits=bits,
+        filter_array=FILTER_ARRAYS.get(pattern, "none"),
+        full_width_px=_whole(features, "SensorWidth"),
+        full_height_px=_whole(features, "SensorHeight"),
+        settings={
+            "address": head.address,
+            **({"serial": serial} if serial else {}),
+            "pixel_format": pixel_format,
+            "width_px": width,
+            "height_px": height,
+        },
+    )
+
+
+def usual_format(offered: Iterable[str]) -> str | None:
+    """The pixel format to use: Bayer where the head has one pattern in its widest format.
+
+    A colour head also offers monochrome, which it computes from its pixels. A head that offers
+    several patterns is none.
+
+    Example:
+        >>> usual_format(["Mono8", "Mono12", "BayerRG8", "BayerRG12"])
+        'BayerRG12'
+    """
+    names = list(offered)
+    widest = widest_format(names)
+    raw = [name for name in names if name.startswith("Bayer") and _FORMAT.fullmatch(name)]
+    raw_widest = widest_format(raw)
+    if widest is None or raw_widest is None:
+        return widest
+    is_colour = len({_pattern_and_bits(name)[0] for name in raw}) == 1
+    has_all_bits = _pattern_and_bits(raw_widest)[1] == _pattern_and_bits(widest)[1]
+    return raw_widest if is_colour and has_all_bits else widest
+
+
+def _pattern_and_bits(pixel_format: str) -> tuple[str, int]:
+    found = _FORMAT.fullmatch(pixel_format)
+    assert found is not None, "widest_format returns no other name"
+    return found[1] or "", int(found[2])
+
+
+def _text(answer: object) -> str:
+    return "".join(c if c.isprintable() else "?" for c in str(answer or ""))
+
+
+def _whole(features: Features, name: str) -> int:
+    value = features.number(name) if features.is_available(name) else None
+    return int(value or 0)
