@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.live import Live
 
-from daemon.cli.exit_status import ExitStatus
+from daemon.cli.exit_status import ExitStatus, status_of
 from daemon.cli.find_ports import SearchProgress, result_table
 from daemon.cli.init_answers import GivenAnswers
-from daemon.cli.init_output import initialization_json, print_end, print_rig, status_after
+from daemon.cli.init_output import initialization_json, is_failed, print_end, print_rig
 from daemon.cli.init_questions import Questions
 from daemon.cli.options import AsJson
 from daemon.initialization.new_configuration import refuse_existing, write_configuration
@@ -138,7 +138,7 @@ def init(
         )
     else:
         print_end(console, folder, written, provisional, results)
-    raise typer.Exit(status_after(results))
+    raise typer.Exit(status_of(is_good=not is_failed(results)))
 
 
 def _trigger_unit(text: str | None) -> TriggerUnit | None:

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from daemon.cli.check import COLOURS
-from daemon.cli.exit_status import ExitStatus
 from daemon.cli.init_answers import optics
 from daemon.initialization.answers import Answers, field_of_view_deg
 from daemon.initialization.provisional import Assumption
@@ -41,11 +40,11 @@ def print_rig(console: Console, answers: Answers) -> None:
     console.print(table)
 
 
-def status_after(results: Sequence[CheckResult]) -> ExitStatus:
-    from daemon.onboard.preflight.check_results import CheckOutcome, worst_outcome
+def is_failed(results: Sequence[CheckResult]) -> bool:
+    """Whether an item of the check fails; one that is waiting does not."""
+    from daemon.onboard.preflight.check_results import CheckOutcome
 
-    is_failed = worst_outcome(results) is CheckOutcome.FAIL
-    return ExitStatus.PROBLEM if is_failed else ExitStatus.DONE
+    return any(one.outcome is CheckOutcome.FAIL for one in results)
 
 
 def print_end(
@@ -62,7 +61,7 @@ def print_end(
         table.add_row(*one)
     console.print(table)
     console.print(f"Written: {', '.join(str(path) for path in written)}", soft_wrap=True)
-    if status_after(results) is ExitStatus.PROBLEM:
+    if is_failed(results):
         console.print(
             f"Not ready; do as the sentences in red say, then: syntopic check {config} --fire",
             style="bold red",

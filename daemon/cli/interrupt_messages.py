@@ -38,7 +38,7 @@ SENTENCES = {
         "every file copied so far is complete, and nothing is removed before the copy is sealed; "
         f"{RETRY_HINT} to continue"
     ),
-    "init": f"rig.toml and service.toml are both complete or both as before; {RETRY_HINT}",
+    "init": f"both files of the rig are complete, or both are as before; {RETRY_HINT}",
     "kernels": f"the kernels compiled so far remain; {RETRY_HINT} to compile the others",
     "install": f"every file written so far is complete; {RETRY_HINT} to finish",
     "uninstall": f"every file left is complete; {RETRY_HINT} to finish",
