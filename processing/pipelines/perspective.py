@@ -108,7 +108,14 @@ def has_head_images(rig: Rig) -> bool:
 
 
 def has_diverging_axes(rig: Rig) -> bool:
-    """Whether the axes of two heads differ by more than `DIVERGING_AXES_RAD`."""
+    """Whether the heads of a rig look into different directions.
+
+    Args:
+        rig: the camera.
+
+    Returns:
+        True where two optical axes differ by more than `DIVERGING_AXES_RAD`.
+    """
     axes = np.array([rotation_matrix(*c.rotation_rad)[:, 2] for c in rig.cones])
     return bool(np.arccos(np.clip(axes @ axes.T, -1.0, 1.0)).max() > DIVERGING_AXES_RAD)
 
