@@ -15,7 +15,7 @@ _OBLIQUE_NAMES = ("nadir", "forward", "right", "backward", "left")
 
 
 @dataclass(frozen=True)
-class HeadMounting:
+class NominalMounting:
     """Name, projection centre in the body frame, and angles against the master, of a head."""
 
     name: str
@@ -27,7 +27,7 @@ class HeadMounting:
 class RigMounting:
     """All heads; the master; roll and pitch of the master's body axes against the vehicle's."""
 
-    heads: tuple[HeadMounting, ...]
+    heads: tuple[NominalMounting, ...]
     master: str
     boresight_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
@@ -56,7 +56,7 @@ def mounting_of(answers: Answers) -> RigMounting:
         else:
             position = (step * distance, 0.0, 0.0)
             rotation = (_signless(from_master * angle), 0.0, 0.0)
-        heads.append(HeadMounting(name, position, rotation))
+        heads.append(NominalMounting(name, position, rotation))
     tilt = (master - middle) * angle
     if answers.arrangement is Arrangement.FORE_AFT:
         # The master looks forward: its nose is up.
@@ -86,7 +86,7 @@ def _oblique(count: int, angle: float, distance: float) -> RigMounting:
         ((0.0, -d, 0.0), (0.0, a, 90.0)),
     )
     heads = tuple(
-        HeadMounting(name, *place)
+        NominalMounting(name, *place)
         for name, place in zip(_OBLIQUE_NAMES[:count], around[:count], strict=True)
     )
     return RigMounting(heads, "nadir")

@@ -20,7 +20,7 @@ def assumptions(
 ) -> list[Assumption]:
     """All assumptions of the files that are written for these answers."""
     found = [
-        Assumption("calibration", "none: every product says uncalibrated", "the first flight"),
+        Assumption("calibration", "none: every product is marked", "the first flight"),
         Assumption("lens distortion", "none", "the first flight"),
         Assumption("focal length", "as printed on the lens", "the first flight"),
         Assumption("exposure time", "1000 us", "exposure_time_us, or [exposure] control"),

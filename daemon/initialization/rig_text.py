@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from daemon.configuration.schemas import schema_line
 from daemon.initialization.answers import Answers, field_of_view_deg, side_mm
-from daemon.initialization.mounting import HeadMounting, RigMounting, mounting_of, radians
+from daemon.initialization.mounting import NominalMounting, RigMounting, mounting_of, radians
 from drivers.cameras.head_description import HeadDescription
 
 _BANDS_OF_FILTERS = ("red", "green", "blue")
@@ -59,7 +59,7 @@ def _title(answers: Answers) -> str:
 
 
 def _cone(answers: Answers, mounting: RigMounting, index: int, head: HeadDescription) -> list[str]:
-    place: HeadMounting = mounting.heads[index]
+    place: NominalMounting = mounting.heads[index]
     focal_mm, pixel_um = answers.focal_lengths_mm[index], answers.pixel_sizes_um[index]
     is_colour = head.filter_array != "none"
     width_mm, height_mm = side_mm(head, pixel_um)
@@ -96,7 +96,7 @@ def _cone(answers: Answers, mounting: RigMounting, index: int, head: HeadDescrip
     return lines
 
 
-def _rotation(place: HeadMounting) -> list[str]:
+def _rotation(place: NominalMounting) -> list[str]:
     angles = " ".join(f"{angle:g}" for angle in place.rotation_deg)
     return [
         f"rotation_rad = {_list(radians(place.rotation_deg))}",

@@ -23,6 +23,12 @@ _FORMAT: Final = re.compile(r"(?:Mono|Bayer(RG|GR|GB|BG))(\d+)\w*")
 def describe(head: FoundHead) -> HeadDescription:
     """Open a head, read its size and formats, and release it; nothing is written to it.
 
+    Args:
+        head: as the discovery found it; model and serial number may be empty.
+
+    Returns:
+        The head as it is set now.
+
     Raises:
         DeviceError: it does not answer, another program controls it, or it has no usable format.
     """
@@ -83,6 +89,12 @@ def usual_format(offered: Iterable[str]) -> str | None:
 
     A colour head also offers monochrome, which it computes from its pixels. A head that offers
     several patterns is none.
+
+    Args:
+        offered: GenICam names of pixel formats.
+
+    Returns:
+        The name of a format, or None if no format is supported.
 
     Example:
         >>> usual_format(["Mono8", "Mono12", "BayerRG8", "BayerRG12"])

@@ -17,6 +17,12 @@ _PATTERN_AT: Final = slice(1, 5)
 def describe(found: FoundNode) -> HeadDescription:
     """Open a capture node, read its size, formats and controls, and close it.
 
+    Args:
+        found: as the discovery found it.
+
+    Returns:
+        The head as it is set now.
+
     Raises:
         DeviceError: it does not answer, or has no usable format.
     """
