@@ -163,9 +163,7 @@ def test_an_existing_rig_is_refused_before_any_device_is_searched(
     assert (tmp_path / "service.toml").read_text() == "mine"
 
 
-def test_an_existing_rig_is_replaced_when_that_is_told(
-    connected: list[Any], tmp_path: Path
-) -> None:
+def test_an_existing_rig_is_replaced_on_request(connected: list[Any], tmp_path: Path) -> None:
     del connected[1]
     (tmp_path / "rig.toml").write_text("mine")
     assert run(str(tmp_path), *OPTICS, *QUIET, "--replace") == 0
