@@ -38,6 +38,9 @@ _DRIVER_PATHS: Final[Mapping[str, Mapping[str, str]]] = {
         "nmea": "drivers.receivers.nmea.navigator:NmeaNavigator",
         "novatel": "drivers.receivers.novatel.navigator:NovatelNavigator",
         "septentrio": "drivers.receivers.septentrio.navigator:SeptentrioNavigator",
+        "sbg": "drivers.receivers.sbg.navigator:SbgNavigator",
+        "vectornav": "drivers.receivers.vectornav.navigator:VectornavNavigator",
+        "xsens": "drivers.receivers.xsens.navigator:XsensNavigator",
         "mavlink": "drivers.receivers.mavlink.navigator:MavlinkNavigator",
     },
 }

@@ -20,11 +20,17 @@ from drivers.receivers.nmea.decoder import NmeaDecoder
 from drivers.receivers.nmea.navigator import NmeaNavigator
 from drivers.receivers.novatel.decoder import NovatelDecoder
 from drivers.receivers.novatel.navigator import NovatelNavigator
+from drivers.receivers.sbg.decoder import SbgDecoder
+from drivers.receivers.sbg.navigator import SbgNavigator
 from drivers.receivers.septentrio.decoder import SbfDecoder
 from drivers.receivers.septentrio.navigator import SeptentrioNavigator
 from drivers.receivers.streaming_navigator import StreamingNavigator
 from drivers.receivers.ublox.decoder import UbxDecoder
 from drivers.receivers.ublox.navigator import UbloxNavigator
+from drivers.receivers.vectornav.decoder import VectornavDecoder
+from drivers.receivers.vectornav.navigator import VectornavNavigator
+from drivers.receivers.xsens.decoder import XsensDecoder
+from drivers.receivers.xsens.navigator import XsensNavigator
 
 TEXT_BUFFER_NBYTES: Final = 20_000
 _GPSD: Final = re.compile(rb'(^|\n)\{"class": ?"VERSION", ?"release":')
@@ -56,6 +62,9 @@ _PROTOCOL_CANDIDATES: Final = (
     _ProtocolCandidate("ublox", UbloxNavigator, UbxDecoder),
     _ProtocolCandidate("septentrio", SeptentrioNavigator, SbfDecoder),
     _ProtocolCandidate("novatel", NovatelNavigator, NovatelDecoder),
+    _ProtocolCandidate("sbg", SbgNavigator, SbgDecoder),
+    _ProtocolCandidate("vectornav", VectornavNavigator, VectornavDecoder),
+    _ProtocolCandidate("xsens", XsensNavigator, XsensDecoder),
     _ProtocolCandidate("mavlink", MavlinkNavigator, MavlinkDecoder),
     _ProtocolCandidate("nmea", NmeaNavigator, NmeaDecoder),
 )

@@ -75,10 +75,11 @@ class MessageFramer:
 
     def _complete_message(self, buffer: bytes, at: int) -> int | None:
         size = self._size_of(buffer, at)
-        if not size:
-            return size
-        end = at + size
-        if end <= len(buffer) and not self._fits(buffer[at:end]):
+        if size == 0:
+            return 0
+        # Where the size is not known yet, all that came may belong to the message.
+        end = len(buffer) if size is None else at + size
+        if size is not None and end <= len(buffer) and not self._fits(buffer[at:end]):
             self.bad_frames += 1
             return 0
         # A message inside means that this start was not one, or that its length is damaged.

@@ -39,6 +39,8 @@ KINDS: Mapping[str, DeviceKind] = {
     "nmea": RECEIVER,
     "novatel": RECEIVER,
     "septentrio": RECEIVER,
+    "sbg": RECEIVER,
+    "vectornav": RECEIVER,
     "mavlink": RECEIVER,
     "modbus": THERMOMETER,
     "ascii": THERMOMETER,
@@ -146,6 +148,14 @@ def _line_device(
         from sim_hw.receivers.septentrio_receiver import SeptentrioReceiver
 
         return SeptentrioReceiver(clock, state, line=line)
+    if kind == "sbg":
+        from sim_hw.receivers.sbg_receiver import SbgReceiver
+
+        return SbgReceiver(clock, state, line=line)
+    if kind == "vectornav":
+        from sim_hw.receivers.vectornav_receiver import VectornavReceiver
+
+        return VectornavReceiver(clock, state, line=line)
     if kind == "mavlink":
         from sim_hw.receivers.mavlink_autopilot import MavlinkAutopilot
 

@@ -20,8 +20,10 @@ from sim_hw.receivers.emulated_receiver import EmulatedReceiver, ReceiverState
 from sim_hw.receivers.mavlink_autopilot import MavlinkAutopilot
 from sim_hw.receivers.nmea_receiver import NmeaReceiver
 from sim_hw.receivers.novatel_receiver import NovatelReceiver
+from sim_hw.receivers.sbg_receiver import SbgReceiver
 from sim_hw.receivers.septentrio_receiver import SeptentrioReceiver
 from sim_hw.receivers.ublox_receiver import UbloxReceiver
+from sim_hw.receivers.vectornav_receiver import VectornavReceiver
 from sim_hw.world.world_clock import WorldClock
 
 BAUDRATE = 115_200
@@ -32,6 +34,8 @@ _ON_A_SERIAL_LINE: dict[str, type[EmulatedReceiver]] = {
     "ublox": UbloxReceiver,
     "novatel": NovatelReceiver,
     "septentrio": SeptentrioReceiver,
+    "sbg": SbgReceiver,
+    "vectornav": VectornavReceiver,
     "nmea": NmeaReceiver,
 }
 RECEIVERS = (*_ON_A_SERIAL_LINE, "mavlink")

@@ -17,16 +17,20 @@ import pytest
 from drivers.contract import EventMark, NavSample
 from drivers.receivers.nmea.navigator import NmeaNavigator
 from drivers.receivers.novatel.navigator import NovatelNavigator
+from drivers.receivers.sbg.navigator import SbgNavigator
 from drivers.receivers.septentrio.navigator import SeptentrioNavigator
 from drivers.receivers.streaming_navigator import StreamingNavigator
 from drivers.receivers.ublox.navigator import UbloxNavigator
+from drivers.receivers.vectornav.navigator import VectornavNavigator
 from sim_hw.devices.network_line import TcpLine, UdpLine
 from sim_hw.devices.pseudo_terminal import PseudoTerminal
 from sim_hw.receivers.emulated_receiver import EmulatedReceiver, ReceiverState
 from sim_hw.receivers.nmea_receiver import NmeaReceiver
 from sim_hw.receivers.novatel_receiver import NovatelReceiver
+from sim_hw.receivers.sbg_receiver import SbgReceiver
 from sim_hw.receivers.septentrio_receiver import SeptentrioReceiver
 from sim_hw.receivers.ublox_receiver import UbloxReceiver
+from sim_hw.receivers.vectornav_receiver import VectornavReceiver
 from sim_hw.world.world_clock import WorldClock
 from tests.drivers.fakes import RecordingSink, running
 from tests.sim_hw.receiver_state import NS, STATE, WEEK_NS
@@ -43,10 +47,21 @@ PAIRS = {
     "novatel": (NovatelReceiver, NovatelNavigator),
     "septentrio": (SeptentrioReceiver, SeptentrioNavigator),
     "nmea": (NmeaReceiver, NmeaNavigator),
+    "sbg": (SbgReceiver, SbgNavigator),
+    "vectornav": (VectornavReceiver, VectornavNavigator),
 }
-MARKS_WITHIN_NS = {"ublox": 0, "novatel": 1, "septentrio": 1, "nmea": 500}
-"""The resolution of each protocol: NMEA resolves microseconds."""
-PLACE_WITHIN_M = {"ublox": 0.02, "novatel": 1e-3, "septentrio": 1e-3, "nmea": 0.06}
+MARKS_WITHIN_NS = {
+    "ublox": 0,
+    "novatel": 1,
+    "septentrio": 1,
+    "nmea": 500,
+    "sbg": 1000,
+    "vectornav": 0,
+}
+"""The resolution of each protocol: NMEA and the time stamps of SBG resolve microseconds."""
+PLACE_WITHIN_M = {
+    "ublox": 0.02, "novatel": 1e-3, "septentrio": 1e-3, "nmea": 0.06, "sbg": 1e-3, "vectornav": 1e-3,
+}  # fmt: skip
 
 
 def flying(gps_ns: int) -> ReceiverState:

@@ -17,14 +17,18 @@ from drivers.receivers.mavlink.decoder import MavlinkDecoder
 from drivers.receivers.message_decoder import MessageDecoder
 from drivers.receivers.nmea.decoder import NmeaDecoder
 from drivers.receivers.novatel.decoder import NovatelDecoder
+from drivers.receivers.sbg.decoder import SbgDecoder
 from drivers.receivers.septentrio.decoder import SbfDecoder
 from drivers.receivers.ublox.decoder import UbxDecoder
+from drivers.receivers.vectornav.decoder import VectornavDecoder
 from sim_hw.receivers.emulated_receiver import Edge, EmulatedReceiver
 from sim_hw.receivers.mavlink_autopilot import MavlinkAutopilot
 from sim_hw.receivers.nmea_receiver import NmeaReceiver
 from sim_hw.receivers.novatel_receiver import NovatelReceiver
+from sim_hw.receivers.sbg_receiver import SbgReceiver
 from sim_hw.receivers.septentrio_receiver import SeptentrioReceiver
 from sim_hw.receivers.ublox_receiver import UbloxReceiver
+from sim_hw.receivers.vectornav_receiver import VectornavReceiver
 from sim_hw.world.world_clock import WorldClock
 from tests.sim_hw.receiver_state import NS, START_GPS_NS, state_at
 
@@ -70,6 +74,8 @@ PROTOCOLS = {
     "ublox": Protocol(UbxDecoder, lambda: bytes_of(UbloxReceiver), 8_200),
     "novatel": Protocol(NovatelDecoder, lambda: bytes_of(NovatelReceiver), 8_500),
     "septentrio": Protocol(SbfDecoder, lambda: bytes_of(SeptentrioReceiver), 16_384),
+    "sbg": Protocol(SbgDecoder, lambda: bytes_of(SbgReceiver), 4_100),
+    "vectornav": Protocol(VectornavDecoder, lambda: bytes_of(VectornavReceiver), 4_100),
     "nmea": Protocol(NmeaDecoder, lambda: bytes_of(NmeaReceiver), 256),
     "mavlink": Protocol(MavlinkDecoder, bytes_of_autopilot, 300),
 }

@@ -134,3 +134,16 @@ def test_a_line_ends_with_a_line_feed_within_its_limit(
 ) -> None:
     assert line_size(line, 0, limit) == size
     assert line_size(b"xx" + line, 2, limit) == size
+
+
+def test_a_start_whose_size_is_not_known_yet_gives_way_to_a_whole_message_inside() -> None:
+    # `!` stands for a message whose size follows from a byte that is 9 bytes away.
+    def late_size_of(buffer: bytes, at: int) -> int | None:
+        if buffer[at : at + 1] == b"!":
+            return None if len(buffer) < at + 10 else 10
+        return size_of(buffer, at)
+
+    framer_under_test = MessageFramer(b"$!", late_size_of, lambda m: sum(m[:-1]) & 0xFF == m[-1])
+    assert framer_under_test.feed(b"!x") == []
+    assert framer_under_test.feed(ONE) == [ONE]
+    assert counted(framer_under_test) == (1, 1, 2, 0)

@@ -20,7 +20,17 @@ def test_there_are_the_drivers_of_the_first_flight() -> None:
         "trigger": ("pulse-bus", "software", "gige-action"),
         "thermometer": ("modbus-rtu", "ascii-line", "host"),
         "pps": ("kernel",),
-        "navigator": ("ublox", "gpsd", "nmea", "novatel", "septentrio", "mavlink"),
+        "navigator": (
+            "ublox",
+            "gpsd",
+            "nmea",
+            "novatel",
+            "septentrio",
+            "sbg",
+            "vectornav",
+            "xsens",
+            "mavlink",
+        ),
     }
 
 

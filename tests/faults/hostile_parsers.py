@@ -22,8 +22,12 @@ from drivers.receivers.gpsd.reports import GpsdReports
 from drivers.receivers.message_decoder import MessageDecoder
 from drivers.receivers.nmea.decoder import NmeaDecoder
 from drivers.receivers.novatel.decoder import NovatelDecoder
+from drivers.receivers.sbg.decoder import SbgDecoder
+from drivers.receivers.sbg.framing import crc as sbg_crc
 from drivers.receivers.septentrio.decoder import SbfDecoder
 from drivers.receivers.ublox.decoder import UbxDecoder
+from drivers.receivers.vectornav.decoder import VectornavDecoder
+from drivers.receivers.xsens.decoder import XsensDecoder
 from drivers.thermometers.ascii_line.thermometer import AsciiLineThermometer
 from drivers.thermometers.modbus_rtu.frames import crc16, find_reply
 from drivers.triggers.pulse_bus import PulseBusTrigger
@@ -34,8 +38,10 @@ from sim_hw.receivers.mavlink_autopilot import MavlinkAutopilot
 from sim_hw.receivers.mavlink_messages import by_number, x25
 from sim_hw.receivers.nmea_receiver import NmeaReceiver
 from sim_hw.receivers.novatel_receiver import NovatelReceiver
+from sim_hw.receivers.sbg_receiver import SbgReceiver
 from sim_hw.receivers.septentrio_receiver import SeptentrioReceiver
 from sim_hw.receivers.ublox_receiver import UbloxReceiver
+from sim_hw.receivers.vectornav_receiver import VectornavReceiver
 from sim_hw.world.world_clock import WorldClock
 from tests.drivers.fakes import FakeClock
 
@@ -144,6 +150,26 @@ def reseal_sbf(message: bytearray) -> bytes:
     return bytes(message)
 
 
+def reseal_sbg(message: bytearray) -> bytes:
+    message[:2] = b"\xff\x5a"
+    message[4:6] = struct.pack("<H", max(len(message) - 9, 0))
+    message[-3:] = struct.pack("<HB", sbg_crc(bytes(message[2:-3])), 0x33)
+    return bytes(message)
+
+
+def reseal_vectornav(message: bytearray) -> bytes:
+    message[:1] = b"\xfa"
+    message[-2:] = struct.pack(">H", binascii.crc_hqx(bytes(message[1:-2]), 0))
+    return bytes(message)
+
+
+def reseal_xsens(message: bytearray) -> bytes:
+    message[:2] = b"\xfa\xff"
+    message[3] = min(max(len(message) - 5, 0), 254)
+    message[-1] = -sum(message[1:-1]) & 0xFF
+    return bytes(message)
+
+
 def reseal_mavlink(message: bytearray) -> bytes:
     message[0], message[2] = 0xFD, 0
     message[1] = max(len(message) - 12, 0) & 0xFF
@@ -226,6 +252,28 @@ def novatel() -> Parser:
 
 def septentrio() -> Parser:
     return _receiver("septentrio", SeptentrioReceiver, SbfDecoder("r"), reseal_sbf, 0.15)
+
+
+def sbg() -> Parser:
+    return _receiver("sbg", SbgReceiver, SbgDecoder("r"), reseal_sbg, 0.15)
+
+
+def vectornav() -> Parser:
+    return _receiver("vectornav", VectornavReceiver, VectornavDecoder("r"), reseal_vectornav, 0.15)
+
+
+def xsens() -> Parser:
+    from tests.drivers import test_xsens as mtdata2
+
+    marked = mtdata2.message(
+        mtdata2.utc(),
+        mtdata2.fine(),
+        mtdata2.trigger(mtdata2.FINE),
+        mtdata2.status(),
+        mtdata2.place(),
+    )
+    stream = mtdata2.GNSS + mtdata2.POSITION + marked
+    return _decoding("xsens", stream, XsensDecoder("r"), reseal_xsens, 0.1)
 
 
 def mavlink() -> Parser:
@@ -465,6 +513,9 @@ PARSERS: Mapping[str, Callable[[], Parser]] = {
     "nmea": nmea,
     "novatel": novatel,
     "septentrio": septentrio,
+    "sbg": sbg,
+    "vectornav": vectornav,
+    "xsens": xsens,
     "mavlink": mavlink,
     "gpsd": gpsd,
     "ascii-line": ascii_line,

@@ -24,6 +24,9 @@ NATIVE_SUFFIXES = {
     "ublox": "ubx",
     "novatel": "gps",
     "septentrio": "sbf",
+    "sbg": "sbg",
+    "vectornav": "vnb",
+    "xsens": "mtb",
     "nmea": "nmea",
     "mavlink": "raw",
 }
