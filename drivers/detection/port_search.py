@@ -234,7 +234,8 @@ class _Search:
                         )
                         return DetectionResult(self._port, detected, baudrate, parity)
             except LineLostError:
-                # Pseudo-terminals refuse parity late, with the first read.
+                # Quirk: pseudo-terminals refuse parity late, with the first read.
+                # Upstream: pyserial/pyserial#196.
                 continue
             finally:
                 line.close()

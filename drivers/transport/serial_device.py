@@ -155,6 +155,9 @@ class SerialLine:
             waiting = self._port.in_waiting if data else 0
             if waiting:
                 data += bytes(self._port.read(waiting))
+        # Quirk: pyserial raises termios.error or OSError for a device that was unplugged, and
+        # TypeError for a port that another thread closes.
+        # Upstream: pyserial/pyserial#401, pyserial/pyserial#417, pyserial/pyserial#713.
         except (serial.SerialException, OSError, termios.error, TypeError) as error:
             raise LineLostError(_reason(error)) from error
         return data
@@ -218,6 +221,7 @@ def open_serial_port(path: str, baudrate: int, parity: str) -> SerialPort:
         )
     except (serial.SerialException, OSError, termios.error, ValueError) as error:
         number = getattr(error, "errno", None) or (error.args[0] if error.args else None)
+        # Quirk: a pseudo-terminal refuses parity. Upstream: pyserial/pyserial#196.
         if number == errno.EINVAL and parity != "N":
             hint = f'parity {parity} is refused, as a pseudo-terminal does; set parity = "N" there'
         elif number == errno.ENOENT:
@@ -238,7 +242,9 @@ def open_serial_port(path: str, baudrate: int, parity: str) -> SerialPort:
 
 
 def _lock_port(port: serial.Serial) -> None:
-    """Make the kernel refuse the port to programs that ignore locks, such as gpsd."""
+    """Make the kernel refuse the port to other programs."""
+    # Quirk: pyserial's exclusive access is an flock, which programs such as gpsd ignore.
+    # Upstream: pyserial/pyserial#206, jclark/satpulse#117.
     # A driver without terminal settings refuses this; the lock itself is set.
     with suppress(OSError):
         fcntl.ioctl(port.fileno(), termios.TIOCEXCL)

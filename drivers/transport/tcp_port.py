@@ -46,7 +46,8 @@ class TcpPort:
             OSError: the other end closed or the connection broke.
         """
         if not self._buffer:
-            # A time-out of 0 would mean "non-blocking" to a socket, with another exception.
+            # Quirk: a time-out of 0 makes a socket non-blocking, with another exception.
+            # Upstream: manual: Python, socket, section Notes on socket timeouts.
             self._connection.settimeout(max(self.timeout, 1e-3))
             try:
                 self._buffer = self._connection.recv(CHUNK_NBYTES)

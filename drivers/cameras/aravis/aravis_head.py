@@ -278,9 +278,9 @@ class AravisHead(AravisSettings, HeadDevice):
                     f"{self.name} at {self.address}: another program has had control of the head "
                     f"for {self.control_wait_limit_s:g} s, so it is running; end that program"
                 )
-            # Wait without a request in between, since a head may take it for a heartbeat of the
-            # dead controller. Only an attempt to take control shows whether the head is free: some
-            # heads leave the register unchanged.
+            # Quirk: some heads take a request for a heartbeat of the dead controller, and leave the
+            # register unchanged when they release control. The wait has no request in between, and
+            # an attempt to take control ends it. Upstream: no report known (2026-11-23).
             left_s = (deadline_ns - self.clock.mono_ns()) * 1e-9
             pause_s = self._heartbeat_s() + CONTROL_WAIT_MARGIN_S
             self.clock.wait(self._closing, max(0.0, min(pause_s, left_s)) + CONTROL_WAIT_MARGIN_S)
@@ -472,7 +472,8 @@ class AravisHead(AravisSettings, HeadDevice):
         self.counters.update(self._of_stream)
         self._of_stream = Counter()
         if session.is_lost and self._closing.is_set():
-            # Aravis sends three release requests to a dead head, 2.5 s each; closing does not wait.
+            # Quirk: Aravis sends three release requests to a dead head, 2.5 s each. Closing does not
+            # wait for them. Upstream: no report known (2026-11-23).
             threading.Thread(
                 target=self._close_session, args=(session,), name=f"{self.name}-let-go", daemon=True
             ).start()

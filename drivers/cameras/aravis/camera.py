@@ -134,13 +134,12 @@ class AravisCamera:
 
     @property
     def has_lost_control(self) -> bool:
-        """Whether Aravis' heartbeat has found that the head no longer accepts control.
-
-        The state is polled. The signal "control-lost" is not used: while it is emitted, the
-        heartbeat's thread holds a reference to the device. If the driver released the device in
-        that time, this reference would be the last one. The thread would then join itself, and
-        GLib aborts.
-        """
+        """Whether Aravis' heartbeat has found that the head no longer accepts control."""
+        # Quirk: while the signal "control-lost" is emitted, the heartbeat's thread holds a
+        # reference to the device. If the driver releases the device in that time, the thread joins
+        # itself and GLib aborts. The state is polled instead.
+        # Upstream: AravisProject/aravis#50 for the stream's thread; for the heartbeat's, no report
+        # known (2026-11-23).
         camera = self._camera
         return bool(camera.is_gv_device() and not camera.get_device().is_controller())
 
@@ -181,7 +180,9 @@ class AravisCamera:
             return 0
 
     def fire_test_packet(self) -> None:
-        """Make the head send a test packet to the stream's port; some heads cannot."""
+        """Make the head send a test packet to the stream's port, if it can."""
+        # Quirk: some heads send no test packet, among them Aravis' fake camera.
+        # Upstream: AravisProject/aravis#278, AravisProject/aravis#1047.
         with contextlib.suppress(aravis_error()):
             self._camera.get_device().execute_command("ArvGevSCPSFireTestPacket")
 
@@ -303,6 +304,8 @@ class AravisCamera:
             try:
                 identity[key] = str(ask() or "")
             except (failed, UnicodeDecodeError):
+                # Quirk: PyGObject raises UnicodeDecodeError for a text of the head that is not
+                # UTF-8. The text is left empty. Upstream: no report known (2026-11-23).
                 identity[key] = ""
         if settings.serial and identity["serial"] != settings.serial:
             raise DeviceError(
@@ -364,6 +367,8 @@ class AravisCamera:
         try:
             size = settings.packet_size
             if size == 0:
+                # Quirk: the size that Aravis finds may exceed what the path transports. The
+                # setting packet_size_limit bounds it. Upstream: AravisProject/aravis#1065.
                 size = min(int(camera.gv_auto_packet_size()), settings.packet_size_limit)
             camera.gv_set_packet_size(size)
         except aravis_error() as error:
@@ -371,7 +376,7 @@ class AravisCamera:
                 f"packet_size = {settings.packet_size} is refused ({message_of(error)}); set 0, or "
                 "a size that the network transports"
             )
-        # The size is final; otherwise Aravis would negotiate again when the stream is created.
+        # The size is final: it is not negotiated again when the stream is created.
         camera.gv_set_packet_size_adjustment(library.GvPacketSizeAdjustment.NEVER)
         options = library.GvStreamOption
         camera.gv_set_stream_options(
@@ -391,8 +396,10 @@ class AravisCamera:
     def _find_latch(self) -> tuple[str, str, bool] | None:
         """Command and value features of the clock, and whether the value is in ns (SFNC 2).
 
-        Some heads list a latch that they refuse to execute; they have no clock.
+        None if the head has no clock.
         """
+        # Quirk: some heads list a latch that they refuse to execute; they have no clock.
+        # Upstream: no report known (2026-11-23).
         for command, value, is_ns in CLOCKS:
             if self._features.kind(command) == "command" and self._features.is_available(value):
                 with contextlib.suppress(FeatureError):

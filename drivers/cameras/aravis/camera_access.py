@@ -49,7 +49,8 @@ def open_camera(head_name: str, interface: str, address: str) -> Any:
     try:
         if not interface:
             return library.Camera.new(address)
-        # Not by name: Aravis would use the address of any discovery reply.
+        # Quirk: by name, Aravis opens the address of any discovery reply, also of a forged one. The
+        # head is opened by its address. Upstream: no report known (2026-11-23).
         gio = inet_address()
         device = library.GvDevice.new(gio.new_from_string(interface), gio.new_from_string(address))
         return library.Camera.new_with_device(device)

@@ -100,6 +100,8 @@ class Features:
         Returns:
             False also if the head does not answer.
         """
+        # Quirk: Aravis writes features that the head's description locks. The lock is checked here.
+        # Upstream: AravisProject/aravis#826.
         if not self.is_available(name) or self.is_locked(name):
             return False
         try:
@@ -190,6 +192,8 @@ class Features:
         except self._failed as error:
             raise FeatureError(f"{name} cannot be read: {message_of(error)}") from None
         except UnicodeDecodeError:
+            # Quirk: PyGObject raises UnicodeDecodeError for a text that is not UTF-8.
+            # Upstream: no report known (2026-11-23).
             raise FeatureError(f"{name} is no text in UTF-8") from None
         raise FeatureError(f"the head has no feature {name}")
 

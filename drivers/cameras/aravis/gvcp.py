@@ -1,7 +1,5 @@
 """GVCP requests without Aravis: presence, control privilege, heartbeat and action commands.
 
-Aravis needs 2.5 s to detect that a head does not answer. It reports no error if another controller
-has control. Reading a register beforehand detects both at once. Aravis 0.8 has no action commands.
 All other access to a head uses Aravis.
 
 Source: GigE Vision 2.0, sections 14.3.1 (READREG), 14.5 (ACTION) and 28.1 (control channel
@@ -58,8 +56,8 @@ def is_ip_address(address: str) -> bool:
 def control_privilege(address: str, *, timeout_s: float) -> int | None:
     """The head's control channel privilege.
 
-    Faults of the head or network never raise. Some heads take any read of this register for a
-    heartbeat of their controller. So it must not be polled while waiting for another controller.
+    Faults of the head or network never raise. The register must not be polled while waiting for
+    another controller.
 
     Args:
         address: IPv4 address of the head.
@@ -71,6 +69,12 @@ def control_privilege(address: str, *, timeout_s: float) -> int | None:
 
     Source: GigE Vision 2.0, sections 14.3.1 and 28.1.
     """
+    # Quirk: Aravis needs 2.5 s to detect that a head does not answer. This answers in `timeout_s`.
+    # Upstream: AravisProject/aravis#459.
+    # Quirk: Aravis reports no error if another controller has control. It is asked for here before
+    # a head is opened. Upstream: AravisProject/aravis#382, AravisProject/aravis#1012.
+    # Quirk: some heads, Aravis' fake camera among them, take any read of this register for a
+    # heartbeat of their controller. Upstream: no report known (2026-11-23).
     answer = _read_register(address, CONTROL_CHANNEL_PRIVILEGE, timeout_s)
     if answer is None:
         return None
@@ -123,6 +127,7 @@ def send_action(
 
     Source: GigE Vision 2.0, section 14.5.
     """
+    # Quirk: Aravis 0.8 has no action commands. Upstream: AravisProject/aravis#184.
     body = struct.pack(">III", keys.device_key, keys.group_key, keys.group_mask)
     flags = ACK_REQUIRED
     if device_ns is not None:

@@ -306,7 +306,8 @@ class HeadConfiguration:
         selectors = features.entries("TriggerSelector")
         frame_trigger = features.first_entry("TriggerSelector", FRAME_TRIGGERS)
         if selectors == [ACQUISITION_TRIGGER]:
-            # Basler scout and pilot: the only trigger there is starts every single frame.
+            # Quirk: the only trigger of Basler scout and pilot starts every single frame.
+            # Upstream: manual: GenICam description of Basler scA1300-32gm, TriggerSelector.
             frame_trigger = ACQUISITION_TRIGGER
         if selectors and frame_trigger is None:
             self.refusals.append(
@@ -330,7 +331,9 @@ class HeadConfiguration:
             "line": ("trigger_line", settings.trigger_line),
             "action": ("trigger_action", settings.trigger_action),
         }[settings.trigger_source]
-        # Some heads accept a source only while the trigger is off, others only while it is on.
+        # Quirk: some heads accept a source only while the trigger is off, others only while it is
+        # on. It is written in both states.
+        # Upstream: no report known (2026-11-23); on the order of features, AravisProject/aravis#560.
         with contextlib.suppress(FeatureError):
             features.set("TriggerSource", source)
         self._set("trigger_source", "TriggerMode", "On", "the head cannot be triggered")
@@ -390,7 +393,8 @@ class HeadConfiguration:
             ("action_group_key", "ActionGroupKey"),
             ("action_group_mask", "ActionGroupMask"),
         ):
-            # Heads do not return their keys.
+            # Quirk: heads do not return their keys, so they are not read back.
+            # Upstream: manual: GenICam SFNC 2.7, ActionDeviceKey.
             value = int(getattr(settings, key))
             self._try(
                 f"{key} = {value!r}",

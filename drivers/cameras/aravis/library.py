@@ -8,9 +8,11 @@ from typing import Any, Final
 
 from drivers.base.extras import missing
 
+# Quirk: Aravis 0.8.26 parses a head's description with global state. Heads that are opened in
+# parallel miss features or cause a segmentation fault, so one head is opened at a time.
+# Upstream: AravisProject/aravis#159.
 OPENING: Final = threading.Lock()
-"""Held while a head is opened and configured. Aravis 0.8.26 parses a head's description with global
-state. Two heads that are opened in parallel miss features or cause a segmentation fault."""
+"""Held while a head is opened and configured."""
 
 
 @functools.cache

@@ -1,8 +1,7 @@
 """Only the head's own datagrams reach Aravis; those of other senders are dropped and counted.
 
-Aravis 0.8 accepts datagrams of any sender on its control and stream sockets (`arvgvdevice.c`,
-`arvgvstream.c`). Its packet socket filters by address, but not by port. This module makes the
-kernel filter Aravis' own sockets. A forged address of the head is not detected.
+This module makes the kernel filter Aravis' own sockets. A forged address of the head is not
+detected.
 """
 
 from __future__ import annotations
@@ -144,11 +143,12 @@ class SocketCapture:
 class ControlSocketFilter:
     """Filters the control socket of an opened head: only its GVCP port is accepted.
 
-    The socket is filtered, not connected: a connected socket fails on ICMP errors, which any host
-    can forge.
+    The socket is filtered, not connected.
     """
 
     def __init__(self, control: socket.socket, address: str, port: int) -> None:
+        # Quirk: a connected UDP socket fails on ICMP errors, which any host can forge.
+        # Upstream: manual: Linux, net/ipv4/udp.c, __udp4_lib_err.
         self._control = control
         filter_by_source(control, address, port)
 
@@ -284,6 +284,8 @@ def filter_by_source(udp: socket.socket, address: str, port: int | None = None) 
     Raises:
         OSError: the kernel refuses the filter.
     """
+    # Quirk: Aravis 0.8 accepts datagrams of any sender on its control and stream sockets.
+    # Upstream: no report known (2026-11-23); src/arvgvdevice.c, src/arvgvstream.c.
     conditions = [(LOAD_WORD, IP_HEADER + 12, JUMP_EQUAL, _as_number(address))]
     if port is not None:
         conditions.append((LOAD_HALF, 0, JUMP_EQUAL, port))
@@ -293,7 +295,7 @@ def filter_by_source(udp: socket.socket, address: str, port: int | None = None) 
 def filter_packet_sockets(known: set[str], source: tuple[str, int], to: tuple[str, int]) -> int:
     """Restrict new packet sockets of this process to the datagrams of one stream.
 
-    Only unfragmented datagrams are accepted. Replaces the filter of Aravis.
+    Only unfragmented datagrams are accepted.
 
     Args:
         known: inodes of the sockets that are left alone.
@@ -303,6 +305,8 @@ def filter_packet_sockets(known: set[str], source: tuple[str, int], to: tuple[st
     Returns:
         Number of sockets.
     """
+    # Quirk: Aravis' own filter ignores the source port. It is replaced.
+    # Upstream: AravisProject/aravis#697.
     program = [
         (LOAD_HALF, 12, JUMP_EQUAL, 0x0800),
         (LOAD_BYTE, 14, JUMP_EQUAL, 0x45),

@@ -88,7 +88,8 @@ def _write_rate(
         held = features.number(PACKET_DELAY)
         return {PACKET_DELAY: int(held)} if held else {}
     if features.text("BandwidthControlMode") == STREAM_BYTES:
-        # Allied Vision: in this mode the pause has no effect.
+        # Quirk: in this mode of Allied Vision heads the pause has no effect.
+        # Upstream: manual: GenICam description of Mako G-234B, BandwidthControlMode.
         return _write_limit(features, STREAM_BYTES, rate_mbps)
     if features.is_writable(PACKET_DELAY):
         ticks = packet_delay_ticks(packet_size, rate_mbps, settings.head_link_mbps, tick_hz)

@@ -25,6 +25,9 @@ from drivers.cameras.aravis.settings import AravisSettings
 from drivers.cameras.pixels import Packing, bytes_at, packed_nbytes, unpack, words_at
 from drivers.contract import DeviceError, FrameMemory
 
+# Quirk: Aravis counts an underrun for every packet that finds no buffer. Underruns in frames are
+# computed from the number of packets of a frame.
+# Upstream: no report known (2026-11-23); _find_frame_data in src/arvgvstream.c.
 STATISTIC_NAMES: Final = {
     "n_underruns": "underrun_packets",
     "n_resend_requests": "resend_requests",
@@ -36,7 +39,7 @@ STATISTIC_NAMES: Final = {
     "n_error_packets": "error_packets",
     "n_transferred_bytes": "bytes",
 }
-"""Aravis' statistics and their names here. Aravis counts underruns in packets, not frames."""
+"""Aravis' statistics and their names here."""
 ALIGNMENT: Final = 8
 GVSP_OVERHEAD_NBYTES: Final = 36
 """IP, UDP and GVSP headers, which are part of the packet size."""
@@ -146,7 +149,8 @@ class FrameStream:
         if buffer is None:
             return None
         reason = str(buffer.get_status().value_nick)
-        # Aravis prints a warning when the size of an aborted frame is read.
+        # Quirk: Aravis prints a warning when the size of an aborted frame is read. It is read of
+        # complete frames only. Upstream: no report known (2026-11-23).
         is_complete = reason == "success"
         if is_complete:
             self._ignored = self._ignored_packets()
@@ -205,12 +209,15 @@ class FrameStream:
     def restart_if_behind(self) -> bool:
         """Restart the stream if Aravis takes the head's frames for old ones and drops them.
 
-        Aravis drops up to 100 frames after a block number that was too large, or if the head counts
-        from 1 again. The sign is a complete frame of ignored packets with no frame delivered since.
+        The sign is a complete frame of ignored packets with no frame delivered since.
 
         Returns:
             Whether it was restarted.
         """
+        # Quirk: Aravis drops up to 100 frames after a block number that was too large, or if the
+        # head counts from 1 again. The stream is restarted.
+        # Upstream: no report known (2026-11-23); ARV_GV_STREAM_DISCARD_LATE_FRAME_THRESHOLD in
+        # src/arvgvstream.c.
         if self._ignored_packets() - self._ignored < self._packets_per_frame:
             return False
         self._stream.stop_thread(False)
@@ -224,8 +231,9 @@ class FrameStream:
         weak = self._stream.weak_ref()
         self._stream = None
         gc.collect()
-        # Dropping the last reference stops the stream's thread. If a reference were left, the
-        # thread would write into slots that are in use again; so it is stopped explicitly.
+        # Quirk: the stream's thread ends only with the last reference to the stream. If one were
+        # left, it would write into slots that are in use again, so it is stopped explicitly.
+        # Upstream: AravisProject/aravis#50, AravisProject/aravis#141.
         left = weak()
         if left is not None:
             left.stop_thread(False)
@@ -261,7 +269,9 @@ class FrameStream:
         socket_nbytes = min(settings.socket_buffer_bytes, receive_buffer_limit())
         stream.set_property("socket-buffer", library.GvStreamSocketBuffer.FIXED)
         stream.set_property("socket-buffer-size", socket_nbytes)
-        # Aravis enlarges its receive buffer only after a first frame has begun, and loses that one.
+        # Quirk: Aravis enlarges its receive buffer only after a first frame has begun, and loses
+        # that one. The driver sets the buffer itself.
+        # Upstream: no report known (2026-11-23); _update_socket in src/arvgvstream.c.
         if self._senders is not None:
             self._senders.set_receive_buffer(socket_nbytes)
         stream.set_property("packet-resend", library.GvStreamPacketResend.ALWAYS)

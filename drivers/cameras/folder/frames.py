@@ -100,6 +100,8 @@ def read_frame(path: Path, *, max_nbytes: int) -> FrameFile:
                 )
             pixels = page.asarray()
             description = str(page.description)[:MAX_DESCRIPTION]
+    # Quirk: tifffile raises many kinds of exceptions for damaged files, not only its own.
+    # Upstream: cgohlke/tifffile#227.
     except (
         TiffFileError,
         OSError,

@@ -318,6 +318,9 @@ class VideoNode:
             offset=int(planes[0].data_offset) if self.is_multi_planar else 0,
             nbytes=int(planes[0].bytesused if self.is_multi_planar else buffer.bytesused),
             sequence=int(buffer.sequence),
+            # Quirk: a corrupted buffer has its full size; only the flag shows the error.
+            # Upstream: manual: Linux, Documentation/userspace-api/media/v4l/buffer.rst,
+            # V4L2_BUF_FLAG_ERROR.
             has_error=bool(flags & uapi.BUF_FLAG_ERROR),
             stamp_ns=stamp.tv_sec * NS_PER_S + stamp.tv_usec * NS_PER_US
             if clock == uapi.BUF_FLAG_TIMESTAMP_MONOTONIC

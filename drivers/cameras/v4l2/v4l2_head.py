@@ -23,6 +23,8 @@ from drivers.errors import DriverError
 
 WAIT_STEP_S: Final = 0.1
 TRIGGER_TIMEOUT_S: Final = 1.0
+# Quirk: vivid stamps the end of a frame up to 34 ms ahead of the host's clock. Stamps somewhat
+# ahead are accepted. Upstream: no report known (2026-11-23).
 STAMP_AHEAD_NS: Final = 1_000_000_000
 """Stamps of the end of a frame may lie somewhat ahead; a second is none of this world."""
 STAMP_BEHIND_NS: Final = 60_000_000_000
@@ -349,6 +351,9 @@ class V4l2Head(V4l2Settings, HeadDevice):
             try:
                 session.camera.node.queue(index)
             except OSError as error:
+                # Quirk: a driver may refuse a buffer once and accept it later.
+                # Upstream: manual: Linux, Documentation/admin-guide/media/vivid.rst, section Error
+                # Injection Controls.
                 self.counters["queue_failures"] += 1
                 if error.errno != errno.EINVAL or tries + 1 >= QUEUE_ATTEMPTS:
                     raise
@@ -367,7 +372,9 @@ class V4l2Head(V4l2Settings, HeadDevice):
         try:
             node.stream_off()
         except OSError:
-            # A lost head refuses; its mappings have to go all the same, or it never comes back.
+            # Quirk: a lost head refuses to stop. Its mappings are released all the same, or its node
+            # never comes back. Upstream: manual: Linux, Documentation/driver-api/media/v4l2-dev.rst,
+            # section video device cleanup; realsenseai/librealsense#406.
             self.counters["stop_failures"] += 1
         node.close()
 

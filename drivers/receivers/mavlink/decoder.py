@@ -263,7 +263,8 @@ class MavlinkDecoder(MessageDecoder):
         if self._gps is None:
             return "none", None, (None, None, None), self._undulation_m
         received_ms, gps = self._gps
-        # Extensions: zero where the autopilot does not send them.
+        # Quirk: extensions are zero where the autopilot does not send them.
+        # Upstream: manual: MAVLink, guide, section Message Extensions.
         undulation_m = (
             (gps.alt_ellipsoid - gps.alt) * 1e-3 if gps.alt_ellipsoid else self._undulation_m
         )

@@ -40,6 +40,8 @@ class MavlinkParser:
     def __init__(self) -> None:
         self._dialect = dialect()
         self._parser = self._dialect.MAVLink(None)
+        # Quirk: pymavlink raises other exceptions than its own for invalid content.
+        # Upstream: dronekit/dronekit-python#263.
         self.errors: tuple[type[Exception], ...] = (
             self._dialect.MAVError,
             ValueError,

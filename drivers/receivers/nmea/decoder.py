@@ -89,6 +89,8 @@ class NmeaDecoder(MessageDecoder):
         if has_checksum(message):
             self._checked += 1
         elif is_proprietary(message):
+            # Quirk: some manufacturers send their own sentences without a checksum.
+            # Upstream: no report known (2026-11-23).
             return []
         else:
             # A receiver that sends checksums sends them always: this one was damaged.
@@ -203,6 +205,8 @@ class NmeaDecoder(MessageDecoder):
         valid = True
         if epoch.day is not None:
             day = epoch.day
+            # Quirk: receivers with an old firmware send dates of 1024 weeks ago.
+            # Upstream: openvehicles/Open-Vehicle-Monitoring-System-3#284.
             if day < self._not_before_day:
                 self.counters["dates_rolled_over"] += 1
                 day += -((day - self._not_before_day) // ROLL_OVER_DAYS) * ROLL_OVER_DAYS
@@ -232,8 +236,9 @@ class NmeaDecoder(MessageDecoder):
         by_gps_day = start + (of_day + leap * SECOND_NS) % DAY_NS
         gps_ns, valid = by_utc_day, True
         if self._gps_ns is not None:
-            # In the last seconds of a UTC day the GPS day is the next one already, and whose day
-            # and week the sentence gives differs by receiver: navigation decides.
+            # Quirk: in the last seconds of a UTC day the GPS day is the next one already, and whose
+            # day and week the sentence gives differs by receiver. Navigation decides.
+            # Upstream: no report known (2026-11-23).
             near = self._gps_ns
             gps_ns = min((by_utc_day, by_gps_day), key=lambda at: abs(at - near))
             valid = self.is_near_navigation(gps_ns)

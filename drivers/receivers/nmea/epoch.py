@@ -190,7 +190,8 @@ class Epoch:
         self._heights(fields[9:11])
 
     def _gll(self, fields: Fields) -> None:
-        # Older than version 2.3: neither time nor status.
+        # Quirk: before version 2.3, GLL has neither time nor status.
+        # Upstream: manual: gpsd's NMEA Revealed, GLL.
         if self._mode(fields[6], fields[7] if len(fields) > 7 else ""):
             self._set_position(fields[1:5], rank=1)
 
@@ -207,7 +208,8 @@ class Epoch:
             self.day = day_number(year, month, day)
 
     def _vtg(self, fields: Fields) -> None:
-        # Before version 2: "course,speed in knots" without letters between them.
+        # Quirk: before version 2, VTG has course and speed in knots without letters between them.
+        # Upstream: manual: gpsd's NMEA Revealed, VTG.
         if len(fields) > 2 and fields[2] not in ("T", ""):
             fields = [fields[0], fields[1], "T", "", "", fields[3], "N", ""]
         course, knots = number_or_none(fields[1]), number_or_none(fields[5])

@@ -14,10 +14,13 @@ from typing import Final
 
 from drivers.timescales.gps_time import GPS_EPOCH_DAY, SECOND_NS
 
+# Quirk: receivers of high precision send sentences longer than the standard's 82 characters.
+# Upstream: no report known (2026-11-23).
 MAX_LENGTH: Final = 256
-"""The standard limit is 82; receivers of high precision send more."""
+# Quirk: receivers without a fix send 99.99, 50.00 or 0 as dilution of precision.
+# Upstream: wellenvogel/esp32-nmea2000#38 (99.99).
 DOP_UNKNOWN_FROM: Final = 50.0
-"""Receivers without a fix send 99.99, 50.00 or 0."""
+"""A larger dilution of precision means that it is unknown."""
 
 _NUMBER: Final = re.compile(r"[-+]?[0-9]{0,15}(\.[0-9]{0,20})?")
 _TIME: Final = re.compile(r"([0-9]{2})([0-9]{2})([0-9]{2})(?:\.([0-9]{0,9}))?")

@@ -40,8 +40,10 @@ LENGTHS: Final = {
 FIXES: Final = {0: "none", 1: "dead-reckoning", 2: "2d", 3: "3d", 4: "3d", 5: "time"}
 TIME_BASE_RECEIVER: Final = 0
 TIME_BASE_UTC: Final = 2
+# Quirk: an M8T reports 255, "unknown", for leap seconds that it received. Only 0 means a default.
+# Upstream: no report known (2026-11-23).
 LEAP_SOURCE_DEFAULT: Final = 0
-"""Of NAV-TIMELS: the firmware's own guess. An M8T reports 255, "unknown", for received ones."""
+"""Of NAV-TIMELS: the firmware's own guess."""
 ATTITUDE_HISTORY_LENGTH: Final = 64
 ACCURACY_UNKNOWN: Final = 0xFFFFFFFF
 """What hAcc, vAcc and sAcc hold before the receiver can estimate them."""
@@ -56,6 +58,8 @@ class UbxDecoder(MessageDecoder):
     raises.
     """
 
+    # Quirk: pyubx2 raises KeyError and AttributeError for some contents, not only its own errors.
+    # Upstream: semuconsulting/pyubx2#79, semuconsulting/pyubx2#109.
     decode_errors = (
         UBXMessageError,
         UBXParseError,
@@ -246,7 +250,8 @@ class UbxDecoder(MessageDecoder):
                 gps_ns=gps_ns,
                 accuracy_ns=int(message.accEst),
                 count=int(message.count),
-                # The receiver counts rising edges only.
+                # Quirk: the receiver counts rising edges only; falling ones have no count.
+                # Upstream: manual: UBX-13003221, section 32.19, UBX-TIM-TM2, count.
                 count_bits=0 if self._is_falling else 16,
                 time_valid=valid,
                 mono_ns=mono_ns,

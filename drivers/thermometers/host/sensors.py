@@ -42,6 +42,8 @@ class HostSensor:
     @property
     def aliases(self) -> tuple[str, ...]:
         """The names of the sensor in a configuration, the shortest first."""
+        # Quirk: the number of a hwmon chip changes from boot to boot. It is not part of a name.
+        # Upstream: no report known (2026-11-23).
         channels = (self.channel, self.label) if self.label else (self.channel,)
         chips = (self.chip, f"{self.chip}@{self.device}") if self.device else (self.chip,)
         return tuple(f"{chip}/{channel}" for chip in chips for channel in channels)

@@ -99,6 +99,8 @@ def find_reply(
     Returns:
         The reply; None if there is none yet.
     """
+    # Quirk: some RS-485 adapters return the request as an echo. It is skipped.
+    # Upstream: stephane/libmodbus#380.
     for start in range(len(received) - 4):
         if received[start] != unit:
             continue

@@ -29,7 +29,8 @@ _WRITE, _READ = 1, 2
 
 
 def _request(direction: int, number: int) -> int:
-    # The kernel's header uses the size of the pointer, not of the structure.
+    # Quirk: the kernel's header uses the size of the pointer, not of the structure.
+    # Upstream: manual: Linux, include/uapi/linux/pps.h, PPS_GETPARAMS to PPS_FETCH.
     return direction << 30 | _POINTER << 16 | ord("p") << 8 | number
 
 
@@ -126,6 +127,8 @@ class KernelPps:
         Returns:
             False if the path is gone or leads to another device.
         """
+        # Quirk: a wait for an edge does not end if the source is removed.
+        # Upstream: no report known (2026-11-23).
         try:
             return os.path.samestat(Path(self._path).stat(), os.fstat(self._fd))
         except FileNotFoundError:
