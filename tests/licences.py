@@ -1,7 +1,7 @@
 """`python -m tests.licences`: the licence of everything in requirements.lock, and what may not be.
 
 Licences are those the installed packages state of themselves. `--write` writes
-docs/reference/licences.md; without it the exit status is 1 where a licence is on no list or the
+docs/reference/contributing/licences.md; without it the exit status is 1 where a licence is on no list or the
 page is not current.
 """
 
@@ -20,7 +20,7 @@ from packaging.markers import Marker
 from packaging.requirements import Requirement
 
 ROOT: Final = Path(__file__).parents[1]
-PAGE: Final = ROOT / "docs/reference/licences.md"
+PAGE: Final = ROOT / "docs/reference/contributing/licences.md"
 
 PERMISSIVE: Final = frozenset(
     {
@@ -122,7 +122,7 @@ def stated(expression: str, text: str, classifiers: Iterable[str]) -> str:
 
 
 def page(found: Iterable[Package]) -> str:
-    """The page docs/reference/licences.md."""
+    """The page docs/reference/contributing/licences.md."""
     listed = sorted(found, key=lambda package: package.name)
     lines = [
         "# Licences",

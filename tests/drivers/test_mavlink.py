@@ -79,6 +79,12 @@ class Bus:
             boot_ms, math.cos(half), 0, 0, math.sin(half), 0, 0, 0,
         ))  # fmt: skip
 
+    def feedback(self, time_us: int, number: int, *, flags: int = 0) -> bytes:
+        return self.pack_message(dialect.MAVLink_camera_feedback_message(
+            time_us, 1, 2, number, 475_000_000, 85_000_000, 952.5, 500.0, 0.0, 0.0, 10.0, 0.0, flags,
+            number,
+        ))  # fmt: skip
+
     def trigger(self, time_us: int, number: int) -> bytes:
         return self.pack_message(dialect.MAVLink_camera_trigger_message(time_us, number))
 
@@ -156,6 +162,33 @@ def test_before_utc_is_known_there_is_no_sample_and_no_valid_mark() -> None:
     ]
     assert decoder.counters["samples_without_time"] == 1
     assert decoder.counters["marks_without_time"] == 1
+
+
+def test_a_camera_feedback_is_a_mark_in_utc_with_its_own_count() -> None:
+    bus = Bus()
+    begun = bus.heartbeat() + bus.system_time() + bus.position()
+    (mark,) = marks(begun + bus.feedback(UNIX_US + 250_000, 65_535))
+    assert (mark.channel, mark.gps_ns) == (2, GPS_NS + 250_000_000)
+    assert (mark.count, mark.count_bits, mark.time_valid) == (65_535, 16, True)
+
+
+@pytest.mark.parametrize(("time_us", "flags"), [(0, 0), (5_000_000, 0), (UNIX_US, 4)])
+def test_a_camera_feedback_without_utc_or_without_a_pulse_is_not_valid(
+    time_us: int, flags: int
+) -> None:
+    bus = Bus()
+    begun = bus.heartbeat() + bus.system_time() + bus.position()
+    (mark,) = marks(begun + bus.feedback(time_us, 1, flags=flags))
+    assert not mark.time_valid
+
+
+def test_a_camera_feedback_next_to_triggers_is_no_second_mark() -> None:
+    bus = Bus()
+    begun = bus.heartbeat() + bus.system_time() + bus.position()
+    found = marks(
+        begun + bus.trigger(UNIX_US, 1) + bus.feedback(UNIX_US, 1) + bus.trigger(UNIX_US + 9, 2)
+    )
+    assert [(m.count, m.count_bits) for m in found] == [(1, 32), (2, 32)]
 
 
 def test_a_trigger_in_utc_and_one_since_start_are_marks_at_gps_time() -> None:

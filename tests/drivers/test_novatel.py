@@ -269,3 +269,50 @@ def test_a_log_has_a_body_of_8192_bytes_at_most(nbytes: int, is_framed: bool) ->
     # A longer one costs itself, and no log behind it.
     assert (decoder.bad_bytes == 0) is is_framed
     assert len(marks(long + mark_time(10.0))) == 1
+
+
+def position_mark(identity: int, ms: int, *, status: int = 180) -> bytes:
+    body = struct.pack("<II3df4x3f4x2fBB6x", 0, 16, 47.5, 8.5, 950.0, 50.0, 3.0, 4.0, 0.9, 0.0, 0.0,
+                       20, 17)  # fmt: skip
+    return log(identity, body, ms=ms, status=status)
+
+
+def test_a_mark_time_of_oem6_is_a_mark_of_the_first_input() -> None:
+    data = log(231, struct.pack("<I4dI", WEEK, 100.25, 1e-6, 3e-9, -18.0, 0))
+    (mark,) = marks(data)
+    assert (mark.channel, mark.gps_ns) == (1, WEEK * WEEK_NS + 100_250_000_000 - 1000)
+    parser = oem.Parser()
+    parser.write(data)
+    (theirs,) = list(parser)
+    assert (type(theirs).__name__.partition("_")[0], theirs.seconds) == ("MARKTIME", 100.25)
+    twice = data + mark_time(100.25, 1e-6)
+    assert len(marks(twice)) == 1
+
+
+@pytest.mark.parametrize(("identity", "channel"), [(181, 1), (615, 2), (1738, 3), (1739, 4)])
+def test_a_mark_position_alone_is_a_coarse_mark_a_second_later(identity: int, channel: int) -> None:
+    data = position_mark(identity, 100_250)
+    decoder, records = decode(data + pva(507, 101.249))
+    assert not [r for r in records if isinstance(r, EventMark)]
+    (mark,) = [r for r in decoder.feed(pva(507, 101.25), 78) if isinstance(r, EventMark)]
+    assert (mark.channel, mark.gps_ns) == (channel, WEEK * WEEK_NS + 100_250_000_000)
+    assert (mark.accuracy_ns, mark.time_valid, mark.mono_ns) == (1_000_000, True, 77)
+    assert decoder.counters["marks_coarse"] == 1
+    parser = oem.Parser()
+    parser.write(data)
+    (theirs,) = list(parser)
+    assert type(theirs).__name__.startswith("MARK") and "POS" in type(theirs).__name__
+
+
+@pytest.mark.parametrize("order", ["time-first", "position-first"])
+def test_a_mark_position_of_a_mark_time_is_no_second_mark(order: str) -> None:
+    parts = [mark_time(100.2504), position_mark(181, 100_250)]
+    data = b"".join(parts if order == "time-first" else parts[::-1]) + pva(507, 102.0)
+    decoder, _ = decode(data)
+    assert [m.accuracy_ns for m in marks(data)] == [100]
+    assert decoder.counters["marks_coarse"] == 0
+
+
+def test_a_mark_position_before_the_time_is_good_is_not_valid() -> None:
+    data = position_mark(181, 100_250, status=UNKNOWN) + pva(507, 102.0)
+    assert [m.time_valid for m in marks(data)] == [False]

@@ -38,6 +38,7 @@ from daemon.onboard.service.messages import (
 )
 from daemon.onboard.service.startup import capture_process, frame_rings, worker_process
 from daemon.onboard.service.supervisor import Supervisor
+from drivers.base.device_support import is_from_manual_only, proof_summary
 from drivers.contract import (
     DeviceEvent,
     EventMark,
@@ -255,6 +256,8 @@ class SystemCheck:
             if problem is not None:
                 return failed(spec.kind, spec.name, problem, is_blocking=True)
             properties = {"driver": spec.driver, **found}
+            if proofs := proof_summary(spec.kind, spec.driver):
+                properties["proof"] = proofs
             return CheckResult(spec.kind, spec.name, CheckOutcome.PASS, found=properties)
         timeout_sentence = (
             f"no answer within {BIND_TIMEOUT_S:g} s while opening it; check its power and cable"
@@ -300,9 +303,14 @@ class SystemCheck:
             sentence = f"receivers of driver {spec.driver} have no event marks"
             return CheckResult("stream", name, CheckOutcome.NOT_TRIED, sentence)
         if f"mark {spec.name}" in self._data:
-            return passed("stream", name)
+            return passed("stream", name, self._mark_note(spec))
         sentence = f"receiver {spec.name} gave no event mark of the exposure"
         return failed("stream", name, f"{sentence}; {MARK_ACTION}")
+
+    def _mark_note(self, spec: DeviceSpec) -> str:
+        if not is_from_manual_only(spec.kind, spec.driver, "event marks"):
+            return ""
+        return f"marks of driver {spec.driver} are decoded from the manual only"
 
     def _frame(self, head: str) -> CheckResult:
         name = f"frame of {head}"

@@ -35,6 +35,10 @@ QUATERNION_MAX_AGE_MS: Final = 1_000
 ATTITUDE_GAP_MS: Final = 500
 """Between attitudes further apart nothing is interpolated."""
 COUNT_BITS: Final = 32
+FEEDBACK_COUNT_BITS: Final = 16
+OPEN_LOOP: Final = 4
+"""CAMERA_FEEDBACK of a command: no pulse of the camera has been seen."""
+UNIX_FROM_2000_US: Final = 946_684_800_000_000
 
 Sigmas = tuple[float | None, float | None, float | None]
 
@@ -55,9 +59,9 @@ class MavlinkDecoder(MessageDecoder):
 
     GLOBAL_POSITION_INT becomes a NavSample with the attitude of ATTITUDE_QUATERNION, or of ATTITUDE
     where that does not come, at its instant, fix and accuracy of GPS_RAW_INT; CAMERA_TRIGGER
-    becomes an EventMark. SYSTEM_TIME ties the autopilot's clock to GPS time. HIGHRES_IMU is checked
-    and counted. Messages of other systems on the bus are counted and left alone. Nothing that is
-    fed raises.
+    becomes an EventMark, and so does CAMERA_FEEDBACK where no CAMERA_TRIGGER comes. SYSTEM_TIME
+    ties the autopilot's clock to GPS time. HIGHRES_IMU is checked and counted. Messages of other
+    systems on the bus are counted and left alone. Nothing that is fed raises.
     """
 
     def __init__(
@@ -72,7 +76,7 @@ class MavlinkDecoder(MessageDecoder):
         super().__init__(
             receiver,
             self._parser.framer(),
-            ("samples", "samples_without_time", "marks", "marks_far", "marks_without_time",
+            ("samples", "samples_without_time", "marks", "marks_far", "marks_without_time", "marks_open_loop",
              "messages_of_others", "messages_lost", "clock_steps"),
         )  # fmt: skip
         self.decode_errors = self._parser.errors
@@ -101,6 +105,7 @@ class MavlinkDecoder(MessageDecoder):
             "HIGHRES_IMU": self._on_imu,
             "GPS_RAW_INT": self._on_gps,
             "CAMERA_TRIGGER": self._on_trigger,
+            "CAMERA_FEEDBACK": self._on_feedback,
             "SYSTEM_TIME": self._on_system_time,
             "TIMESYNC": self._on_timesync,
             "HEARTBEAT": lambda message, mono_ns: [],
@@ -315,10 +320,36 @@ class MavlinkDecoder(MessageDecoder):
         return []
 
     def _on_trigger(self, message: Any, mono_ns: int) -> list[Nav]:
-        known = self.clock.gps_of_us(message.time_usec)
-        if known is None:
+        return self._mark(message.time_usec, 0, (int(message.seq), COUNT_BITS), mono_ns)
+
+    def _on_feedback(self, message: Any, mono_ns: int) -> list[Nav]:
+        if self.seen["CAMERA_TRIGGER"]:
+            return []
+        is_utc = message.time_usec >= UNIX_FROM_2000_US
+        self.counters["marks_open_loop"] += message.flags == OPEN_LOOP
+        return self._mark(
+            message.time_usec,
+            int(message.cam_idx),
+            (int(message.img_idx), FEEDBACK_COUNT_BITS),
+            mono_ns,
+            # Before the first fix its time is zero; it never counts from the start.
+            is_trusted=is_utc and message.flags != OPEN_LOOP,
+        )
+
+    def _mark(
+        self,
+        time_us: int,
+        channel: int,
+        count: tuple[int, int],
+        mono_ns: int,
+        *,
+        is_trusted: bool = True,
+    ) -> list[Nav]:
+        """A mark of a time in UTC or since the start; `count` is a number and its bits."""
+        known = self.clock.gps_of_us(time_us)
+        if known is None or not is_trusted:
             self.counters["marks_without_time"] += 1
-            gps_ns, sigma_ns, valid = message.time_usec * 1000, self.clock.utc_sigma_ns, False
+            gps_ns, sigma_ns, valid = time_us * 1000, self.clock.utc_sigma_ns, False
         else:
             gps_ns, sigma_ns = known
             valid = self.is_near_navigation(gps_ns)
@@ -326,11 +357,11 @@ class MavlinkDecoder(MessageDecoder):
         return [
             EventMark(
                 receiver=self.receiver,
-                channel=0,
+                channel=channel,
                 gps_ns=gps_ns,
                 accuracy_ns=round(math.hypot(self._mark_accuracy_ns, sigma_ns)),
-                count=int(message.seq),
-                count_bits=COUNT_BITS,
+                count=count[0],
+                count_bits=count[1],
                 time_valid=valid,
                 mono_ns=mono_ns,
             )

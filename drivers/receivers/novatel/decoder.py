@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import math
 import struct
-from collections import Counter
+from collections import Counter, deque
+from dataclasses import replace
 from typing import Any, Final
 
 from drivers.contract import POSITION_FIXES, EventMark, NavSample, Velocity
@@ -20,6 +21,7 @@ from drivers.timescales.gps_time import RECENT_NS, SECOND_NS, WEEK_NS
 
 NAMES: Final = {
     42: "BESTPOS", 99: "BESTVEL", 101: "TIME", 507: "INSPVA", 508: "INSPVAS", 1465: "INSPVAX",
+    231: "MARKTIME", 181: "MARKPOS", 615: "MARK2POS", 1738: "MARK3POS", 1739: "MARK4POS",
     1130: "MARK1TIME", 616: "MARK2TIME", 1075: "MARK3TIME", 1076: "MARK4TIME",
     1067: "MARK1PVA", 1068: "MARK2PVA", 1118: "MARK3PVA", 1119: "MARK4PVA",
 }  # fmt: skip
@@ -56,6 +58,11 @@ GOOD_TIME_STATES: Final = frozenset(
 )  # fmt: skip
 SAME_NS: Final = 1000
 """MARKxTIME and MARKxPVA of one edge lie closer; two edges never do."""
+POSITION_MARK_ACCURACY_NS: Final = 1_000_000
+"""MARKxPOS has the time of its edge in its header only, to the millisecond."""
+POSITION_MARK_DELAY_NS: Final = SECOND_NS
+"""By then, MARKxTIME or MARKxPVA of the same edge has come."""
+MAX_POSITION_MARKS: Final = 16
 TIME_ONLY: Final = (1, "FIXEDPOS")
 HEIGHT_IS_FIXED: Final = (2, "FIXEDHEIGHT")
 """Position types of BESTPOS whose position, or height, was set and not measured."""
@@ -77,7 +84,9 @@ class NovatelDecoder(MessageDecoder):
 
     def __init__(self, receiver: str, *, mark_accuracy_ns: int = 100) -> None:
         super().__init__(
-            receiver, novatel_framer(), ("samples", "marks", "marks_duplicate", "marks_far")
+            receiver,
+            novatel_framer(),
+            ("samples", "marks", "marks_coarse", "marks_duplicate", "marks_far"),
         )
         self._mark_accuracy_ns = mark_accuracy_ns
         self._time_good = False
@@ -88,6 +97,8 @@ class NovatelDecoder(MessageDecoder):
         self._sigmas: tuple[float | None, float | None, float | None] = (None, None, None)
         self._marks: dict[int, list[int]] = {}
         self._counts: Counter[int] = Counter()
+        self._position_marks: deque[tuple[int, EventMark]] = deque(maxlen=MAX_POSITION_MARKS)
+        """Marks of MARKxPOS that wait for a better one, with the edge's input."""
 
     def on_message(self, message: bytes, mono_ns: int) -> list[Nav]:
         return self._on_log(log_of(message), mono_ns)
@@ -104,10 +115,12 @@ class NovatelDecoder(MessageDecoder):
         values = _values(name, log.body)
         if any(isinstance(value, float) and not math.isfinite(value) for value in values):
             raise ValueError(f"{name} holds a number that is none")
-        decoded: list[Nav] = []
-        if name.startswith("MARK"):
-            decoded = self._on_mark(
-                int(name[4]), values, is_pva=name.endswith("PVA"), mono_ns=mono_ns
+        decoded: list[Nav] = self._coarse_marks(_header_ns(log))
+        if name.startswith("MARK") and name.endswith("POS"):
+            self._on_mark_position(_input_of(name), _header_ns(log), mono_ns)
+        elif name.startswith("MARK"):
+            decoded += self._on_mark(
+                _input_of(name), values, is_pva=name.endswith("PVA"), mono_ns=mono_ns
             )
         elif name == "TIME":
             if values[10] in VALID[1:]:
@@ -119,14 +132,14 @@ class NovatelDecoder(MessageDecoder):
                 ned = (speed * math.cos(course), speed * math.sin(course), -up)
                 self._velocity = (_header_ns(log), ned)
         elif name == "BESTPOS":
-            decoded = self._on_bestpos(log, values, mono_ns)
+            decoded += self._on_bestpos(log, values, mono_ns)
         elif name == "INSPVAX":
             self._sigmas = (math.hypot(*values[12:14]), values[14], math.hypot(*values[15:18]))
             height = values[4] + values[5]
             inertial = (*values[2:4], height, *values[6:12], values[0])
-            decoded = self._on_inertial(_header_ns(log), inertial, mono_ns)
+            decoded += self._on_inertial(_header_ns(log), inertial, mono_ns)
         else:
-            decoded = self._on_inertial(_gps_ns(values[0], values[1]), values[2:], mono_ns)
+            decoded += self._on_inertial(_gps_ns(values[0], values[1]), values[2:], mono_ns)
         self.seen[name] += 1
         return decoded
 
@@ -236,6 +249,37 @@ class NovatelDecoder(MessageDecoder):
             EventMark(self.receiver, channel, gps_ns, accuracy_ns, count, NO_COUNT, valid, mono_ns)
         ]
 
+    def _on_mark_position(self, channel: int, gps_ns: int, mono_ns: int) -> None:
+        valid = self._time_good and gps_ns >= WEEK_NS
+        accuracy_ns = max(self._mark_accuracy_ns, POSITION_MARK_ACCURACY_NS)
+        mark = EventMark(self.receiver, channel, gps_ns, accuracy_ns, 0, NO_COUNT, valid, mono_ns)
+        self._position_marks.append((channel, mark))
+
+    def _coarse_marks(self, header_ns: int) -> list[Nav]:
+        """Marks of MARKxPOS for whose edge no better one has come."""
+        coarse: list[Nav] = []
+        while self._position_marks:
+            channel, mark = self._position_marks[0]
+            if header_ns - mark.gps_ns < POSITION_MARK_DELAY_NS:
+                break
+            self._position_marks.popleft()
+            recent = self._marks.setdefault(channel, [])
+            if any(abs(mark.gps_ns - at) <= POSITION_MARK_ACCURACY_NS for at in recent):
+                continue
+            recent.append(mark.gps_ns)
+            del recent[:-16]
+            self.counters["marks"] += 1
+            self.counters["marks_coarse"] += 1
+            count = self._counts[channel] = (self._counts[channel] + 1) % (1 << COUNT_BITS)
+            valid = mark.time_valid and self.is_near_navigation(mark.gps_ns)
+            coarse.append(replace(mark, count=count, time_valid=valid))
+        return coarse
+
+
+def _input_of(name: str) -> int:
+    """The mark input of a log; MARKTIME and MARKPOS are of the first one."""
+    return int(name[4]) if name[4].isdigit() else 1
+
 
 def _fix(status: object, kind: object) -> str:
     """The fix of a BESTPOS, by its solution status and position type."""
@@ -248,6 +292,7 @@ def _fix(status: object, kind: object) -> str:
 
 def _values(name: str, body: bytes | list[str]) -> tuple[Any, ...]:
     is_mark_time = name.endswith("TIME")
+    name = "BESTPOS" if name.endswith("POS") else name
     if isinstance(body, bytes):
         return LAYOUTS.get(name, _MARKTIME if is_mark_time else _PVA).unpack_from(body)
     kinds = ASCII_KINDS.get(name, ASCII_MARKTIME if is_mark_time else ASCII_PVA)
