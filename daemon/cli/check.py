@@ -34,8 +34,10 @@ With `--find`, detect the protocols at serial ports, tcp://host:port, udpin://ho
 given, or all serial ports and the usual addresses): protocol, speed, and the configuration for it.
 With `--find-heads`, search for GigE Vision, USB3 Vision and V4L2 heads.
 
-For heads on a network, the link budget is printed: what the heads of each interface send per
-exposure, the time that takes, and the pause between packets that each head is given.
+For heads on a network, the computer and the path of each head are examined: MTU by test packets,
+receive buffers, reverse-path filter, firewall, subnets, dropped packets. The link budget is
+printed: what the heads of each interface send per exposure, the time that takes, and the pause
+between packets that each head is given.
 
 Examples: `syntopic check flights/sim/service.toml`, `syntopic check service.toml --fire --json`,
 `syntopic check --find`, `syntopic check --find /dev/ttyUSB0 tcp://10.0.0.5:3001`
@@ -116,6 +118,8 @@ def collect_results(
     """All findings: of the running service where there is one, else of what `run` would build."""
     from daemon.mission.interrupted_mission import interrupted_mission
     from daemon.onboard.monitoring.access.service_query import query_service
+    from daemon.onboard.preflight.kernel_counters import read_counters
+    from daemon.onboard.preflight.network_diagnosis import kernel_results, network_diagnosis
     from daemon.onboard.preflight.prerequisites import prerequisites
     from daemon.onboard.preflight.resumption import resumption_result
     from daemon.onboard.preflight.system_check import run_system_check
@@ -131,7 +135,10 @@ def collect_results(
         results.append(result)
         if result.is_blocking:
             return results
-    return results + asyncio.run(run_system_check(configuration, rig, fire=fire))
+    results += network_diagnosis(configuration, rig)
+    before = read_counters()
+    results += asyncio.run(run_system_check(configuration, rig, fire=fire))
+    return results + kernel_results(configuration, before)
 
 
 def _print_tree(console: Console, config: Path, rig: str, results: Sequence[CheckResult]) -> None:

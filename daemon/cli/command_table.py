@@ -90,6 +90,9 @@ TABLE: Final = {
         _command("adjust", _LABORATORY, "Adjust a bundle from a project of text files."),
         _command("init", _BENCH, "Write rig.toml and service.toml for the connected devices."),
         _command("schema", _BENCH, "Print the JSON Schema of rig.toml or service.toml."),
+        _command(
+            "force-ip", _BENCH, "Give a GigE Vision head an IP address by broadcast.", "force_ip"
+        ),
         _command("demo", _BENCH, "Fly the first flight with emulated devices."),
         _command("sim", _BENCH, "Run the emulated devices of a rig until Ctrl-C."),
         _command("bench", _BENCH, "Time the pipeline on one exposure against other software."),

@@ -53,6 +53,7 @@ PROBLEMS: Final = {
     "calibrate thermal": "the flights change nothing",
     "calibrate validity": "a sensor was displaced, or the mission cannot be read",
     "adjust": "the adjustment did not converge, or the project is inconsistent",
+    "force-ip": "the head does not answer, or keeps its address",
     "demo": "an exposure was lost, or the emulator or the service ended",
     "sim": "the emulator did not start",
     "bench": "a needed program or file is missing",

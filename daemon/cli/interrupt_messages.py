@@ -40,6 +40,9 @@ SENTENCES = {
     ),
     "init": f"both files of the rig are complete, or both are as before; {RETRY_HINT}",
     "kernels": f"the kernels compiled so far remain; {RETRY_HINT} to compile the others",
+    "force-ip": (
+        "the head may have its new address; run `syntopic check --find-heads` to see its state"
+    ),
     "install": f"every file written so far is complete; {RETRY_HINT} to finish",
     "uninstall": f"every file left is complete; {RETRY_HINT} to finish",
     **dict.fromkeys(

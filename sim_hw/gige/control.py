@@ -16,12 +16,14 @@ from sim_hw.gige import features as at
 from sim_hw.gige.gvcp import (
     READ_MAX,
     CommandCode,
+    ForceIpRequest,
     GvcpCommand,
     ResendRequest,
     Status,
     acknowledgement,
     parse_action,
     parse_command,
+    parse_force_ip,
     parse_resend,
 )
 from sim_hw.gige.registers import RegisterRefusedError
@@ -47,6 +49,8 @@ class HeadActions:
     """An action command that meant this head: now, or when its clock shows so many ns."""
     control_lost: Callable[[], None]
     is_acquiring: Callable[[], bool]
+    force_address: Callable[[ForceIpRequest], Status] = lambda _: Status.NOT_IMPLEMENTED
+    """A FORCEIP command that meant this head while nobody controls it."""
 
 
 class Registers(Protocol):
@@ -145,6 +149,8 @@ class ControlChannel:
                 return self._read_memory(command, peer)
             case CommandCode.WRITEMEM:
                 return self._write_memory(command, peer, now_ns)
+            case CommandCode.FORCEIP:
+                return self._force_address(command)
             case CommandCode.ACTION:
                 return self._act(command)
             case CommandCode.PACKETRESEND:
@@ -234,6 +240,17 @@ class ControlChannel:
             return None
         self.counts["actions"] += 1
         return acknowledgement(command, status=self._actions.execute_action(request.device_ns))
+
+    def _force_address(self, command: GvcpCommand) -> bytes | None:
+        """A new address for the head with this MAC; the others send no answer."""
+        request = parse_force_ip(command)
+        if request is None:
+            raise RegisterRefusedError(Status.INVALID_HEADER)
+        if request.mac != self._registers.read(at.MAC_HIGH, 8)[2:]:
+            return None
+        if self._controller is not None:
+            raise RegisterRefusedError(Status.ACCESS_DENIED)
+        return acknowledgement(command, status=self._actions.force_address(request))
 
     def _may_read(self, peer: Peer) -> None:
         if self._controller in (None, peer):

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import ipaddress
 import struct
 import time
 import zlib
@@ -17,7 +18,9 @@ from numpy.typing import NDArray
 from sim_hw.gige import features as at
 from sim_hw.gige.acquisition import NO_PULSE, Acquisition, ExposureRequest
 from sim_hw.gige.control import ControlChannel, HeadActions
+from sim_hw.gige.gvcp import ForceIpRequest, Status
 from sim_hw.gige.head_faults import NO_FAULTS, HeadClock, WireFaults, channel_of
+from sim_hw.gige.interface_address import replace_address
 from sim_hw.gige.pacing import Pacing
 from sim_hw.gige.registers import FrameSize, HeadIdentity, RegisterMemory
 from sim_hw.gige.server import ControlServer
@@ -65,6 +68,7 @@ STATISTICS = (
     "actions_ignored",
     "actions_not_waited_for",
     "heartbeats_lost",
+    "forced_addresses",
     "resets",
 )
 """The names `GigeHead.statistics` always has."""
@@ -76,7 +80,9 @@ class GigeHead:
     `expose` is called in the head's own thread, one exposure after another; it returns the whole
     sensor, uint16, shape (height, width), and must not change the array afterwards; what the pixel
     formats make of it is in `packing`. `temperature_c` gets a monotonic time in ns.
-    `packet_pacing` defaults to what suits this host's rmem_max.
+    `packet_pacing` defaults to what suits this host's rmem_max. `interface` is the interface of a
+    network namespace that the head is; it then answers broadcasts there and takes an address by
+    FORCEIP, until it is closed.
     """
 
     def __init__(
@@ -88,8 +94,10 @@ class GigeHead:
         clock: FreeRunningClock,
         faults: WireFaults = NO_FAULTS,
         packet_pacing: Pacing | None = None,
+        interface: str = "",
     ) -> None:
         self.identity = identity
+        self._interface = interface
         self.size = size
         self.channel = channel_of(faults, identity.serial)
         self._clock = HeadClock(clock, self.channel)
@@ -125,9 +133,12 @@ class GigeHead:
                 execute_action=self._acquisition.execute_action,
                 control_lost=self._control_lost,
                 is_acquiring=lambda: self._acquisition.is_acquiring,
+                force_address=self._force_address,
             ),
         )
-        self._server = ControlServer(identity.address, self._control, self._is_listening)
+        self._server = ControlServer(
+            identity.address, self._control, self._is_listening, interface, self._network
+        )
         self._stream_port = 0
         self._counts: Counter[str] = Counter()
 
@@ -195,6 +206,33 @@ class GigeHead:
             self._stream.discard_retained()
         elif address == at.STREAM_PACKET_SIZE:
             self._fire_test_packet()
+
+    def _network(self) -> ipaddress.IPv4Network:
+        """The subnet that the head believes to be in."""
+        address, mask = (
+            ipaddress.IPv4Address(self._registers.register(register))
+            for register in (at.IP_ADDRESS, at.SUBNET_MASK)
+        )
+        return ipaddress.IPv4Network((address, str(mask)), strict=False)
+
+    def _force_address(self, request: ForceIpRequest) -> Status:
+        """FORCEIP: the head answers and sends from the new address."""
+        if not self._interface:
+            return Status.NOT_IMPLEMENTED
+        old = str(ipaddress.IPv4Address(self._registers.register(at.IP_ADDRESS)))
+        if not replace_address(self._interface, old, request.address, request.mask):
+            return Status.INVALID_PARAMETER
+        self._server.move_to(request.address)
+        self._stream_port = self._stream.move_to(request.address)
+        for register, value in (
+            (at.IP_ADDRESS, request.address),
+            (at.SUBNET_MASK, request.mask),
+            (at.GATEWAY, request.gateway),
+        ):
+            self._registers.set_register(register, int(ipaddress.IPv4Address(value)))
+        self._registers.set_register(at.STREAM_SOURCE_PORT, self._stream_port)
+        self._counts["forced_addresses"] += 1
+        return Status.SUCCESS
 
     def _latch_timestamp(self) -> None:
         if self._registers.register(at.TIMESTAMP_CONTROL) & at.TIMESTAMP_LATCH:

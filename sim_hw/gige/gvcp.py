@@ -6,6 +6,7 @@ Encoding only; `control` checks the privileges.
 from __future__ import annotations
 
 import enum
+import socket
 import struct
 from dataclasses import dataclass
 
@@ -16,6 +17,8 @@ PACKET_MAX = 576
 """No GVCP packet is longer, IP and UDP headers included; ours never exceed it."""
 READ_MAX = 536
 ACK_REQUIRED = 0x01
+ALLOW_BROADCAST_ACK = 0x10
+"""DISCOVERY and FORCEIP: a head in another subnet than the asker answers by broadcast."""
 SCHEDULED = 0x80
 """An action command with its scheduled time."""
 
@@ -81,6 +84,25 @@ class ActionRequest:
     group_key: int
     group_mask: int
     device_ns: int | None
+
+
+@dataclass(frozen=True)
+class ForceIpRequest:
+    """The head that is meant, by its MAC address, and its new address."""
+
+    mac: bytes
+    address: str
+    mask: str
+    gateway: str
+
+
+def parse_force_ip(command: GvcpCommand) -> ForceIpRequest | None:
+    """The request in a FORCEIP command; None where it makes no sense."""
+    if len(command.body) != 56:
+        return None
+    mac, *parts = struct.unpack(">2x6s12x4s12x4s12x4s", command.body)
+    address, mask, gateway = (socket.inet_ntoa(part) for part in parts)
+    return ForceIpRequest(mac, address, mask, gateway)
 
 
 def parse_action(command: GvcpCommand) -> ActionRequest | None:

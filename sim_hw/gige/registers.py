@@ -56,6 +56,7 @@ class HeadIdentity:
     model: str = "UC-Head"
     vendor: str = "Syntopic"
     user_id: str = ""
+    mask: str = "255.0.0.0"
 
 
 @dataclass(frozen=True)
@@ -216,7 +217,7 @@ class RegisterMemory:
             (at.IP_OPTIONS, _LINK_LOCAL_DHCP_PERSISTENT),
             (at.IP_CONFIGURATION, _LINK_LOCAL_DHCP_PERSISTENT),
             (at.IP_ADDRESS, ip),
-            (at.SUBNET_MASK, 0xFF00_0000),
+            (at.SUBNET_MASK, int(ipaddress.IPv4Address(identity.mask))),
             (at.INTERFACES, 1),
             (at.STREAM_CHANNELS, 1),
             (at.ACTION_SIGNALS, 1),

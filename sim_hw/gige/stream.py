@@ -91,12 +91,24 @@ class StreamChannel:
 
     def start(self) -> int:
         """Open the socket and start sending. Returns the source port."""
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
-        self._socket.bind((self._address, 0))
+        self._socket = self._open(self._address)
         self._thread = threading.Thread(target=self._run, name=f"gvsp-{self._address}", daemon=True)
         self._thread.start()
         return int(self._socket.getsockname()[1])
+
+    def move_to(self, address: str) -> int:
+        """Send from another address from now on. Returns the source port."""
+        moved = self._open(address)
+        old, self._socket, self._address = self._socket, moved, address
+        if old is not None:
+            old.close()
+        return int(moved.getsockname()[1])
+
+    def _open(self, address: str) -> socket.socket:
+        opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        opened.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
+        opened.bind((address, 0))
+        return opened
 
     def close(self) -> None:
         self._stop.set()

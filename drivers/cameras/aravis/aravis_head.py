@@ -79,7 +79,7 @@ class AravisHead(AravisSettings, HeadDevice):
     kind: ClassVar = "head"
     counted: ClassVar = (
         *("frames", "frames_incomplete", "frames_corrupt", "underruns", "opened", "latches"),
-        "other_senders",
+        *("other_senders", "kernel_drops"),
     )
 
     def __init__(
@@ -439,6 +439,13 @@ class AravisHead(AravisSettings, HeadDevice):
         self._of_stream = now
         if now["underruns"] > before["underruns"]:
             self._report_underrun()
+        if now["kernel_drops"] > before["kernel_drops"]:
+            self.emitter.emit_throttled(
+                "kernel-drops",
+                f"The kernel dropped {now['kernel_drops']} packets of the head {self.name}, since "
+                "the buffer of their socket was full. Raise net.core.rmem_max and "
+                "socket_buffer_bytes, and end other programs.",
+            )
         if now["other_senders"] > before["other_senders"]:
             self._report_other_senders(session, now["other_senders"])
         if session.stream.restart_if_behind():

@@ -242,6 +242,10 @@ class StreamSocketFilter:
             self.last_other = f"{host}:{port}"
         return self._received + _drops(self._others)
 
+    def kernel_drops(self) -> int:
+        """Datagrams of the head that found the stream's buffer full; the kernel counts them."""
+        return _drops(self._stream)
+
     def close(self) -> None:
         """Close both descriptors; the stream's socket stays connected."""
         self._others.close()

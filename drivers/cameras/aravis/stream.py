@@ -186,9 +186,9 @@ class FrameStream:
     def counted(self) -> Counter[str]:
         """Aravis' statistics of this stream.
 
-        Returns:
             Counts by the names of STATISTIC_NAMES; also `underruns` in frames, `stream_restarts`,
-            and `other_senders`, dropped datagrams of other senders.
+            `other_senders`, dropped datagrams of other senders, and `kernel_drops`, datagrams of the
+            head that found the buffer of the socket full.
         """
         found: Counter[str] = Counter()
         for theirs, ours in STATISTIC_NAMES.items():
@@ -197,6 +197,7 @@ class FrameStream:
         found["stream_restarts"] = self._restarts
         if self._senders is not None:
             found["other_senders"] = self._senders.poll(found["received_packets"])
+            found["kernel_drops"] = self._senders.kernel_drops()
         return found
 
     @property

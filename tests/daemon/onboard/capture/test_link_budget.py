@@ -101,7 +101,7 @@ def test_near_the_limit_the_pause_is_shortened_by_the_packets_own_time() -> None
 @pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf])
 def test_rates_that_are_no_rates_are_refused(name: str, value: float) -> None:
     with pytest.raises(ValueError, match="positive and finite"):
-        plan_link(dataclasses.replace(gigabit(), **{name: value}), heads(1), 1.0)
+        plan_link(Link(**{**dataclasses.asdict(gigabit()), name: value}), heads(1), 1.0)
 
 
 def test_packets_without_space_for_pixels_are_refused() -> None:
