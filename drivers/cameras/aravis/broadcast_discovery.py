@@ -51,7 +51,14 @@ class BroadcastHead:
 
 
 def discover(interface: str, *, timeout_s: float = DISCOVERY_TIMEOUT_S) -> list[BroadcastHead]:
-    """Every head that answers a broadcast on an interface, by MAC address.
+    """Every head that answers a broadcast on an interface.
+
+    Args:
+        interface: name of the interface of this computer.
+        timeout_s: time to wait for answers.
+
+    Returns:
+        The answers, one for each MAC address, in its order.
 
     Raises:
         DeviceError: the interface cannot be used.
@@ -74,7 +81,17 @@ def discover(interface: str, *, timeout_s: float = DISCOVERY_TIMEOUT_S) -> list[
 def force_address(
     interface: str, mac: str, address: str, mask: str, gateway: str = "0.0.0.0"
 ) -> BroadcastHead:
-    """Give a head an address until it is switched off; returns the head with its new address.
+    """Give a head an address until it is switched off, and wait until it answers there.
+
+    Args:
+        interface: name of the interface of this computer that the head is connected to.
+        mac: MAC address of the head, six hexadecimal bytes with colons.
+        address: new IPv4 address.
+        mask: mask of its subnet.
+        gateway: gateway of its subnet.
+
+    Returns:
+        The head with its new address.
 
     Raises:
         DeviceError: an argument is none, the head does not answer, or it keeps its address.

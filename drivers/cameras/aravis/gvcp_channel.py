@@ -82,14 +82,32 @@ class GvcpChannel:
         return str(self._socket.getsockname()[0])
 
     def read(self, register: int) -> int:
-        """The value of a register. DeviceError: no answer, or it is refused."""
+        """Read a register.
+
+        Args:
+            register: its address.
+
+        Returns:
+            Its value, 32 bits.
+
+        Raises:
+            DeviceError: no answer, or it is refused.
+        """
         body = self._request(READREG_CMD, struct.pack(">I", register))
         if len(body) < 4:
             raise DeviceError(f"the head at {self._address} answers without a value")
         return int(struct.unpack_from(">I", body)[0])
 
     def write(self, register: int, value: int) -> None:
-        """Write a register. DeviceError: no answer, or it is refused."""
+        """Write a register.
+
+        Args:
+            register: its address.
+            value: 32 bits.
+
+        Raises:
+            DeviceError: no answer, or it is refused.
+        """
         self._request(WRITEREG_CMD, struct.pack(">II", register, value))
 
     def _request(self, command: int, body: bytes) -> bytes:

@@ -243,7 +243,11 @@ class StreamSocketFilter:
         return self._received + _drops(self._others)
 
     def kernel_drops(self) -> int:
-        """Datagrams of the head that found the stream's buffer full; the kernel counts them."""
+        """Datagrams of the head that found the stream's buffer full.
+
+        Returns:
+            Their number, as the kernel counts it.
+        """
         return _drops(self._stream)
 
     def close(self) -> None:

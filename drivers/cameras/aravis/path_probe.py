@@ -64,6 +64,9 @@ def probe_path(address: str, wanted: int) -> PathProbe:
     Args:
         address: of the head.
         wanted: size of the IP packet in bytes.
+
+    Returns:
+        How far the head is reached, and the largest packet that arrived.
     """
     try:
         with (
