@@ -16,6 +16,7 @@ from daemon.onboard.capture.link_budget import HeadDemand, Link, LinkPlan, plan_
 from daemon.onboard.capture.routes import network_heads, parse_routes, route_to
 from daemon.onboard.preflight.check_results import CheckOutcome, CheckResult, failed, passed
 from daemon.onboard.service.messages import DeviceSpec
+from drivers.cameras.aravis.gvcp import is_ip_address
 from processing.rig import Rig
 
 INTERFACES: Final = Path("/sys/class/net")
@@ -103,6 +104,7 @@ def paced_specs(
 def link_budget(configuration: Configuration, rig: Rig) -> Iterator[CheckResult]:
     """One result for each interface that leads to heads; what cannot fit prevents a flight."""
     plans, unknown = link_plans(configuration, rig)
+    yield from _uncounted(configuration)
     for name in unknown:
         yield CheckResult(
             "link",
@@ -117,6 +119,30 @@ def link_budget(configuration: Configuration, rig: Rig) -> Iterator[CheckResult]
             yield passed("link", name, _fitting_sentence(plan))
         else:
             yield failed("link", name, refusal(plan), is_blocking=True)
+
+
+def _uncounted(configuration: Configuration) -> Iterator[CheckResult]:
+    """Heads that are configured by their name, and rates of interfaces without heads."""
+    addresses = network_heads(configuration)
+    for head in configuration.head:
+        address = str(head.settings.get("address", ""))
+        if head.driver == GIGE_DRIVER and not is_ip_address(address):
+            yield CheckResult(
+                "link",
+                head.sensor,
+                CheckOutcome.NOT_TRIED,
+                f"head {head.sensor} is configured by its name {address!r} and not counted in a "
+                "link budget; configure a GigE Vision head by its IP address",
+            )
+    reached = _heads_by_interface(configuration)
+    for name in configuration.network.link_mbps:
+        if addresses and name not in reached:
+            yield failed(
+                "link",
+                name,
+                f"network.link_mbps has {name}, and the route to no head leads there; heads are "
+                f"reached by {', '.join(reached) or 'no interface'}",
+            )
 
 
 def refusal(plan: LinkPlan) -> str:

@@ -105,6 +105,22 @@ def configured_with_network(addresses: str, section: dict[str, Any]) -> tuple[Co
     return configuration.model_copy(update={"network": network}), rig
 
 
+def test_a_rate_of_an_interface_without_heads_is_reported(kernel: Path) -> None:
+    wrong, fitting = link_budget(*configured_with_network("10.0.0", {"link_mbps": {"eth2": 100.0}}))
+    assert wrong.outcome is CheckOutcome.FAIL
+    assert not wrong.is_blocking
+    assert "network.link_mbps has eth2" in wrong.sentence
+    assert "heads are reached by eth1" in wrong.sentence
+    assert fitting.outcome is CheckOutcome.PASS
+
+
+def test_heads_that_are_configured_by_name_are_reported_as_not_counted(kernel: Path) -> None:
+    results = list(link_budget(*configured(network="Basler-2134")))
+    assert {result.outcome for result in results} == {CheckOutcome.NOT_TRIED}
+    assert len(results) == 13
+    assert "'Basler-2134.10' and not counted in a link budget" in results[0].sentence
+
+
 def test_pacing_can_be_switched_off(kernel: Path) -> None:
     configuration, rig = configured_with_network("10.0.0", {"is_paced": False})
     specs = device_specs(configuration, rig)
