@@ -186,9 +186,10 @@ class FrameStream:
     def counted(self) -> Counter[str]:
         """Aravis' statistics of this stream.
 
-        Counts by the names of STATISTIC_NAMES; also `underruns` in frames, `stream_restarts`,
-        `other_senders`, dropped datagrams of other senders, and `kernel_drops`, datagrams of the
-        head that found the buffer of the socket full.
+        Returns:
+            Counts by the names of STATISTIC_NAMES; also `underruns` in frames, `stream_restarts`,
+            `other_senders`, dropped datagrams of other senders, and `kernel_drops`, datagrams of
+            the head that found the buffer of the socket full.
         """
         found: Counter[str] = Counter()
         for theirs, ours in STATISTIC_NAMES.items():
