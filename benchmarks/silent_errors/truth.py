@@ -32,6 +32,8 @@ BLOCKS: Final = 8
 """Regions of a frame along each side whose radiance is compared."""
 MIN_PIXELS: Final = 12
 CHECK: Final = (5, 5)
+WITHOUT_DATA: Final = 1e-6
+"""Weight of pixels without data up to which an interpolated value counts as measured."""
 DARK: Final = 0.02
 """Radiance below which a relative error is meaningless."""
 
@@ -240,6 +242,10 @@ def _of_colour(emulated: EmulatedExposure, product: Product) -> Samples:
         at, raw = at[inside], raw[inside]
         picture = product.colour[band].astype(np.float32)
         shown = map_coordinates(picture, at.T[::-1], order=1) / product.counts_per_dn
+        # Next to pixels without data the interpolated value is too low: not the image's error.
+        data = map_coordinates((picture > 0).astype(np.float32), at.T[::-1], order=1)
+        at_data = data > 1.0 - WITHOUT_DATA
+        raw, shown = raw[at_data], shown[at_data]
         found[sensor.name] = _compared(emulated, sensor.name, raw, shown)
     return found
 
