@@ -60,7 +60,7 @@ def main() -> None:
         )
         sys.exit(1 if any(row["alarm"] for row in found) else 0)
     if given.drawn:
-        alarms = false_alarms(given.drawn, given.seed)
+        alarms = false_alarms(given.drawn, given.seed, given.results)
         print(json.dumps({"machine": machine(), "drawn": given.drawn, "alarms": alarms}))
         sys.exit(1 if alarms["any"] > given.drawn * MAX_ALARMS else 0)
     cases = draw(given.count, given.seed, rigs=given.rig or (), kinds=given.kind or ())

@@ -7,9 +7,12 @@ erring alike. All go through the judgement of the pipeline.
 
 from __future__ import annotations
 
+import json
+import sys
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -33,6 +36,8 @@ Random = np.random.Generator
 
 RIG_SEQUENCE: Final = (X, X, X, X, X, L, DMC)
 """The rig of each drawn exposure in turn."""
+PROGRESS: Final = 100
+"""Drawn exposures from one line of progress to the next."""
 PROBE_SIGMA_K: Final = 0.1
 LARGEST_DC_K: Final = 15.0
 CORRELATED_PX: Final = 60.0
@@ -62,15 +67,35 @@ def template(rig: str) -> Template:
     return Template(emulated.rig, product, root)
 
 
-def false_alarms(count: int, seed: int) -> Counter[str]:
-    """How many of `count` drawn exposures change a verdict, by finding; `any` counts exposures."""
+def false_alarms(count: int, seed: int, file: Path | None = None) -> Counter[str]:
+    """How many of `count` drawn exposures change a verdict, by finding; `any` counts exposures.
+
+    Args:
+        count: exposures.
+        seed: for all random generators.
+        file: of outcomes, one JSON object a line; exposures that are in it are not drawn again.
+    """
+    known = set()
+    found: Counter[str] = Counter({"any": 0})
+    if file is not None and file.exists():
+        for row in map(json.loads, file.read_text().splitlines()):
+            if row["seed"] == seed and row["number"] < count:
+                known.add(row["number"])
+                found.update(row["alarms"])
+                found["any"] += bool(row["alarms"])
     templates = {rig: template(rig) for rig in dict.fromkeys(RIG_SEQUENCE)}
-    found: Counter[str] = Counter()
     for number in range(count):
+        if number in known:
+            continue
         of = templates[RIG_SEQUENCE[number % len(RIG_SEQUENCE)]]
         alarms = raised_findings(of, np.random.default_rng([seed, 37, number]))
         found.update(alarms)
         found["any"] += bool(alarms)
+        if file is not None:
+            with file.open("a") as out:
+                out.write(json.dumps({"seed": seed, "number": number, "alarms": alarms}) + "\n")
+        if (number + 1) % PROGRESS == 0:
+            print(f"{number + 1} of {count} drawn: {dict(found)}", file=sys.stderr, flush=True)
     return found
 
 
