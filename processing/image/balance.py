@@ -80,9 +80,24 @@ class Balance:
 
         None where no gain is more than `OUTLIER` off.
         """
-        if len(self.gains) < 2:
+        return self.outlier_without(())
+
+    def outlier_without(self, changed: Collection[str]) -> tuple[str, float] | None:
+        """The same where the signal of some sensors changes within their frames.
+
+        Such a frame has no one gain, and passes its error on to its neighbours: gains follow from
+        the overlaps of the others alone.
+        """
+        gains = self.gains
+        if not gains.keys().isdisjoint(changed):
+            names = [name for name in gains if name not in changed]
+            pairs = [p for p in self.pairs if {p.sensor_a, p.sensor_b}.isdisjoint(changed)]
+            tied = {name for pair in pairs for name in (pair.sensor_a, pair.sensor_b)}
+            names = [name for name in names if name in tied]
+            gains = dict(zip(names, np.exp(_log_gains(names, pairs)).tolist(), strict=True))
+        if len(gains) < 2:
             return None
-        logs = {name: float(np.log(gain)) for name, gain in self.gains.items()}
+        logs = {name: float(np.log(gain)) for name, gain in gains.items()}
         middle = float(np.median(list(logs.values())))
         name = max(logs, key=lambda n: abs(logs[n] - middle))
         off = logs[name] - middle

@@ -35,6 +35,7 @@ from processing.image.kernels import Interpolation
 from processing.image.line_means import line_means
 from processing.image.quicklook import quicklook
 from processing.image.resampling import SATURATED_SOURCE
+from processing.matching.band_gaps import filled_gaps
 from processing.matching.content_check import (
     MIN_TEXTURED,
     ContentCheck,
@@ -267,6 +268,8 @@ class Pipeline(
             pitch_mm = self._pan.image.pitch_mm
             elsewhere = moved_placements(corrected.start, content, pitch_mm)
             tie_points = match_tie_points(rig, elsewhere, level1, settings=settings)
+        else:
+            tie_points = filled_gaps(rig, corrected.start, level1, tie_points, settings=settings)
         return tie_points, content
 
     def _resample(

@@ -123,6 +123,9 @@ def figures_of(
     pan = [s for cone in rig.pan_cones for s in cone.sensors if s.name in level1]
     yield from signal_figures(pan, level1, corrected.statistics)
     yield sharpness_figures(pan, level1, exposed)
+    means = {n: seen.lines for n, seen in corrected.statistics.items() if seen.lines is not None}
+    steps = signal_steps(rig.sensors, means)
+    blocks = block_edges(rig, mosaic.placements, level1, means)
     yield from stitching_figures(
         rig,
         tie_points,
@@ -131,6 +134,7 @@ def figures_of(
         balance=image.pan.balance,
         bands=image.registrations,
         present=level1,
+        changed={found.sensor for found in (*steps, *blocks)},
     )
     yield _saturated_overlap(rig, settings, corrected, stitching)
     yield SupportFigures(stitching.weak)
@@ -140,9 +144,8 @@ def figures_of(
     yield projection_figures(rig, conditions, settings.relief_fraction)
     yield content_figures(adjusted.content)
     yield relative_sharpness_figures(rig, start, level1)
-    means = {n: seen.lines for n, seen in corrected.statistics.items() if seen.lines is not None}
-    yield step_figures(signal_steps(rig.sensors, means))
-    yield block_figures(block_edges(rig, mosaic.placements, level1, means))
+    yield step_figures(steps)
+    yield block_figures(blocks)
     shared = measure_common_windows(rig, mosaic.placements, level1)
     yield local_blur_figures(rig, shared)
     yield level_figures(rig, shared)

@@ -34,6 +34,8 @@ MAX_BLUR: Final = 0.2
 """Of the step, in the lines before and after it: a lens leaves a quarter and more."""
 NEAR_PX: Final = 3 * BUNDLE_PX
 """How far from a corner edges may seem to end."""
+MAX_RATIO: Final = 3.0
+"""Of the steps of two edges of one block, whose ground differs from side to side."""
 MAX_FRAMES: Final = 3
 """Such edges in more frames of one exposure are roofs or rows of plants along the track."""
 CANDIDATES: Final = 6
@@ -218,7 +220,7 @@ def _cornered(edges: list[_Edge]) -> list[_Edge]:
     """The edges that meet another one in a corner, or have one of the other sign opposite."""
 
     def joined(a: _Edge, b: _Edge) -> bool:
-        if not 0.5 < abs(a.step / b.step) < 2.0:
+        if not 1.0 / MAX_RATIO < abs(a.step / b.step) < MAX_RATIO:
             return False
         if a.axis == b.axis:
             shared = min(a.last, b.last) - max(a.first, b.first)

@@ -36,6 +36,7 @@ def stitching_figures(
     balance: Balance,
     bands: Sequence[BandRegistration],
     present: Collection[str],
+    changed: Collection[str] = (),
 ) -> Iterator[FigureGroup]:
     """Tie points, adjustment, displaced sensor, balance and colour registration.
 
@@ -47,12 +48,13 @@ def stitching_figures(
         balance: of the PAN heads.
         bands: how the other colours were registered to green.
         present: sensors with a frame; overlaps of others do not count as poor in tie points.
+        changed: sensors whose signal changes within the frame, which say nothing about gains.
 
     Yields:
         Groups of figures.
     """
     yield _adjustment(mosaic)
-    outlier = balance.outlier or (None, None)
+    outlier = balance.outlier_without(changed) or (None, None)
     yield BalanceFigures(balance.spread, *outlier)
     yield from _tie_points(rig, tie_points, mosaic)
     poorest = poorest_overlap(rig, mosaic, present)
