@@ -74,6 +74,9 @@ def false_alarms(count: int, seed: int, file: Path | None = None) -> Counter[str
         count: exposures.
         seed: for all random generators.
         file: of outcomes, one JSON object a line; exposures that are in it are not drawn again.
+
+    Returns:
+        Exposures by finding.
     """
     known = set()
     found: Counter[str] = Counter({"any": 0})

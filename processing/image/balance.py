@@ -87,6 +87,12 @@ class Balance:
 
         Such a frame has no one gain, and passes its error on to its neighbours: gains follow from
         the overlaps of the others alone.
+
+        Args:
+            changed: these sensors, by name.
+
+        Returns:
+            Name and signal, or None where no gain is more than `OUTLIER` off.
         """
         gains = self.gains
         if not gains.keys().isdisjoint(changed):

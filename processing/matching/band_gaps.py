@@ -36,7 +36,15 @@ Gap = tuple[int, float, float]
 
 
 def colour_gaps(rig: Rig, tie_points: TiePoints) -> list[Gap]:
-    """Bands of the colour master frame that hold no tie point."""
+    """Bands of the colour master frame that hold no tie point.
+
+    Args:
+        rig: the camera.
+        tie_points: what was matched.
+
+    Returns:
+        Axis and limits of each band; none where the frame has too few tie points.
+    """
     if rig.colour_master_cone is None:
         return []
     sensor = rig.cone(rig.colour_master_cone).sensors[0]
@@ -71,6 +79,9 @@ def filled_gaps(
         frames: Level-1 words by sensor name.
         tie_points: what was matched there.
         settings: those it was matched with; None takes the defaults.
+
+    Returns:
+        Either set of tie points as a whole.
     """
     settings = settings or TiePointSettings()
     gaps = colour_gaps(rig, tie_points)

@@ -59,8 +59,8 @@ MIN_SHIFT_PX: Final = 0.01
 MIN_POINTS: Final = 24
 SCALED_PPM: Final = 100.0
 ALTERNATIVE_SHARE: Final = 0.5
-"""Of the largest shift, above which another head may be the one that moved: of one head that turned
-alone, the others seem to have gone a third of its way."""
+"""Of the largest turn, above which another head may be the one that moved: of one head that turned
+alone, the others seem to have turned a third of it."""
 _ROUNDS: Final = 12
 
 
@@ -71,7 +71,10 @@ class EstimatedMounting:
     `angles_rad` are omega, phi, kappa of virtual_from_head with their `covariance` (3, 3), by tie
     points and by how well the sensors' places are known; `correction_rad`, `correction_sigma_rad`
     the same against calibration, about the axes of the virtual image; the mean of all heads is
-    zero. `shift_px` is how far the head's middle went by it, (x right, y up). `residual_px` is the
+    zero. `usual_rad` is the standard deviation of an angle by calibration; `turn` the
+    length of the correction in standard deviations of calibration and stitching. `shift_px` is how
+    far the head's middle went by it, (x right, y up), `reach_px` how far the point of the frame that
+    went farthest. `residual_px` is the
     shift that an affine transformation still finds between this head's tie points and its
     neighbours', `affine` (2, 2) the rest of it, px per px, `points` their number.
     """
@@ -86,6 +89,9 @@ class EstimatedMounting:
     residual_sigma_px: tuple[float, float]
     affine: Array
     points: int
+    usual_rad: float = 0.0
+    turn: float = 0.0
+    reach_px: float = 0.0
 
     @property
     def scale_ppm(self) -> float:
@@ -121,18 +127,21 @@ class PlatformCheck:
 
     @property
     def alternatives(self) -> tuple[str, ...]:
-        """Other heads that moved nearly as far as the farthest, where the test is failed."""
-        far = ALTERNATIVE_SHARE * math.hypot(*self.farthest.shift_px)
+        """Other heads that turned nearly as far as the farthest, where the test is failed."""
+        far = ALTERNATIVE_SHARE * self.farthest.turn
         return tuple(
             head.cone
             for head in self.heads
-            if self.is_expired and head is not self.farthest and math.hypot(*head.shift_px) > far
+            if self.is_expired and head is not self.farthest and head.turn > far
         )
 
     @property
     def farthest(self) -> EstimatedMounting:
-        """The head whose middle moved most."""
-        return max(self.heads, key=lambda head: math.hypot(*head.shift_px))
+        """The head that turned most, measured by how well its angles are known.
+
+        By the shift of its middle, a head that turned about its own axis would be overlooked.
+        """
+        return max(self.heads, key=lambda head: head.turn)
 
 
 def verified_mosaic(rig: Rig, mosaic: Mosaic, tie_points: TiePoints) -> Mosaic:
@@ -256,7 +265,7 @@ def platform_figures(check: PlatformCheck | None) -> tuple[FigureGroup, ...]:
     return (
         PlatformFigures(
             platform_test=check.statistic / check.limit,
-            platform_shift_px=math.hypot(*farthest.shift_px),
+            platform_shift_px=farthest.reach_px,
             platform_shift_head=farthest.cone,
             platform_alternatives=tuple(check.alternatives),
         ),
@@ -345,6 +354,11 @@ def _mounting(
         small_rotation_design(_middle_mm(rig, mosaic, name), mosaic.model.f_mm)[:, :, 0]
         @ rotation_vector
     )
+    edge_mm = vip_mm_from_raw(mosaic.placements[cone.sensors[0].name], _grid(cone.sensors[0]))
+    reach_mm = np.einsum(
+        "ijn,j->in", small_rotation_design(edge_mm, mosaic.model.f_mm), rotation_vector
+    )
+    calibrated = np.eye(3) * (cone.rotation_sigma_urad * 1e-6) ** 2
     shift, sigma, affine, points = _affine_shift(rig, mosaic, tie_points, name)
     return EstimatedMounting(
         cone=name,
@@ -357,6 +371,9 @@ def _mounting(
         residual_sigma_px=_pair(sigma),
         affine=affine,
         points=points,
+        usual_rad=cone.rotation_sigma_urad * 1e-6,
+        turn=math.sqrt(rotation_vector @ np.linalg.solve(covariance + calibrated, rotation_vector)),
+        reach_px=float(np.hypot(*reach_mm).max()) / mosaic.model.pitch_mm,
     )
 
 

@@ -42,6 +42,8 @@ SCALE_SIGMAS: Final = 2.0
 """A common change of scale within so many standard deviations of the calibration is no error."""
 SINGLE_SENSOR_SIGMAS: Final = 1.0
 """The same where the master cone has one sensor: nothing else shows a wrong scale of it."""
+TURN_SIGMAS: Final = 2.0
+"""A turn of a converging head within so many standard deviations of calibration is no error."""
 STALE_K_PER_S: Final = 0.02
 """How fast temperatures change that were read too long ago."""
 HEAD_SCALE_PPM: Final = 50.0
@@ -195,13 +197,20 @@ def _unplaced(
 def _rotated_heads(
     mosaic: Mosaic, platform: PlatformCheck | None, held: HeldQuantities | None
 ) -> Iterator[Array]:
-    """What heads that turned do to the mean of all, which is the datum; each on its own."""
-    if platform is None or not platform.is_expired:
+    """What heads that turned do to the mean of all, which is the datum; each on its own.
+
+    Of heads whose turn is no significant one, what is beyond the usual size counts.
+    """
+    if platform is None:
         return
     pitch_mm = mosaic.model.pitch_mm
     f_px = mosaic.model.f_mm / pitch_mm
     for head in platform.heads:
-        by_x, by_y, by_z = _true_turn(mosaic, head, held) / (len(platform.heads) - 1)
+        turn = _true_turn(mosaic, head, held)
+        if not platform.is_expired:
+            usual = TURN_SIGMAS * head.usual_rad
+            turn = np.sign(turn) * np.sqrt(np.maximum(turn**2 - usual**2, 0.0))
+        by_x, by_y, by_z = turn / (len(platform.heads) - 1)
         yield np.array([-f_px * by_y, f_px * by_x, 0.0, by_z / pitch_mm])
 
 
@@ -293,13 +302,15 @@ def _changed_master(rig: Rig, mosaic: Mosaic, layers: LayerCheck | None) -> Iter
     def moved(scale_ppm: float, by_x: float, by_y: float, by_z: float) -> Array:
         return np.array([-f_px * by_y, f_px * by_x, scale_ppm * per_mm, by_z * per_mm])
 
-    if layers.master_changed:
+    if layers.master_changed and not (is_single and len(layers.causes) > 1):
         # Each by itself: together they would state one direction only, and that of their noise.
         beyond = np.abs(layers.common) > SCALE_SIGMAS * layers.common_sigmas
         for quantity in np.diag(layers.common)[beyond]:
             yield moved(*quantity)
     elif len(layers.causes) > 1:
         changes = np.sqrt(np.mean([layer.values**2 for layer in layers.layers], axis=0))
+        # The master may have tilted about the axis about which the others did not.
+        changes[1:3] = np.sqrt(np.mean(changes[1:3] ** 2))
         for quantity in np.diag(changes)[: 3 if is_single else 1]:
             yield moved(*quantity)
     elif not layers.changed:

@@ -59,8 +59,8 @@ from processing.pipelines.stitched_stages import (
     ComposedImage,
     CorrectedFrames,
     StitchedStages,
-    farthest_shift_px,
     figures_of,
+    misplaced_px,
 )
 from processing.pipelines.synthetic_frames import synthetic_frames
 from processing.quality.clipping import clipping_figures
@@ -253,8 +253,8 @@ class Pipeline(
                 held=held,
                 temperatures_c=temperatures.usable_c,
                 stale_s=self._stale_s(exposure.conditions),
-                shifted_px=farthest_shift_px(content),
-                weak=stitching.weak,
+                shifted_px=misplaced_px(rig, content),
+                weak=(*stitching.weak, *content.mismatched),
                 smear_px=tdi_misfit_px(rig, exposure.conditions, settings.thresholds.smear_px),
             )
         return AdjustedFrames(stitching, content, estimated, platform, layers, held, contribution)

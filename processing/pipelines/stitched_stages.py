@@ -20,7 +20,7 @@ from processing.geometry.placement import SensorPlacement
 from processing.geometry.virtual_camera import GroundPlane, projection_figures
 from processing.image.colour import BandRegistration
 from processing.image.composition import Composition
-from processing.matching.content_check import ContentCheck, content_figures
+from processing.matching.content_check import WIDE_SEARCH_PX, ContentCheck, content_figures
 from processing.matching.tie_point_search import saturated_window_fraction
 from processing.mosaic.estimated_dc import EstimatedDc, estimated_dc_figures
 from processing.mosaic.free_mosaic import Mosaic
@@ -38,7 +38,7 @@ from processing.quality.figures import FigureGroup
 from processing.quality.figures.circumstances import ParallaxFigures
 from processing.quality.figures.image import ValidFigures
 from processing.quality.figures.stitching import SaturatedOverlapFigures, SupportFigures
-from processing.quality.frame_blocks import block_edges, block_figures
+from processing.quality.frame_blocks import block_edges, block_figures, edge_limits
 from processing.quality.frame_identity import identity_figures
 from processing.quality.frame_signal import sharpness_figures, signal_figures
 from processing.quality.local_sharpness import local_blur_figures
@@ -125,7 +125,8 @@ def figures_of(
     yield sharpness_figures(pan, level1, exposed)
     means = {n: seen.lines for n, seen in corrected.statistics.items() if seen.lines is not None}
     steps = signal_steps(rig.sensors, means)
-    blocks = block_edges(rig, mosaic.placements, level1, means)
+    limits = edge_limits(rig, means)
+    blocks = block_edges(rig, mosaic.placements, level1, means, limits)
     yield from stitching_figures(
         rig,
         tie_points,
@@ -134,7 +135,7 @@ def figures_of(
         balance=image.pan.balance,
         bands=image.registrations,
         present=level1,
-        changed={found.sensor for found in (*steps, *blocks)},
+        changed={*(step.sensor for step in steps), *(block.sensor for block in blocks)},
     )
     yield _saturated_overlap(rig, settings, corrected, stitching)
     yield SupportFigures(stitching.weak)
@@ -145,7 +146,7 @@ def figures_of(
     yield content_figures(adjusted.content)
     yield relative_sharpness_figures(rig, start, level1)
     yield step_figures(steps)
-    yield block_figures(blocks)
+    yield block_figures(rig, limits, blocks)
     shared = measure_common_windows(rig, mosaic.placements, level1)
     yield local_blur_figures(rig, shared)
     yield level_figures(rig, shared)
@@ -159,16 +160,25 @@ def figures_of(
     yield ParallaxFigures(parallax_px(rig, conditions, settings.relief_fraction))
 
 
-def farthest_shift_px(content: ContentCheck) -> float:
-    """How far the farthest frame lies from where points are sought.
+def misplaced_px(rig: Rig, content: ContentCheck) -> float:
+    """How far the farthest frame lies from where points are sought; zero where all are there.
+
+    Where others of the frames that lie elsewhere were not found, or most of the PAN frames were not,
+    they lie beyond the wide search: that far at least.
 
     Args:
+        rig: the camera.
         content: check of the frames' content.
 
     Returns:
         PAN pixels; zero where all are there.
     """
-    return max((math.hypot(*shift) for shift in content.shifted_px.values()), default=0.0)
+    farthest = max((math.hypot(*shift) for shift in content.shifted_px.values()), default=0.0)
+    pan = {s.name for cone in rig.pan_cones for s in cone.sensors}
+    lost = len(pan & content.mismatched.keys())
+    if (content.shifted_px and content.mismatched) or (lost > 2 and 2 * lost > len(pan)):
+        return max(farthest, float(WIDE_SEARCH_PX))
+    return farthest
 
 
 def _saturated_overlap(

@@ -23,6 +23,8 @@ from processing.radiometry.level1 import exposed_rows, level1_counts_per_dn
 from processing.rig import Rig, Sensor
 
 Array = NDArray[Any]
+EdgeLimits = tuple[float, float]
+"""Of a frame, for edges along rows and along columns, Level-1 counts."""
 
 RUN: Final = 5
 """Neighbouring bundles of pixels with the same step."""
@@ -30,6 +32,8 @@ MIN_STEP_DN: Final = 12.0
 """Of 12 bits, in each of them."""
 OVER_TEXTURE: Final = 1.0
 """Over the RMS change from line to line of the frame."""
+FOUND_OVER_LIMIT: Final = 4.5
+"""Of the smallest step looked at: the offset from which on all planted blocks were found."""
 MAX_BLUR: Final = 0.2
 """Of the step, in the lines before and after it: a lens leaves a quarter and more."""
 NEAR_PX: Final = 3 * BUNDLE_PX
@@ -71,6 +75,7 @@ def block_edges(
     placements: Mapping[str, SensorPlacement],
     frames: Mapping[str, Array],
     means: Mapping[str, LineMeans],
+    limits: Mapping[str, EdgeLimits],
 ) -> tuple[BlockEdge, ...]:
     """Search all frames for edges of changed blocks.
 
@@ -79,11 +84,15 @@ def block_edges(
         placements: of the sensors, by name.
         frames: Level-1 words by sensor name, (h, w) uint16.
         means: of their lines, by sensor name.
+        limits: by `edge_limits`.
 
     Returns:
         The largest edge of each frame that has one, the largest first.
     """
-    edges = {name: _cornered(_candidates(rig.sensor(name), lines)) for name, lines in means.items()}
+    edges = {
+        name: _cornered(_candidates(rig.sensor(name), lines, limits[name]))
+        for name, lines in means.items()
+    }
     if sum(1 for of_frame in edges.values() if of_frame) > MAX_FRAMES:
         return ()
     found = []
@@ -97,19 +106,52 @@ def block_edges(
     return tuple(sorted(found, key=lambda block: -abs(block.relative)))
 
 
-def block_figures(blocks: tuple[BlockEdge, ...]) -> BlockFigures:
-    """The largest edge in figures of the quality report.
+def edge_limits(rig: Rig, means: Mapping[str, LineMeans]) -> dict[str, EdgeLimits]:
+    """The steps from which on edges along rows and columns of each frame are looked at.
 
     Args:
-        blocks: edges of changed blocks, the largest first.
+        rig: the camera.
+        means: of the lines of the frames, by sensor name.
 
     Returns:
-        Figures of the first; empty without an edge.
+        Level-1 counts by sensor name, along rows and along columns.
     """
+    found = {}
+    for name, lines in means.items():
+        least = MIN_STEP_DN * level1_counts_per_dn(rig.sensor(name).bits)
+        by_row, by_column = (
+            max(least, OVER_TEXTURE * _texture(by_line)) if len(by_line) else least
+            for by_line in (lines.by_row, lines.by_column)
+        )
+        found[name] = (by_row, by_column)
+    return found
+
+
+def block_figures(
+    rig: Rig, limits: Mapping[str, EdgeLimits], blocks: tuple[BlockEdge, ...]
+) -> BlockFigures:
+    """The largest edge, and which blocks would not be found, in figures of the quality report.
+
+    Args:
+        rig: the camera.
+        limits: by `edge_limits`.
+        blocks: by `block_edges`.
+
+    Returns:
+        Figures of the first edge, and the limit of the frame with the coarsest texture.
+    """
+    limits_dn = {
+        name: FOUND_OVER_LIMIT * max(limit) / level1_counts_per_dn(rig.sensor(name).bits)
+        for name, limit in limits.items()
+    }
+    coarsest = max(limits_dn, key=lambda name: limits_dn[name], default=None)
+    limit_dn = None if coarsest is None else limits_dn[coarsest]
     if not blocks:
-        return BlockFigures()
+        return BlockFigures(block_limit_dn=limit_dn, block_limit_sensor=coarsest)
     worst = blocks[0]
     return BlockFigures(
+        block_limit_dn=limit_dn,
+        block_limit_sensor=coarsest,
         block_sensor=worst.sensor,
         block_step_dn=worst.step_dn,
         block_step=worst.relative,
@@ -129,18 +171,16 @@ class _Edge:
     step: float
 
 
-def _candidates(sensor: Sensor, lines: LineMeans) -> list[_Edge]:
+def _candidates(sensor: Sensor, lines: LineMeans, limits: tuple[float, float]) -> list[_Edge]:
     """Runs of bundles with the same step between two lines, the largest first."""
-    least = MIN_STEP_DN * level1_counts_per_dn(sensor.bits)
     edges: list[_Edge] = []
     axes: tuple[tuple[Literal["rows", "columns"], Array, int, int], ...] = (
         ("rows", lines.by_row, lines.first_row, sensor.width_px),
         ("columns", lines.by_column, 0, sensor.height_px),
     )
-    for axis, by_line, offset, length in axes:
+    for (axis, by_line, offset, length), limit in zip(axes, limits, strict=True):
         if len(by_line) < RUN:
             continue
-        limit = max(least, OVER_TEXTURE * _texture(by_line))
         pace = length // len(by_line)
         for sign in (1.0, -1.0):
             places = np.flatnonzero(_has_run(by_line, sign, limit, RUN))

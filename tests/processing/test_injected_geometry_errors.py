@@ -92,6 +92,9 @@ def test_the_principal_distance_of_another_cone_is_corrected_and_named(
         ("SU30", "rows", 416, 1, None, 1.0),
         ("SU30", "columns", 600, 1, None, 1.0),
         ("G", "rows", 300, 1, None, 3.0),
+        # Farther than tie points of colour are sought.
+        ("G", "rows", 500, 3, 207, 9.0),
+        ("G", "columns", 300, 4, 160, 12.0),
     ],
 )
 def test_a_read_out_slip_is_found_named_and_measured(
@@ -209,3 +212,20 @@ def test_slips_of_converging_heads_are_named(
     outcome = converging.with_frame("P2", slipped(axis, first, by, length)).outcome()
     assert outcome.verdict == "refly" and outcome.figure("slip_sensor") == "P2"
     assert "CALIBRATION_EXPIRED" not in outcome.flags, outcome.sentences
+
+
+@pytest.mark.parametrize("angle", ["x_rad", "y_rad", "z_rad"])
+def test_a_converging_head_that_turned_about_any_axis_is_named(angle: str) -> None:
+    turned = with_platform_rotation(**{angle: -2.4e-4})
+    outcome = rendered("dmc-mini").with_cone("1", turned).outcome()
+    assert "CALIBRATION_EXPIRED" in outcome.flags and outcome.figure("platform_shift_head") == "1"
+    assert outcome.figure("platform_shift_px") > 0.1
+    assert outcome.true_sigma_px < 2.0 * outcome.stated_sigma_px
+
+
+def test_a_turn_below_its_detection_limit_widens_the_sigma_by_the_mean() -> None:
+    healthy = rendered("dmc-mini")
+    turned = healthy.with_cone("2", with_platform_rotation(x_rad=-1e-4)).outcome()
+    assert turned.verdict == "good", turned.sentences
+    assert_covered(turned)
+    assert turned.stated_sigma_px > 1.3 * healthy.outcome().stated_sigma_px

@@ -65,6 +65,18 @@ def test_a_gain_step_or_banding_in_a_coarse_colour_head_is_named(sensor: str, ax
         assert outcome.figure("signal_step_axis") == ("rows", "columns")[axis]
 
 
+@pytest.mark.parametrize(
+    ("rig", "sensor", "line", "factor"),
+    [("ultracam-x-mini", "SU30", 338, 0.88), ("ultracam-l-mini", "SU10", 375, 1.27)],
+)
+def test_a_step_within_a_frame_accuses_no_neighbour_of_another_gain(
+    rig: str, sensor: str, line: int, factor: float
+) -> None:
+    outcome = rendered(rig).with_frame(sensor, gain(factor, line)).outcome()
+    assert outcome.figure("signal_step_sensor") == sensor
+    assert outcome.figure("gain_outlier") is None, outcome.sentences
+
+
 def test_banding_is_named(error_free: InjectedExposure) -> None:
     outcome = error_free.with_frame("SU10", banded(30, 20)).outcome()
     assert outcome.figure("signal_step_sensor") == "SU10" and "banding" in outcome.sentences
@@ -221,6 +233,26 @@ def test_a_block_with_another_offset_is_named_with_an_edge(
     assert abs(outcome.figure("block_step_dn")) == pytest.approx(abs(dn), rel=0.3)
     edges = (rows if outcome.figure("block_axis") == "rows" else columns).indices(1248)[:2]
     assert outcome.figure("block_at") + 1 in edges
+
+
+def test_a_block_over_ground_of_other_brightness_on_each_side_is_named() -> None:
+    planted = block(600, slice(72, 200), slice(209, 401))
+    outcome = rendered("dmc-mini").with_frame("G", planted).outcome()
+    assert outcome.verdict == "usable" and outcome.figure("block_sensor") == "G"
+
+
+@pytest.mark.parametrize("rig", ["ultracam-x-mini", "ultracam-l-mini", "dmc-mini"])
+def test_a_block_is_named_or_smaller_than_what_the_report_states(rig: str) -> None:
+    exposure = rendered(rig)
+    sensors = [cone.sensors[0] for cone in exposure.rig.cones]
+    for sensor in sensors[:: max(1, len(sensors) // 3)]:
+        part = slice(sensor.height_px // 3, 2 * sensor.height_px // 3)
+        across = slice(sensor.width_px // 4, sensor.width_px // 2)
+        outcome = exposure.with_frame(sensor.name, block(40, part, across)).outcome()
+        found = outcome.figure("block_sensor") == sensor.name
+        assert found or outcome.figure("block_limit_dn") > 40.0
+        assert 40.0 < outcome.figure("block_limit_dn") < 250.0
+        assert outcome.figure("block_limit_sensor") in exposure.frames
 
 
 @pytest.mark.parametrize(("sensor", "level_dn"), [("SU21", 1500), ("G", 1200), ("N", 1500)])

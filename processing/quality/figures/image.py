@@ -116,6 +116,12 @@ class BlockFigures(FigureGroup):
     block_at: Annotated[int | None, "the last line before it, raw pixels"] = None
     block_first: Annotated[int | None, "first pixel of the edge in these lines"] = None
     block_last: Annotated[int | None, "last pixel of it"] = None
+    block_limit_dn: Annotated[
+        float | None,
+        "offset of a block from which on it is found in any frame of this exposure, DN; smaller "
+        "ones may be in the image, where the ground's texture hides them",
+    ] = None
+    block_limit_sensor: Annotated[str | None, "the frame whose texture hides most"] = None
 
 
 @dataclass(frozen=True)

@@ -173,7 +173,8 @@ class PlatformFigures(FigureGroup):
     ] = None
     platform_shift_px: Annotated[
         float | None,
-        "how far the head that moved most went by it, PAN pixels at its middle",
+        "how far the head that turned most went by it, PAN pixels: of converging heads the "
+        "farthest point of its frame, else its middle",
     ] = None
     platform_shift_head: Annotated[str | None, "which head that is"] = None
     platform_alternatives: Annotated[Names, "cones that explain them nearly as well"] = ()

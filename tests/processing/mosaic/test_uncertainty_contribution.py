@@ -162,9 +162,16 @@ def test_where_several_cones_changed_the_master_is_known_no_better(name: str, al
     datum = found(rig, mosaic, layers=layers).datum
     per_mm = 1e-6 / mosaic.model.pitch_mm
     f_px = mosaic.model.f_mm * per_mm
-    shifts = np.array([(50.0**2 + 70.0**2) / 2.0, 40.0**2 / 2.0]) * f_px**2 * alone
+    shift = (50.0**2 + 70.0**2 + 40.0**2) / 4.0 * f_px**2 * alone
     scale = (300.0**2 + 400.0**2) / 2.0 * per_mm**2
-    np.testing.assert_allclose(datum, np.diag([*shifts, scale, 0.0]), rtol=1e-9)
+    np.testing.assert_allclose(datum, np.diag([shift, shift, scale, 0.0]), rtol=1e-9)
+    # A single master sensor that changed as well is known no better.
+    also = dataclasses.replace(layers, causes=("1", "0"))
+    of_master = found(rig, mosaic, layers=also).datum
+    if alone:
+        np.testing.assert_allclose(of_master, datum, rtol=1e-9)
+    else:
+        assert not of_master.any()
 
 
 def test_old_temperatures_move_the_datum_by_their_age() -> None:
@@ -203,7 +210,8 @@ def test_heads_that_turned_move_the_mean_and_may_have_displaced_sensors() -> Non
     of_second = [part.layers["2"] for part in disturbed.parts[-2:]]
     shifts = np.diag([6e-5, -4e-5, 0.0])[:2] * mosaic.model.f_mm
     np.testing.assert_allclose(of_second, shifts, atol=1e-12)
-    fits = dataclasses.replace(expired, statistic=19.0)
+    usual = tuple(dataclasses.replace(head, usual_rad=5e-5) for head in heads)
+    fits = dataclasses.replace(expired, heads=usual, statistic=19.0)
     fewer = found(rig, mosaic, platform=fits, held=held)
     assert not fewer.datum.any() and len(fewer.parts) == len(disturbed.parts) - 4
 
@@ -374,12 +382,27 @@ def test_where_several_moved_any_two_may_be_in_place() -> None:
     np.testing.assert_allclose(datum, expected, rtol=5e-3, atol=1e-9)
 
 
-def test_heads_that_moved_nearly_as_far_are_alternatives() -> None:
-    moved = {"1": (0.9, 0.0), "2": (0.0, -2.0), "3": (0.8, 0.8), "4": (0.0, 0.99)}
+def test_heads_that_turned_nearly_as_far_are_alternatives() -> None:
+    turns = {"1": 0.9, "2": 2.0, "3": 1.1, "4": 0.99}
     heads = tuple(
-        dataclasses.replace(_head(name, (0.0, 0.0, 0.0), 0.0), shift_px=shift)
-        for name, shift in moved.items()
+        dataclasses.replace(_head(name, (0.0, 0.0, 0.0), 0.0), turn=turn)
+        for name, turn in turns.items()
     )
     failed = PlatformCheck(heads, np.eye(12), 50.0, 9, 20.0)
     assert failed.farthest.cone == "2" and failed.alternatives == ("3",)
     assert dataclasses.replace(failed, statistic=20.0).alternatives == ()
+
+
+def test_a_turn_that_is_not_significant_moves_the_mean_by_what_is_beyond_the_usual() -> None:
+    rig, mosaic = mosaic_of("dmc-mini")
+    heads = tuple(
+        dataclasses.replace(_head(name, (angle, 0.0, 0.0), 0.0), usual_rad=2e-5)
+        for name, angle in (("1", 3.9e-5), ("2", -5e-5))
+    )
+    passed = PlatformCheck(heads, np.zeros((6, 6)), 19.0, 3, 20.0)
+    held = quantities(mosaic, (0.0, 0.0, 0.0, 0.0))
+    f_px = mosaic.model.f_mm / mosaic.model.pitch_mm
+    beyond = np.array([0.0, -3e-5 * f_px, 0.0, 0.0])
+    np.testing.assert_allclose(
+        found(rig, mosaic, platform=passed, held=held).datum, np.outer(beyond, beyond), atol=1e-12
+    )
