@@ -55,7 +55,7 @@ def _clean(number: int, seed: int) -> Row:
     light = number // DRAWS
     rig = RIGS[light % len(RIGS)]
     scene = list(SCENES)[light // len(RIGS) % len(SCENES)]
-    place = _first_without_smear(rig, scene, FIRST + 10 * light)
+    place = first_without_smear(rig, scene, FIRST + 10 * light)
     emulated = remeasured(rig, place, seed * 1_000_000 + number, scene=scene)
     product = emulated.process()
     report = product.report
@@ -81,7 +81,7 @@ def _clean(number: int, seed: int) -> Row:
     }
 
 
-def _first_without_smear(rig: str, scene: str, first: int) -> int:
+def first_without_smear(rig: str, scene: str, first: int) -> int:
     """The first exposure from `first` on without true smear: the mount's tremor smears some."""
     for number in range(first, first + 10):
         if true_smear_px(world_of(rig, number, scene), 0) < MAX_TRUE_SMEAR_PX:

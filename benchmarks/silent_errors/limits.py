@@ -42,7 +42,7 @@ LIMITS: Final[Mapping[str, Limit]] = {
     "slip": Limit("lines of a frame shifted by 1 to 4 px", "lines", _same_limit(STITCHED, 80.0)),
     "blur": Limit("a PAN head blurred", "px (sigma)", _same_limit(STITCHED, 1.0)),
     "blur-region": Limit("a quarter of a PAN frame blurred", "px (sigma)", _same_limit(STITCHED, 1.5)),
-    "blur-band": Limit("a colour head blurred", "px (sigma)", _same_limit(STITCHED, 1.5)),
+    "blur-band": Limit("a colour head blurred", "px (sigma)", {X: 2.5, L: 1.5, DMC: 1.5}),
     "smear": Limit("a PAN head smeared along or across", "px", _same_limit(STITCHED, 4.0)),
     "gain-step": Limit("signal of a PAN frame from one line on", "%", _same_limit(EVERY, 8.0)),
     "gain-step-colour": Limit(
@@ -55,7 +55,7 @@ LIMITS: Final[Mapping[str, Limit]] = {
     ),
     "block-offset": Limit("a block of a PAN frame brighter", "DN", {X: 160.0, L: 80.0, DMC: 80.0}),
     "block-offset-colour": Limit(
-        "a block of a colour frame brighter", "DN", {X: 80.0, L: 160.0, DMC: 160.0}
+        "a block of a colour frame brighter", "DN", _same_limit(STITCHED, 160.0)
     ),
     "clipping": Limit("pixels of a PAN head clipped below full scale", "%", _same_limit(STITCHED, 2.0)),
     "exposure-pan": Limit("exposure time of a PAN head", "%", _same_limit((X, DMC), 8.0)),
