@@ -49,7 +49,15 @@ def main() -> None:
 
 
 def planted(exposures: int, seed: int) -> Iterator[Row]:
-    """Outcomes of all blocks, and the frames that were named where nothing was planted."""
+    """Plant blocks in exposures of every rig over every scene.
+
+    Args:
+        exposures: of each rig and scene.
+        seed: for all random generators.
+
+    Yields:
+        Outcomes of all blocks, and the frames that were named where nothing was planted.
+    """
     random = np.random.default_rng(seed)
     number = 0
     for scene in SCENES:
