@@ -41,10 +41,14 @@ def print_rig(console: Console, answers: Answers) -> None:
 
 
 def is_failed(results: Sequence[CheckResult]) -> bool:
-    """Whether an item of the check fails; one that is waiting does not."""
-    from daemon.onboard.preflight.check_results import CheckOutcome
+    """Whether an item of the check fails; one that is waiting does not, nor a strobe without cable."""
+    return any(one.outcome.value == "fail" and not is_absent_mark(one) for one in results)
 
-    return any(one.outcome is CheckOutcome.FAIL for one in results)
+
+def is_absent_mark(one: CheckResult) -> bool:
+    """Whether a receiver gave no event mark: the rig flies with the time of its triggers."""
+    is_mark = one.kind == "stream" and one.name.startswith("event mark ")
+    return is_mark and one.outcome.value == "fail"
 
 
 def print_end(
@@ -83,6 +87,9 @@ def _print_results(console: Console, results: Sequence[CheckResult]) -> None:
         if outcome == "pass" and not is_caution:
             continue
         label = ": ".join(filter(None, (one.kind, one.name, one.sentence)))
+        if is_absent_mark(one):
+            label += ". Until then exposures have the time of their trigger and MARK_MISSING"
+            outcome, is_caution = "missing", True
         style = "yellow" if is_caution else COLOURS[outcome]
         console.print(f"  {outcome}  {label}", style=style, soft_wrap=True)
 
@@ -99,6 +106,7 @@ def initialization_json(
     from daemon.initialization.rig_text import sensor_names
     from daemon.onboard.preflight.check_results import worst_outcome
 
+    judged = [one for one in results if not is_absent_mark(one)]
     return {
         "rig": answers.name,
         "arrangement": answers.arrangement.value,
@@ -122,7 +130,7 @@ def initialization_json(
         "ports": [result_json(one) for one in found],
         "written": [str(path) for path in written],
         "provisional": [one._asdict() for one in provisional],
-        "outcome": worst_outcome(results).value if results else "not tried",
+        "outcome": worst_outcome(judged).value if results else "not tried",
         "findings": [result.as_json() for result in results],
         "seconds": round(seconds, 2),
     }

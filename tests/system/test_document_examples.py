@@ -18,13 +18,14 @@ import subprocess
 import time
 import tomllib
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import pytest
 
+from benchmarks import first_exposure
 from tests.daemon.rededge_data import RECORDED
 
 ROOT: Final = Path(__file__).parents[2]
@@ -37,12 +38,17 @@ PAGES: Final = sorted(
 BLOCK_TIMEOUT_S: Final = 1800
 PAGE_TIMEOUT_S: Final = 7200
 END_TIMEOUT_S: Final = 300
+SYSTEM_PATH: Final = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin"
 
 LONG: Final = {"how-to/processing/calibration.md"}
 """Pages that render whole laboratory series; `make soak` runs them."""
 
+OWN_NETWORK: Final = {"tutorials/your-own-hardware.md"}
+"""Pages that search for heads or change addresses; they run in a network namespace of their own."""
+
 NOT_RUN: Final[Mapping[tuple[str, str], str]] = {
     ("tutorials/getting-started.md", "clone"): "installs the system; the tests run after it",
+    ("tutorials/your-own-hardware.md", "wheel"): "tests/system/test_wheel.py installs the wheel",
     ("how-to/flight/installation.md", "root"): "changes the system; tests/installed flies the unit",
     ("how-to/flight/link-budget.md", "devices"): "opens every device of a service",
     ("how-to/flight/finding-devices.md", "devices"): "asks every port and network of the machine",
@@ -89,13 +95,19 @@ def page_of(name: str) -> str:
 
 
 class Session:
-    """A reader's shells in one folder; those that run on end with their section."""
+    """A reader's shells in one folder; those that run on end with their section.
 
-    def __init__(self, folder: Path) -> None:
+    Args:
+        folder: where the commands run.
+        inside: command that runs others in a network of their own.
+    """
+
+    def __init__(self, folder: Path, inside: tuple[str, ...] = ()) -> None:
         self._folder = folder
+        self._inside = inside
         self._environment = {
             **{name: os.environ[name] for name in ("HOME", "LANG") if name in os.environ},
-            "PATH": f"{ROOT / '.venv/bin'}:/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin",
+            "PATH": ":".join((str(folder / "bin"), str(ROOT / ".venv/bin"), SYSTEM_PATH)),
             "COLUMNS": "120",
             "PYTHONUNBUFFERED": "1",
         }
@@ -112,7 +124,7 @@ class Session:
         """Run a block to its end."""
         allowed = {int(one) for one in block.options.get("status", "0").split()}
         done = subprocess.run(
-            ["bash", "-euo", "pipefail", "-c", block.text],
+            [*self._inside, "bash", "-euo", "pipefail", "-c", block.text],
             cwd=self._folder, env=self._environment, stdin=subprocess.DEVNULL,
             capture_output=True, text=True, timeout=BLOCK_TIMEOUT_S, check=False,
         )  # fmt: skip
@@ -124,7 +136,7 @@ class Session:
         log = self._folder / f"terminal-{len(self._terminals)}.log"
         with log.open("wb") as output:
             process = subprocess.Popen(
-                ["env", "--default-signal=INT", "bash", "-euo", "pipefail", "-c", block.text],
+                [*self._inside, "env", "--default-signal=INT", "bash", "-euo", "pipefail", "-c", block.text],
                 cwd=self._folder, env=self._environment, stdin=subprocess.DEVNULL,
                 stdout=output, stderr=subprocess.STDOUT, start_new_session=True,
             )  # fmt: skip
@@ -152,6 +164,32 @@ class Session:
                 os.killpg(process.pid, signal.SIGKILL)
                 process.wait(20)
                 raise
+
+
+@contextmanager
+def own_network() -> Iterator[tuple[str, ...]]:
+    """A command that runs others in a new network namespace; a skip where that is not allowed."""
+    lacks = first_exposure.missing()
+    if lacks is not None:
+        pytest.skip(lacks)
+    holder = subprocess.Popen(
+        [*first_exposure.NAMESPACE, "sh", "-c", "ip link set lo up && echo up && exec sleep 86400"],
+        stdout=subprocess.PIPE,
+    )
+    try:
+        assert holder.stdout is not None and holder.stdout.readline() == b"up\n"
+        yield ("nsenter", "--target", str(holder.pid), "--user", "--net")
+    finally:
+        holder.kill()
+        holder.wait(END_TIMEOUT_S)
+
+
+def allow_as_root(folder: Path) -> None:
+    """A `sudo` for commands that are root in their namespace already."""
+    shim = folder / "bin" / "sudo"
+    shim.parent.mkdir()
+    shim.write_text('#!/bin/sh\nexec "$@"\n')
+    shim.chmod(0o755)
 
 
 def merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
@@ -200,7 +238,10 @@ def test_the_blocks_of_a_page_run_in_their_order(name: str, tmp_path: Path) -> N
             pytest.skip("needs recorded exposures in ../shared/data/rededge")
         (tmp_path / "0000SET").symlink_to(RECORDED / "0000SET")
     with ExitStack() as stack:
-        session = stack.enter_context(Session(tmp_path))
+        inside = stack.enter_context(own_network()) if name in OWN_NETWORK else ()
+        if inside:
+            allow_as_root(tmp_path)
+        session = stack.enter_context(Session(tmp_path, inside))
         for block in listed:
             session.enter(block.section)
             if block.language != "sh":

@@ -57,6 +57,9 @@ DATA_TIMEOUT_S: Final = 10.0
 KERNELS_TIMEOUT_S: Final = 120.0
 """Loading takes seconds; compiling may take minutes and is not awaited."""
 STEP_S: Final = 0.1
+FIRE_TRIES: Final = 3
+FIRE_TIMEOUT_S: Final = 5.0
+FIRE_PAUSE_S: Final = 0.5
 WITHOUT_MARKS: Final = frozenset({"gpsd"})
 """Drivers of receivers that have no event marks."""
 MARK_ACTION: Final = "check the strobe cable, and that the receiver is set to send its marks"
@@ -115,6 +118,8 @@ class SystemCheck:
         """The last datum of each stream, by kind and name."""
         self._device_faults: dict[str, str] = {}
         self._not_fired = ""
+        self._has_fired: bool | None = None
+        self._opened: set[str] = set()
 
     async def run(self) -> list[CheckResult]:
         """Everything that was found, in the order of the devices.
@@ -128,7 +133,8 @@ class SystemCheck:
             self._supervisor.spawn(*capture_process(self._configuration, self._rig, rings))
             await self._until(lambda: all(map(self._has_answered, self._specs)), BIND_TIMEOUT_S)
             if self._fire and "trigger" in self._bound:
-                self._fire_once()
+                await self._until(self._heads_are_open, DATA_TIMEOUT_S)
+                await self._fire_once()
             await self._until(self._is_verified, DATA_TIMEOUT_S)
             await self._until(self._worker_has_answered, KERNELS_TIMEOUT_S)
             return list(self._findings())
@@ -137,8 +143,19 @@ class SystemCheck:
 
     # While it runs
 
-    def _fire_once(self) -> None:
-        self._sequence.fire(self._line.order(time.monotonic_ns()))
+    async def _fire_once(self) -> None:
+        """Fire one exposure; again if no head could be triggered, as while its stream starts."""
+        for _ in range(FIRE_TRIES):
+            self._has_fired = None
+            self._sequence.fire(self._line.order(time.monotonic_ns()))
+            await self._until(lambda: self._has_fired is not None, FIRE_TIMEOUT_S)
+            if self._has_fired:
+                return
+            await asyncio.sleep(FIRE_PAUSE_S)
+
+    def _heads_are_open(self) -> bool:
+        heads = {spec.name for spec in self._specs if spec.kind == "head"}
+        return heads & self._bound.keys() <= self._opened
 
     def _dispatch(self, message: object) -> None:
         if (record := self._recorders.get(type(message))) is not None:
@@ -184,12 +201,14 @@ class SystemCheck:
             self._data[f"head {frame.head}"] = frame
 
     def _on_device_event(self, event: DeviceEvent) -> None:
-        if event.name != "opened":
+        if event.name == "opened":
+            self._opened.add(event.device)
+        else:
             self._device_faults[event.device] = event.sentence
 
     def _on_fired(self, fired: Fired) -> None:
-        if fired.pulse is None:
-            self._not_fired = fired.sentence
+        self._has_fired = fired.pulse is not None
+        self._not_fired = "" if self._has_fired else fired.sentence
 
     @property
     def _handlers(self) -> Handlers:
