@@ -46,7 +46,7 @@ class FirstExposure:
 
 
 def missing() -> str | None:
-    """What this computer lacks for the measurement; None if nothing."""
+    """What this computer needs for the measurement; None if nothing."""
     if shutil.which(FAKE_CAMERA) is None:
         return f"needs {FAKE_CAMERA} (Debian package aravis-tools)"
     if shutil.which("ip") is None:
@@ -177,9 +177,9 @@ def main(arguments: Sequence[str]) -> int:
         with tempfile.TemporaryDirectory() as folder:
             print(json.dumps(asdict(_measure_here(arrangement, int(heads), Path(folder)))))
         return 0
-    lacks = missing()
-    if lacks is not None:
-        print(lacks, file=sys.stderr)
+    needed = missing()
+    if needed is not None:
+        print(needed, file=sys.stderr)
         return 1
     print(f"load {os.getloadavg()[0]:.1f}", file=sys.stderr)
     for arrangement, heads in ARRANGEMENTS:

@@ -169,9 +169,9 @@ class Session:
 @contextmanager
 def own_network() -> Iterator[tuple[str, ...]]:
     """A command that runs others in a new network namespace; a skip where that is not allowed."""
-    lacks = first_exposure.missing()
-    if lacks is not None:
-        pytest.skip(lacks)
+    needed = first_exposure.missing()
+    if needed is not None:
+        pytest.skip(needed)
     holder = subprocess.Popen(
         [*first_exposure.NAMESPACE, "sh", "-c", "ip link set lo up && echo up && exec sleep 86400"],
         stdout=subprocess.PIPE,

@@ -19,9 +19,9 @@ LIMIT_S = 180.0
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize(("arrangement", "heads"), first_exposure.ARRANGEMENTS)
 def test_the_first_exposure_is_stored_within_minutes(arrangement: str, heads: int) -> None:
-    lacks = first_exposure.missing()
-    if lacks is not None:
-        pytest.skip(lacks)
+    needed = first_exposure.missing()
+    if needed is not None:
+        pytest.skip(needed)
     found = first_exposure.measure(arrangement, heads)
     print(found)
     assert found.check in ("pass", "waiting")
