@@ -78,6 +78,14 @@ def test_every_key_of_the_configuration_has_a_meaning() -> None:
     assert [(header, row[0]) for header, _, rows in listed for row in rows if not row[-1]] == []
 
 
+def test_every_key_of_a_rig_file_has_a_meaning() -> None:
+    from processing.rig.rig_file import RigFile
+
+    listed = list(tables.sections(RigFile.model_json_schema()))
+    assert sum(len(rows) for _, _, rows in listed) > 60
+    assert [(header, row[0]) for header, _, rows in listed for row in rows if not row[-1]] == []
+
+
 def test_every_key_of_a_rig_file_is_on_its_page() -> None:
     from processing.rig import Cone, Lens, Sensor, ThermalDrift, VirtualImage
 

@@ -33,6 +33,7 @@ def publish_calibration(
     The report's id is `place.name`; a digest of the content is appended. `rig_file` builds
     `rig.toml` from the complete id.
     """
+    from daemon.configuration.schemas import SCHEMA_FILES, schema_file_name
     from daemon.postflight.calibration.calibration_report import (
         calibration_json,
         with_content_id,
@@ -40,6 +41,8 @@ def publish_calibration(
     )
 
     report, files = with_content_id(report, files or {}, rig_file)
+    if rig_file is not None:
+        files[schema_file_name("rig")] = SCHEMA_FILES["rig"].read_bytes()
     folder = place.of(report.calibration_id)
     # The same content has the same id: it is there already.
     if place.folder is not None or not folder.exists():

@@ -28,9 +28,9 @@ from daemon.cli.sim import (
     free_first_address,
     service_toml,
     simulator_arguments,
+    write_service_file,
 )
 from daemon.errors import DaemonError
-from daemon.mission.store.durable import replace_file
 from daemon.terminal.console import Console
 from daemon.terminal.tables import light_table
 from drivers.base.extras import require
@@ -127,7 +127,7 @@ def _fly(
         end_when_done=True,
         watch_port=0,
     )
-    replace_file(config, text.encode("utf-8"))
+    write_service_file(config, text)
     log = (folder / "service.log").open("w")
     service = subprocess.Popen(
         [

@@ -18,6 +18,7 @@ from typing import Annotated, Any
 import typer
 
 from daemon.cli.options import AsJson
+from daemon.configuration.schemas import SCHEMA_FILES, schema_file_name, schema_line
 from daemon.errors import DaemonError
 from daemon.mission.store.durable import replace_file
 from daemon.terminal.console import Console
@@ -125,7 +126,7 @@ def sim(
     emulator = Emulator(arguments)
     path = out / "service.toml"
     text = service_toml(emulator.ready, root="missions", watch_port=8470)
-    replace_file(path, text.encode("utf-8"))
+    write_service_file(path, text)
     if as_json:
         typer.echo(json.dumps(emulator.ready | {"configuration": str(path)}))
     else:
@@ -171,6 +172,12 @@ def free_first_address() -> str:
     raise EmulatorError("256 emulated rigs are running here already; end one of them")
 
 
+def write_service_file(path: Path, text: str) -> None:
+    """Write a service configuration, and the schema that its first line names."""
+    replace_file(path.parent / schema_file_name("service"), SCHEMA_FILES["service"].read_bytes())
+    replace_file(path, text.encode("utf-8"))
+
+
 def service_toml(
     ready: Mapping[str, Any],
     *,
@@ -189,6 +196,7 @@ def service_toml(
     probes = ready["probes"]
     host, _, port = ready["pulse_bus"].rpartition(":")
     lines = [
+        schema_line("service"),
         "# Written by `syntopic sim` for the devices it emulates.",
         "[mission]",
         f"root = {_quoted(root)}",

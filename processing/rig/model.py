@@ -65,7 +65,7 @@ def _ascending(steps: tuple[float, ...]) -> tuple[float, ...]:
 Steps = Annotated[tuple[Number, ...], AfterValidator(_ascending)]
 Rows = tuple[tuple[Number, ...], ...]
 
-_KNOWN_KEYS_ONLY: Final = ConfigDict(extra="forbid")
+_KNOWN_KEYS_ONLY: Final = ConfigDict(extra="forbid", use_attribute_docstrings=True)
 
 
 @dataclass(frozen=True)
@@ -78,11 +78,17 @@ class ThermalDrift:
     __pydantic_config__ = _KNOWN_KEYS_ONLY
 
     x_um_per_k: Number = 0.0
+    """Shift to the right."""
     y_um_per_k: Number = 0.0
+    """Shift up."""
     rotation_urad_per_k: Number = 0.0
+    """Counter-clockwise rotation."""
     scale_ppm_per_k: Number = 0.0
+    """Growth of the distances on the sensor."""
     sigma_um_per_k: Number = 0.0
+    """Standard deviation of both shifts."""
     lag_s: Number = 0.0
+    """Time constant with which the sensor follows its probe."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,27 +106,49 @@ class Sensor:
     __pydantic_config__ = _KNOWN_KEYS_ONLY
 
     name: Name
+    """Name of the sensor, of its files and of its head."""
     serial: Text = ""
+    """Serial number of the head; compared when it connects. Empty: not compared."""
     width_px: SidePx
+    """Columns of a frame."""
     height_px: SidePx
+    """Rows of a frame."""
     pitch_um: PitchUm
+    """Distance of pixel centres."""
     x_mm: Number
+    """Centre of the pixel array in the layer, to the right."""
     y_mm: Number
+    """Centre of the pixel array in the layer, up."""
     rotation_rad: Number = 0.0
+    """Counter-clockwise rotation in the layer."""
     scale: Positive = 1.0
+    """Scale against the nominal pitch, near one."""
     position_sigma_um: Number = 0.0
+    """Standard deviation of each calibrated coordinate."""
     calibration_c: Number
+    """Temperature at calibration; default: that of the cone."""
     probe: Text
+    """Temperature probe; empty: none. Default: that of the cone."""
     drift: ThermalDrift = field(default_factory=ThermalDrift)
+    """Drift with temperature."""
     bits: Annotated[int, Strict(), Field(ge=1, le=16)] = 12
+    """Bits of a DN."""
     black_dn: Number = 0.0
+    """Signal without light."""
     electrons_per_dn: Positive = 1.0
+    """Electrons that raise the signal by one DN."""
     read_noise_e: Number = 0.0
+    """Noise of the readout."""
     colour_filter_array: ColourFilterArray = "none"
+    """Bayer pattern of pixels (0, 0), (1, 0), (0, 1), (1, 1), as (column, row)."""
     tdi_row_sign: Literal[-1, 1] = 1
+    """1: TDI moves charge to higher rows; -1: to lower ones."""
     justified: Literal["right", "left"] = "right"
+    """Whether a word is the DN (right) or the DN times 2^(16 - bits) (left)."""
     skew_x_ppm_per_mm: SkewPpmPerMm = 0.0
+    """Perspective skew along x."""
     skew_y_ppm_per_mm: SkewPpmPerMm = 0.0
+    """Perspective skew along y."""
 
     @property
     def pitch_mm(self) -> float:
@@ -154,9 +182,13 @@ class LensGrid:
     __pydantic_config__ = _KNOWN_KEYS_ONLY
 
     x_mm: Steps
+    """Columns of nodes, ascending by equal steps."""
     y_mm: Steps
+    """Rows of nodes, ascending by equal steps."""
     dx_um: Rows
+    """Corrections in x, one list for each row of nodes."""
     dy_um: Rows
+    """Corrections in y, one list for each row of nodes."""
 
 
 @dataclass(frozen=True)
@@ -171,21 +203,37 @@ class Lens:
     __pydantic_config__ = _KNOWN_KEYS_ONLY
 
     f_mm: FocalLengthMm
+    """Principal distance; the focal length of a lens that is not calibrated."""
     f_ppm_per_k: Number = 0.0
+    """Drift of the principal distance."""
     f_number: Positive = 5.6
+    """Aperture of the calibration."""
     serial: Text = ""
+    """Serial number of the lens; compared with `[serials]` of the service configuration."""
     dx0_mm: Number = 0.0
+    """Principal point, x."""
     dy0_mm: Number = 0.0
+    """Principal point, y."""
     df_mm: Number = 0.0
+    """Correction of the principal distance."""
     k1: Number = 0.0
+    """Radial distortion, mm^-2."""
     k2: Number = 0.0
+    """Radial distortion, mm^-4."""
     k3: Number = 0.0
+    """Radial distortion, mm^-6."""
     p1: Number = 0.0
+    """Decentring distortion, mm^-1."""
     p2: Number = 0.0
+    """Decentring distortion, mm^-1."""
     b1: Number = 0.0
+    """Affinity."""
     b2: Number = 0.0
+    """Shear."""
     residual_grid: LensGrid | None = None
+    """Corrections in addition to these ten."""
     f_sigma_ppm: Positive = 20.0
+    """Standard deviation of the principal distance."""
 
 
 def _of_a_camera(sensor: Sensor) -> Sensor:
@@ -224,20 +272,32 @@ class Cone:
     __pydantic_config__ = _KNOWN_KEYS_ONLY
 
     name: Name
+    """Name of the cone."""
     role: Role
+    """Whether it is part of the panchromatic image."""
     bands: tuple[Band, ...]
+    """Bands of its pixels."""
     position_mm: Triple
+    """Projection centre in the body frame: forward, right, down."""
     rotation_rad: Triple
+    """Omega, phi, kappa against the master cone or the virtual camera."""
     probe: Text
+    """Temperature probe; empty: none."""
     calibration_c: Number
+    """Temperature at calibration."""
     mark_to_mid_exposure_ns: OffsetNs = 0
+    """From the event mark to mid-exposure."""
     mark_to_mid_exposure_sigma_ns: Annotated[OffsetNs, Field(ge=0)] = 1000
+    """Standard deviation of that time, jitter included."""
     lens: Annotated[Lens, AfterValidator(_with_full_grid)]
+    """The lens."""
     sensors: Annotated[
         tuple[Annotated[Sensor, AfterValidator(_of_a_camera)], ...],
         Field(alias="sensor", min_length=1),
     ]
+    """The sensors in its focal plane."""
     rotation_sigma_urad: Positive = 30.0
+    """Standard deviation of each small rotation."""
 
 
 @dataclass(frozen=True)
@@ -250,10 +310,15 @@ class VirtualImage:
     __pydantic_config__ = _KNOWN_KEYS_ONLY
 
     width_px: SidePx
+    """Columns of the stitched image."""
     height_px: SidePx
+    """Rows of the stitched image."""
     pitch_um: PitchUm
+    """Pixel size of the stitched image."""
     f_mm: FocalLengthMm
+    """Principal distance of the stitched image."""
     colour_ratio: Annotated[Positive, AfterValidator(_whole_stays_whole)] = 1
+    """Pixels along the side of a colour pixel."""
 
     @property
     def pitch_mm(self) -> float:

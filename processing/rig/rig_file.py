@@ -88,7 +88,9 @@ ConeName = Annotated[Text, AfterValidator(lambda name: name or None)]
 
 
 class _Table(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, defer_build=True, use_attribute_docstrings=True
+    )
 
 
 class CalibrationTable(_Table):
@@ -98,33 +100,51 @@ class CalibrationTable(_Table):
     """
 
     id: Annotated[Text, AfterValidator(_of_a_calibration)]
+    """Name of the calibration."""
     date: Annotated[Text, AfterValidator(_date)]
+    """Date of the calibration, YYYY-MM-DD."""
     valid_days: Annotated[int, Strict(), Field(ge=1, le=2**53)] = CALIBRATION_VALID_DAYS
+    """Days after which exposures are flagged `CALIBRATION_EXPIRED`."""
 
 
 class DefaultsTable(_Table):
     """Values for all lenses and sensors that have none of their own."""
 
     lens: dict[str, Any] = {}
+    """Keys of a lens, for every lens that has none of its own."""
     sensor: dict[str, Any] = {}
+    """Keys of a sensor, for every sensor that has none of its own."""
 
 
 class RigFile(_Table):
     """A camera of several heads (docs/reference/formats.md)."""
 
     format: Literal[1] = 1
+    """Version of the format."""
     name: Name
+    """Name of the rig, of its missions and records."""
     title: Text = ""
+    """Name for people."""
     timing: Timing
+    """Whether cones fire at one place (syntopic) or at one instant (synchronous)."""
     frame_interval_s: Positive
+    """Shortest time between two exposures."""
     master_cone: ConeName | None = None
+    """Cone whose layer is the virtual image plane, or from which angles count; empty: a virtual camera."""
     colour_master_cone: ConeName | None = None
+    """Cone that the other colours are registered to."""
     reference_cone: Text
+    """Cone whose strobe the receiver stamps."""
     calibration: CalibrationTable | None = None
+    """Calibration; without it the rig is uncalibrated."""
     virtual_image: Annotated[VirtualImage, AfterValidator(_fitting)] | None = None
+    """Stitched image; without it heads or bands are images of their own."""
     probe_serials: dict[str, Text] = {}
+    """Serial number of each probe by its name."""
     defaults: DefaultsTable = DefaultsTable()
+    """Values for all lenses and sensors."""
     cone: Annotated[tuple[Cone, ...], Field(min_length=1, max_length=CONES_MAX)]
+    """The cones."""
 
     @property
     def rig(self) -> Rig:

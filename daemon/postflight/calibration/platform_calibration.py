@@ -73,6 +73,11 @@ def read_missions(missions: Sequence[Path]) -> PlatformMissions:
     for path in missions:
         mission = Mission.open(path)
         own = load_rig(mission.rig_path)
+        if not own.is_calibrated:
+            raise PlatformCalibrationError(
+                f"{mission.id} was flown with the uncalibrated rig {own.name}; angles need calibrated "
+                "lenses: calibrate the heads first, and process the mission again"
+            )
         rig = rig or own
         if own != rig:
             raise PlatformCalibrationError(

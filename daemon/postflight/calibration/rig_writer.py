@@ -9,12 +9,17 @@ import json
 from dataclasses import fields
 from typing import Any
 
+from daemon.configuration.schemas import schema_line
 from processing.rig import RIG_FORMAT, Cone, Rig, Sensor
 
 
-def rig_toml(rig: Rig, *, remark: str = "") -> bytes:
-    """The rig as TOML; `remark` becomes the comment at the top."""
-    lines = [f"# {line}".rstrip() for line in remark.splitlines()]
+def rig_toml(rig: Rig, *, remark: str = "", names_schema: bool = True) -> bytes:
+    """The rig as TOML; `remark` becomes the comment at the top.
+
+    With `names_schema` the first line names the schema in the same folder, for editors.
+    """
+    lines = [schema_line("rig")] if names_schema else []
+    lines += [f"# {line}".rstrip() for line in remark.splitlines()]
     lines += _pairs(
         {
             "format": RIG_FORMAT,

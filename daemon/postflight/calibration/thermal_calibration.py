@@ -12,10 +12,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from daemon.configuration.schemas import SCHEMA_FILES, schema_file_name
 from daemon.errors import DaemonError
 from daemon.mission.exposure import Exposure
 from daemon.mission.layout import Mission
-from daemon.mission.store.durable import new_file
+from daemon.mission.store.durable import new_file, replace_file
 from daemon.mission.store.store import read_sealed
 from daemon.postflight.calibration.rig_writer import rig_toml
 from processing.calibration.thermal_learning import ThermalState, add_exposure, empty_state
@@ -77,6 +78,11 @@ def read_thermal_records(missions: Sequence[Path]) -> ThermalRecords:
         seen.add(mission.path.resolve())
         own = load_rig(mission.rig_path)
         if rig is None or state is None:
+            if not own.is_calibrated:
+                raise ThermalCalibrationError(
+                    f"{mission.id} was flown with the uncalibrated rig {own.name}; drift is learned "
+                    "against a calibration: calibrate the camera, and process the mission again"
+                )
             rig, state = own, empty_state(own)
         elif own != rig:
             raise ThermalCalibrationError(
@@ -151,6 +157,7 @@ def write_rig(rig: Rig, path: Path, *, remark: str) -> None:
     try:
         with new_file(path, replaces=False) as part:
             part.write_bytes(text)
+        replace_file(path.parent / schema_file_name("rig"), SCHEMA_FILES["rig"].read_bytes())
     except FileExistsError as error:
         raise ThermalCalibrationError(
             f"{path} exists; a calibration is never overwritten: give another name with --out"

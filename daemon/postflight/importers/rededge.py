@@ -113,6 +113,7 @@ def import_rededge(
     rig_bytes = rig_toml(
         rig, remark="A MicaSense RedEdge with the calibration its images carry.\n"
         "Lenses: Brown's distortion of the XMP, fitted by Heier et al. (2002), eq. 5.1.",
+        names_schema=False,
     )  # fmt: skip
     frames, missing = 0, []
     with durable.new_files(out, last="rig.toml") as part:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import tomllib
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +13,19 @@ import pytest
 
 from daemon.configuration.model import Configuration, MountSection, ProcessingSection
 from daemon.mission.exposure import Exposure
+from daemon.mission.layout import Mission
 from daemon.onboard.preflight.check_results import CheckOutcome
 from daemon.onboard.preflight.prerequisites import calibration
 from daemon.orientation.in_flight_orientation import orientation_json
+from daemon.postflight.calibration.platform_calibration import (
+    PlatformCalibrationError,
+    read_missions,
+)
 from daemon.postflight.calibration.rig_writer import rig_toml
+from daemon.postflight.calibration.thermal_calibration import (
+    ThermalCalibrationError,
+    read_thermal_records,
+)
 from daemon.postflight.export.camera_certificate import CameraCertificateError, certificate_of
 from daemon.products.exposure_products import report_unprocessed
 from daemon.products.processor import build_processor
@@ -96,6 +106,20 @@ def test_an_exposure_without_image_states_it_as_well() -> None:
     orientation = orientation_json(Exposure(1), UNCALIBRATED, MountSection(), 0.0)
     assert orientation["uncalibrated"] is True
     assert "uncalibrated" not in orientation_json(Exposure(1), CALIBRATED, MountSection(), 0.0)
+
+
+def test_no_partial_calibration_makes_an_uncalibrated_rig_calibrated(tmp_path: Path) -> None:
+    mission = Mission.create(
+        tmp_path,
+        "diverging",
+        service_toml=b"",
+        rig_toml=rig_toml(UNCALIBRATED),
+        started_utc=datetime(2026, 11, 21, tzinfo=UTC),
+    )
+    with pytest.raises(ThermalCalibrationError, match="uncalibrated rig"):
+        read_thermal_records([mission.path])
+    with pytest.raises(PlatformCalibrationError, match="uncalibrated rig"):
+        read_missions([mission.path])
 
 
 def test_there_is_no_certificate_of_nominal_values() -> None:

@@ -8,14 +8,14 @@ from dataclasses import replace
 import pytest
 
 from daemon.postflight.calibration.rig_writer import rig_toml
-from processing.rig import RigError, load_rig, rig_from_mapping, shipped_rigs
+from processing.rig import RigError, find_rig, load_rig, rig_from_mapping, shipped_rigs
 
 
 @pytest.mark.parametrize("name", sorted(shipped_rigs()))
 def test_every_shipped_rig_survives_writing_and_reading(name):
     rig = load_rig(shipped_rigs()[name])
     text = rig_toml(rig, remark="a remark\nof two lines").decode()
-    assert text.startswith("# a remark\n# of two lines\n")
+    assert text.startswith("#:schema ./rig.schema.json\n# a remark\n# of two lines\n")
     assert rig_from_mapping(tomllib.loads(text), "rig.toml") == rig
 
 
@@ -33,3 +33,11 @@ def test_left_justified_words_are_refused_where_images_are_stitched():
     rig = load_rig(shipped_rigs()["rededge"])
     assert {sensor.raw_units_per_dn for sensor in rig.sensors} == {16}
     assert rig.probes == ()
+
+
+def test_the_first_line_names_the_schema_unless_the_file_is_a_record() -> None:
+    rig = find_rig("rededge")
+    assert rig_toml(rig, remark="A\nB").splitlines()[:3] == [
+        b"#:schema ./rig.schema.json", b"# A", b"# B",
+    ]  # fmt: skip
+    assert rig_toml(rig, names_schema=False).startswith(b"format")
