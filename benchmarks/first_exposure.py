@@ -173,9 +173,9 @@ def _wait_for(path: Path) -> None:
 
 def main(arguments: Sequence[str]) -> int:
     if arguments:
-        arrangement, heads = arguments
+        name, count = arguments
         with tempfile.TemporaryDirectory() as folder:
-            print(json.dumps(asdict(_measure_here(arrangement, int(heads), Path(folder)))))
+            print(json.dumps(asdict(_measure_here(name, int(count), Path(folder)))))
         return 0
     needed = missing()
     if needed is not None:
