@@ -28,6 +28,7 @@ def device_problems(content: Mapping[str, Any], trigger_keys: frozenset[str]) ->
         *_name_problems(content),
         *_trigger_problems(content),
         *_port_problems(content),
+        *_probe_problems(content),
     ]
 
 
@@ -105,6 +106,24 @@ def _name_problems(content: Mapping[str, Any]) -> Iterator[Finding]:
                 other = key_of(used_by[name])
                 yield place, f"is {name!r}, as is {other}; give each device a name of its own"
             used_by.setdefault(name, place)
+
+
+def _probe_problems(content: Mapping[str, Any]) -> Iterator[Finding]:
+    """Probes that two devices read: readings of one would be taken for the other's."""
+    used_by: dict[str, Location] = {}
+    for kind, key in (("thermometer", "channels"), ("head", "temperature_probe")):
+        for index, section in enumerate(_sections(content, kind)):
+            value, place = section.get(key), (kind, index, key)
+            for name in value if isinstance(value, list) else [value]:
+                if not isinstance(name, str) or not name:
+                    continue
+                if name in used_by and used_by[name] != place:
+                    other = key_of(used_by[name])
+                    yield (
+                        place,
+                        f"names the probe {name!r}, as does {other}; one device reads a probe",
+                    )
+                used_by.setdefault(name, place)
 
 
 def _trigger_problems(content: Mapping[str, Any]) -> Iterator[Finding]:

@@ -111,6 +111,13 @@ SUPPORT: Final = (
         ),
     ),
     DriverSupport(
+        "navigator", "applanix", "Applanix POS AV, POS MV, AP",
+        (
+            Proof("navigation, attitude, time", _MANUAL, "PUBS-ICD-004089"),
+            Proof("event marks", _MANUAL, "PUBS-ICD-004089"),
+        ),
+    ),
+    DriverSupport(
         "navigator", "mavlink", "autopilots with PX4 or ArduPilot (Pixhawk, Cube, ...)",
         (Proof("navigation, CAMERA_TRIGGER, CAMERA_FEEDBACK", _PEER, "pymavlink"),),
     ),

@@ -41,6 +41,7 @@ _DRIVER_PATHS: Final[Mapping[str, Mapping[str, str]]] = {
         "sbg": "drivers.receivers.sbg.navigator:SbgNavigator",
         "vectornav": "drivers.receivers.vectornav.navigator:VectornavNavigator",
         "xsens": "drivers.receivers.xsens.navigator:XsensNavigator",
+        "applanix": "drivers.receivers.applanix.navigator:ApplanixNavigator",
         "mavlink": "drivers.receivers.mavlink.navigator:MavlinkNavigator",
     },
 }

@@ -12,6 +12,8 @@ from typing import Any, Final
 
 from drivers.contract import DeviceError
 from drivers.detection.line_format import line_format_of
+from drivers.receivers.applanix.decoder import ApplanixDecoder
+from drivers.receivers.applanix.navigator import ApplanixNavigator
 from drivers.receivers.fix_monitor import fix_description
 from drivers.receivers.mavlink.decoder import MavlinkDecoder
 from drivers.receivers.mavlink.navigator import MavlinkNavigator
@@ -65,6 +67,7 @@ _PROTOCOL_CANDIDATES: Final = (
     _ProtocolCandidate("sbg", SbgNavigator, SbgDecoder),
     _ProtocolCandidate("vectornav", VectornavNavigator, VectornavDecoder),
     _ProtocolCandidate("xsens", XsensNavigator, XsensDecoder),
+    _ProtocolCandidate("applanix", ApplanixNavigator, ApplanixDecoder),
     _ProtocolCandidate("mavlink", MavlinkNavigator, MavlinkDecoder),
     _ProtocolCandidate("nmea", NmeaNavigator, NmeaDecoder),
 )

@@ -23,6 +23,7 @@ from drivers.contract import (
     FrameStatus,
     LifeCycle,
     Record,
+    TemperatureSample,
 )
 from sim_hw.faults.plan import PlannedFault
 from sim_hw.gige.gige_head import (
@@ -97,6 +98,7 @@ class Pair:
         self.frames: list[Frame] = []
         self.pictures: list[NDArray[np.uint16]] = []
         self.events: list[DeviceEvent] = []
+        self.temperatures: list[TemperatureSample] = []
         self.changed = threading.Condition()
         self.thread = threading.Thread(target=self.driver.run, args=(self.sink,))
 
@@ -106,6 +108,8 @@ class Pair:
 
     def sink(self, record: Record) -> None:
         with self.changed:
+            if isinstance(record, TemperatureSample):
+                self.temperatures.append(record)
             if isinstance(record, Frame):
                 self.frames.append(record)
                 self.pictures.append(self.memory.pixels(record.slot))
@@ -192,6 +196,20 @@ def test_a_packed_frame_without_chunks_is_unpacked_alike() -> None:
     np.testing.assert_array_equal(pair.pictures[0], PATTERN)
     assert pair.frames[0].counter is None
     assert pair.frames[0].temperature_c == 36.5, "asked for, since the frame does not say"
+
+
+def test_the_heads_own_thermometer_is_a_probe_where_it_is_named() -> None:
+    with flying(temperature_probe="3", latch_interval_s=0.5) as (pair,):
+        deadline = time.monotonic() + WITHIN_S
+        while len(pair.temperatures) < 2 and time.monotonic() < deadline:
+            time.sleep(0.05)
+    assert {(t.probe, t.value_c) for t in pair.temperatures} == {("3", 36.5)}
+    first, second = pair.temperatures[:2]
+    assert second.mono_ns > first.mono_ns
+    with flying(latch_interval_s=0.5) as (pair,):
+        pair.pulse(1)
+        pair.wait_frames(1)
+    assert pair.temperatures == []
 
 
 def test_heads_are_found_with_what_reaches_them() -> None:

@@ -20,6 +20,7 @@ PAGES = [
     ("navigator", "sbg", "sbg.md"),
     ("navigator", "vectornav", "vectornav.md"),
     ("navigator", "xsens", "xsens.md"),
+    ("navigator", "applanix", "applanix.md"),
     ("navigator", "mavlink", "mavlink.md"),
     ("thermometer", "ascii-line", "ascii-line.md"),
     ("thermometer", "host", "host.md"),

@@ -29,6 +29,7 @@ def test_there_are_the_drivers_of_the_first_flight() -> None:
             "sbg",
             "vectornav",
             "xsens",
+            "applanix",
             "mavlink",
         ),
     }

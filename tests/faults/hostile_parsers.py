@@ -18,6 +18,7 @@ from unittest import mock
 
 from drivers.cameras.aravis import gvcp
 from drivers.contract import DeviceError
+from drivers.receivers.applanix.decoder import ApplanixDecoder
 from drivers.receivers.gpsd.reports import GpsdReports
 from drivers.receivers.message_decoder import MessageDecoder
 from drivers.receivers.nmea.decoder import NmeaDecoder
@@ -170,6 +171,15 @@ def reseal_xsens(message: bytearray) -> bytes:
     return bytes(message)
 
 
+def reseal_applanix(message: bytearray) -> bytes:
+    del message[len(message) // 4 * 4 :]
+    message[:4], message[-4:] = b"$GRP", b"\0\0$#"
+    message[6:8] = struct.pack("<H", len(message) - 8)
+    words = struct.unpack(f"<{len(message) // 2}H", message)
+    message[-4:-2] = struct.pack("<H", -sum(words) & 0xFFFF)
+    return bytes(message)
+
+
 def reseal_mavlink(message: bytearray) -> bytes:
     message[0], message[2] = 0xFD, 0
     message[1] = max(len(message) - 12, 0) & 0xFF
@@ -274,6 +284,13 @@ def xsens() -> Parser:
     )
     stream = mtdata2.GNSS + mtdata2.POSITION + marked
     return _decoding("xsens", stream, XsensDecoder("r"), reseal_xsens, 0.1)
+
+
+def applanix() -> Parser:
+    from tests.drivers import test_applanix as pos
+
+    stream = pos.BEGUN + pos.performance() + pos.nav() + pos.event(1) + pos.event(2)
+    return _decoding("applanix", stream, ApplanixDecoder("r"), reseal_applanix, 0.1)
 
 
 def mavlink() -> Parser:
@@ -516,6 +533,7 @@ PARSERS: Mapping[str, Callable[[], Parser]] = {
     "sbg": sbg,
     "vectornav": vectornav,
     "xsens": xsens,
+    "applanix": applanix,
     "mavlink": mavlink,
     "gpsd": gpsd,
     "ascii-line": ascii_line,

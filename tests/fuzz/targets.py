@@ -587,7 +587,7 @@ def device(name: str) -> Callable[[], Target]:
 
 
 DEVICES = (
-    "ublox", "nmea", "novatel", "septentrio", "sbg", "vectornav", "xsens", "mavlink", "gpsd",
+    "ublox", "nmea", "novatel", "septentrio", "sbg", "vectornav", "xsens", "applanix", "mavlink", "gpsd",
     "ascii-line", "modbus", "pulse-bus", "gvcp-answer", "gvcp-command",
 )  # fmt: skip
 

@@ -107,7 +107,10 @@ class Preflight:
             absent.append("trigger")
         last = flight.track.last
         read = {t.probe: (t.value_c, t.age_ns * 1e-9) for t in flight.temperatures.at(mono_ns)}
-        probes = self._rig.probes if configuration.thermometer else ()
+        is_measured = bool(configuration.thermometer) or any(
+            head.settings.get("temperature_probe") for head in configuration.head
+        )
+        probes = self._rig.probes if is_measured else ()
         return Readiness(
             has_kernels=self._pipeline.is_ready,
             absent=absent,

@@ -249,7 +249,11 @@ class SystemCheck:
         """Whether nothing is left that more time could prove."""
         bound = {spec.kind for spec in self._specs if spec.name in self._bound}
         waits = {"arming-time", "arming-navigation"} if "navigator" in bound else set()
-        waits |= {"arming-temperature"} if "thermometer" in bound else set()
+        has_probe = any(
+            spec.name in self._bound and spec.settings.get("temperature_probe")
+            for spec in self._specs
+        )
+        waits |= {"arming-temperature"} if "thermometer" in bound or has_probe else set()
         if any(item.name in waits for item in self._preflight.missing_prerequisites()):
             return False
         return not any(f.outcome is not CheckOutcome.PASS for f in self._streams(is_final=False))

@@ -27,6 +27,7 @@ NATIVE_SUFFIXES = {
     "sbg": "sbg",
     "vectornav": "vnb",
     "xsens": "mtb",
+    "applanix": "pos",
     "nmea": "nmea",
     "mavlink": "raw",
 }

@@ -34,6 +34,7 @@ from drivers.contract import (
     FrameStatus,
     LifeCycle,
     Sink,
+    TemperatureSample,
 )
 from drivers.errors import DriverError
 from drivers.timescales.clock import Clock
@@ -376,8 +377,16 @@ class AravisHead(AravisSettings, HeadDevice):
                 raise AravisHeadLostError("it no longer accepts the heartbeat")
             if self.clock.mono_ns() >= next_check_ns:
                 healthy = self._check(session)
+                if healthy:
+                    self._deliver_temperature(session, sink)
                 pause_s = self.latch_interval_s if healthy else 0.0
                 next_check_ns = self.clock.mono_ns() + round(pause_s * 1e9)
+
+    def _deliver_temperature(self, session: _Session, sink: Sink) -> None:
+        """Give the head's own temperature as that of a probe, if one is named."""
+        if self.temperature_probe and session.temperature_c is not None:
+            now_ns = self.clock.mono_ns()
+            sink(TemperatureSample(self.temperature_probe, session.temperature_c, now_ns))
 
     def _deliver_frame(self, session: _Session, received: ReceivedFrame, sink: Sink) -> None:
         now_ns = self.clock.mono_ns()

@@ -121,6 +121,11 @@ class AravisCamera:
         self._tick_hz = self._read_tick_frequency()
         self._latch_features = self._find_latch()
         self._temperature_feature = self._find_temperature()
+        if settings.temperature_probe and self._temperature_feature is None:
+            raise DeviceError(
+                f"{self._who}: the head has no thermometer ({' or '.join(TEMPERATURES)}) for "
+                f"temperature_probe = {settings.temperature_probe!r}; leave that setting out"
+            )
         self.exposure_time_us = self._configuration.exposure_time_us()
         self.frame_settings = self._frame_settings()
         self._earlier: deque[Mapping[str, float | int | str]] = deque(

@@ -35,6 +35,9 @@ class AravisSettings(Configured):
     )
     exposure_time_us = Setting(1000.0, minimum=1, maximum=60e6, help="exposure time, us")
     gain_db = Setting(0.0, minimum=-20, maximum=60, help="gain, dB")
+    temperature_probe = Setting(
+        "", help="name of the rig's probe that the head's own thermometer is; empty: none"
+    )
     tdi_shifts = Setting(0, minimum=0, maximum=1000, help="TDI shifts; 0 for a head without TDI")
     trigger_source = Setting(
         "line", choices=("line", "software", "action"), help="what starts an exposure"

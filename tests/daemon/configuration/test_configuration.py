@@ -169,6 +169,15 @@ def test_two_heads_for_one_sensor_are_refused() -> None:
     assert "head[1].sensor" in sentence
 
 
+def test_a_probe_that_two_devices_read_is_refused() -> None:
+    content = copy.deepcopy(GOOD)
+    content["head"][0]["temperature_probe"] = "0"
+    (sentence,) = problems_of(content)
+    assert (
+        "head[0].temperature_probe names the probe '0', as does thermometer[0].channels" in sentence
+    )
+
+
 def test_an_unknown_rig_is_refused_with_the_names_of_those_there_are() -> None:
     content = copy.deepcopy(GOOD)
     content["mission"]["rig"] = "ultracam-y"
