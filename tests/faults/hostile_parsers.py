@@ -240,11 +240,11 @@ def _decoding(
 
 
 def ublox() -> Parser:
-    return _receiver("ublox", UbloxReceiver, UbxDecoder("r"), reseal_ubx, 0.15, chatter=False)
+    return _receiver("ublox", UbloxReceiver, UbxDecoder("r"), reseal_ubx, 0.1, chatter=False)
 
 
 def nmea() -> Parser:
-    parser = _receiver("nmea", NmeaReceiver, NmeaDecoder("r"), reseal_nmea, 0.15)
+    parser = _receiver("nmea", NmeaReceiver, NmeaDecoder("r"), reseal_nmea, 0.1)
     recorded = (DATA / "ublox-zed-f9r-excerpt.nmea").read_bytes().splitlines(keepends=True)
     event = b"$PTNL,EVT,165402.123456,1,460,2133,5,18*7D\r\n"
     extra = tuple(line for line in recorded if line.startswith(b"$"))
@@ -253,7 +253,7 @@ def nmea() -> Parser:
 
 
 def novatel() -> Parser:
-    parser = _receiver("novatel", NovatelReceiver, NovatelDecoder("r"), reseal_novatel, 0.15)
+    parser = _receiver("novatel", NovatelReceiver, NovatelDecoder("r"), reseal_novatel, 0.1)
     text = NovatelDecoder("text")
     recorded = (DATA / "novatel-ins2-excerpt.gps").read_bytes()
     parser.genuine += tuple(text._framer.feed(recorded))
@@ -261,15 +261,15 @@ def novatel() -> Parser:
 
 
 def septentrio() -> Parser:
-    return _receiver("septentrio", SeptentrioReceiver, SbfDecoder("r"), reseal_sbf, 0.15)
+    return _receiver("septentrio", SeptentrioReceiver, SbfDecoder("r"), reseal_sbf, 0.1)
 
 
 def sbg() -> Parser:
-    return _receiver("sbg", SbgReceiver, SbgDecoder("r"), reseal_sbg, 0.15)
+    return _receiver("sbg", SbgReceiver, SbgDecoder("r"), reseal_sbg, 0.07)
 
 
 def vectornav() -> Parser:
-    return _receiver("vectornav", VectornavReceiver, VectornavDecoder("r"), reseal_vectornav, 0.15)
+    return _receiver("vectornav", VectornavReceiver, VectornavDecoder("r"), reseal_vectornav, 0.07)
 
 
 def xsens() -> Parser:
@@ -283,14 +283,14 @@ def xsens() -> Parser:
         mtdata2.place(),
     )
     stream = mtdata2.GNSS + mtdata2.POSITION + marked
-    return _decoding("xsens", stream, XsensDecoder("r"), reseal_xsens, 0.1)
+    return _decoding("xsens", stream, XsensDecoder("r"), reseal_xsens, 0.05)
 
 
 def applanix() -> Parser:
     from tests.drivers import test_applanix as pos
 
     stream = pos.BEGUN + pos.performance() + pos.nav() + pos.event(1) + pos.event(2)
-    return _decoding("applanix", stream, ApplanixDecoder("r"), reseal_applanix, 0.1)
+    return _decoding("applanix", stream, ApplanixDecoder("r"), reseal_applanix, 0.05)
 
 
 def mavlink() -> Parser:
