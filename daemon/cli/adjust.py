@@ -37,7 +37,7 @@ def adjust(
         bool | None, typer.Option("--robust/--no-robust", help="Robust weights at the start.")
     ] = None,
     reject: Annotated[
-        float | None, typer.Option(help="Rejection limit of image points in sigmas.")
+        float | None, typer.Option(help="Rejection limit of observations in sigmas.")
     ] = None,
     components: Annotated[
         bool | None, typer.Option("--components/--no-components", help="Variance components.")
@@ -103,11 +103,13 @@ def adjust(
         write_results(out, given, result, report)
     if as_json:
         typer.echo(json.dumps(report))
-        return
-    console = Console()
-    print_report(console, report)
-    if out is not None:
-        console.print(f"Results: {out}", soft_wrap=True)
+    else:
+        console = Console()
+        print_report(console, report)
+        if out is not None:
+            console.print(f"Results: {out}", soft_wrap=True)
+    if result.problems:
+        raise typer.Exit(ExitStatus.PROBLEM)
 
 
 def _peak_mib() -> float:

@@ -12,8 +12,20 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.bundle.data_snooping import (
+    Excluded,
+    contradicted,
+    fitting_again,
+    nothing_excluded,
+)
 from processing.bundle.equations import BehindCameraError, Equations, equations
-from processing.bundle.gauss_newton import Progress, Run, iterate, robust_weights
+from processing.bundle.gauss_newton import (
+    Progress,
+    Run,
+    WeakPointsError,
+    iterate,
+    robust_weights,
+)
 from processing.bundle.network import Network, NetworkError, validate
 from processing.bundle.normal_equations import ReducedEquations, cofactor_matrix, point_normals
 from processing.bundle.rank_diagnosis import RankDefect, rank_defects
@@ -25,7 +37,7 @@ Flags = NDArray[np.bool_]
 
 _MIN_POINT_INFORMATION: Final = 1e-10
 _MAX_BEHIND_FRACTION: Final = 0.05
-_MAX_ROUNDS: Final = 12
+_MAX_COMPONENT_ROUNDS: Final = 12
 _COMPONENT_CONVERGED: Final = 0.02
 
 
@@ -36,8 +48,9 @@ class AdjustmentSettings:
     Attributes:
         max_iterations: of each Gauss-Newton run.
         robust: first with Huber weights on image points, so that blunders pull less.
-        reject_beyond: image points whose standardised residual (residual over its own a posteriori
+        reject_beyond: observations whose standardised residual (residual over its own a posteriori
             standard deviation) exceeds this are left out, worst first; None: no data snooping.
+        max_rounds: of data snooping; to reach it is a problem of the adjustment.
         variance_components: scale the sigmas of each kind of observation by its residuals.
         minimum_norm: undetermined directions raise no error; the shortest correction is used.
     """
@@ -45,6 +58,7 @@ class AdjustmentSettings:
     max_iterations: int = 30
     robust: bool = False
     reject_beyond: float | None = None
+    max_rounds: int = 100
     variance_components: bool = False
     minimum_norm: bool = False
 
@@ -65,6 +79,9 @@ class Adjustment:
         equations: the last rows; `residual` (m,) in sigmas of each row, `redundancy_number` (m,).
         weight: (image points,) robust weight, zero for what was rejected.
         rejected: (image points,) left out by data snooping.
+        excluded: everything that data snooping left out, image points among it.
+        rounds: adjustments that data snooping needed; 0 without it.
+        problems: why the result is not final; empty when it is.
         left_out: (points,) object points that their rays do not fix.
         factors: variance factor applied to each kind of observation.
         groups: statistics of each kind of observation.
@@ -90,6 +107,9 @@ class Adjustment:
     left_out: Flags
     factors: Mapping[str, float]
     groups: tuple[ObservationGroup, ...]
+    excluded: Excluded
+    rounds: int = 0
+    problems: tuple[str, ...] = ()
     rank_defects: tuple[RankDefect, ...] = field(default=())
 
     @property
@@ -124,19 +144,19 @@ def adjust(
     """
     validate(network)
     settings = settings or AdjustmentSettings()
-    given = network
-    weight = np.ones(len(network.image_points.image))
-    rejected = np.zeros(len(weight), dtype=bool)
-    factors: dict[str, float] = {}
+    selection = _Selection(network, nothing_excluded(network), nothing_excluded(network))
     state = initial_values(network)
     report_progress = progress or (lambda _what, _iteration, _value: None)
     history: list[float] = []
     robust = settings.robust
-    for round_ in range(_MAX_ROUNDS + 1):
-        left_out = undetermined_points(network, state, weight)
-        layout = layout_of(network, left_out)
+    weak = np.zeros(len(network.points.names), dtype=bool)
+    while True:
+        active = selection.active()
+        weight = np.where(selection.excluded.image, 0.0, 1.0)
+        left_out = undetermined_points(active, state, weight) | weak
+        layout = layout_of(active, left_out)
         run = Run(
-            network,
+            active,
             layout,
             state,
             weight,
@@ -147,29 +167,111 @@ def adjust(
         )
         if robust:
             robust_weights(run)
-            outlying = run.weight < 0.25
-            rejected |= outlying
-            weight = np.where(rejected, 0.0, 1.0)
+            selection.exclude_image_points(run.weight < 0.25)
             state, robust = run.state, False
             continue
-        rows, reduced = iterate(run)
+        try:
+            rows, reduced = iterate(run)
+        except WeakPointsError as error:
+            weak[error.points] = True
+            state = run.state
+            report_progress(f"weak points set aside: {int(weak.sum())}", len(history), history[-1])
+            continue
         state = run.state
-        result = _figures(run, settings, given, rows, reduced, left_out, rejected, factors)
-        if round_ == _MAX_ROUNDS:
-            break
-        worst = _points_to_reject(result, settings.reject_beyond)
-        if worst.any():
-            rejected = rejected | worst
-            weight = np.where(rejected, 0.0, 1.0)
-            report_progress(f"{int(rejected.sum())} image points left out", round_ + 1, history[-1])
-            continue
-        if settings.variance_components and _components_changing(result):
-            factors = {g.name: g.factor for g in result.groups if _is_estimable(g)}
-            network = _rescaled(given, factors)
-            report_progress("variance components", round_ + 1, history[-1])
-            continue
-        break
-    return result
+        result = _figures(run, settings, network, rows, reduced, left_out, selection)
+        what = selection.advance(result, reduced)
+        if what is None:
+            return replace(
+                result, problems=tuple(selection.problems), rounds=selection.snooping_rounds
+            )
+        report_progress(what, selection.rounds, history[-1])
+
+
+@dataclass
+class _Selection:
+    """Which observations take part with which variance factors, from round to round."""
+
+    given: Network
+    excluded: Excluded
+    readmitted: Excluded
+    factors: dict[str, float] = field(default_factory=dict)
+    rounds: int = 0
+    snooping_rounds: int = 0
+    component_rounds: int = 0
+    problems: list[str] = field(default_factory=list)
+
+    def active(self) -> Network:
+        """The network to adjust next."""
+        return self.excluded.applied(_rescaled(self.given, self.factors))
+
+    def exclude_image_points(self, flags: Flags) -> None:
+        self.excluded = replace(self.excluded, image=self.excluded.image | flags)
+
+    def advance(self, result: Adjustment, reduced: ReducedEquations) -> str | None:
+        """Choose again after an adjustment; what was done, None when the selection is final."""
+        self.rounds += 1
+        settings = result.settings
+        if settings.reject_beyond is not None and result.redundancy > 0:
+            what = self._snoop(result, reduced, settings.reject_beyond, settings.max_rounds)
+            if what is not None or self.problems:
+                return what
+        if (
+            settings.variance_components
+            and self.component_rounds < _MAX_COMPONENT_ROUNDS
+            and _components_changing(result)
+        ):
+            self.component_rounds += 1
+            self.factors = {g.name: g.factor for g in result.groups if _is_estimable(g)}
+            return "variance components"
+        return None
+
+    def _snoop(
+        self, result: Adjustment, reduced: ReducedEquations, limit: float, max_rounds: int
+    ) -> str | None:
+        worst, beyond = contradicted(
+            self.given,
+            result.equations,
+            reduced,
+            result.cofactor,
+            result.standardised,
+            result.redundancy_number,
+            result.sigma0,
+            limit,
+        )
+        if beyond and self.snooping_rounds >= max_rounds:
+            self.problems.append(
+                f"data snooping ended after {max_rounds} rounds with {beyond} observations beyond "
+                f"{limit:g} standard deviations and {self.excluded.count} left out: the result is "
+                "not final; correct the observations, begin with robust weights or raise max_rounds"
+            )
+            return None
+        if beyond:
+            self.snooping_rounds += 1
+            self.excluded = self.excluded.joined(worst)
+            return f"{self.excluded.count} observations left out"
+        again = self._fitting(result, reduced, limit)
+        if not again.count:
+            return None
+        self.snooping_rounds += 1
+        self.readmitted = self.readmitted.joined(again)
+        self.excluded = self.excluded.without(again)
+        return f"{again.count} observations taken in again"
+
+    def _fitting(self, result: Adjustment, reduced: ReducedEquations, limit: float) -> Excluded:
+        """What fits again and was not taken in before."""
+        candidates = self.excluded.without(self.readmitted)
+        if not candidates.count:
+            return candidates
+        return fitting_again(
+            _rescaled(self.given, self.factors),
+            result.layout,
+            result.state,
+            candidates,
+            reduced,
+            result.cofactor,
+            result.sigma0,
+            limit,
+        )
 
 
 def undetermined_points(
@@ -235,8 +337,7 @@ def _figures(
     rows: Equations,
     reduced: ReducedEquations,
     left_out: Flags,
-    rejected: Flags,
-    factors: Mapping[str, float],
+    selection: _Selection,
 ) -> Adjustment:
     layout = run.layout
     run.report_progress("covariances", len(run.history), run.history[-1])
@@ -284,10 +385,11 @@ def _figures(
         residual=residual,
         redundancy_number=redundancy_number,
         weight=run.weight,
-        rejected=rejected,
+        rejected=selection.excluded.image,
         left_out=left_out,
-        factors=dict(factors),
-        groups=groups_of(rows, residual, redundancy_number, factors),
+        factors=dict(selection.factors),
+        groups=groups_of(rows, residual, redundancy_number, selection.factors),
+        excluded=selection.excluded,
         rank_defects=found,
     )
 
@@ -295,30 +397,6 @@ def _figures(
 def _fixed_distance_points(layout: ParameterLayout) -> Flags:
     """Fully held points that distances end at: neither eliminated nor with columns."""
     return np.asarray(layout.locked.all(axis=1) & (layout.eliminated < 0))
-
-
-def _points_to_reject(result: Adjustment, limit: float | None) -> Flags:
-    """Image points to leave out next: beyond the limit and the largest of their image and point.
-
-    One blunder enlarges its neighbours' residuals. Only the largest of each image and each object
-    point is rejected at a time.
-    """
-    table = result.network.image_points
-    worst = np.zeros(len(table.image), dtype=bool)
-    if limit is None or result.redundancy == 0:
-        return worst
-    rows = result.equations.group < 2
-    size = np.zeros(len(table.image))
-    testable = result.redundancy_number[rows] > 0.01
-    values = np.where(testable, np.abs(result.standardised[rows]), 0.0)
-    np.maximum.at(size, result.equations.source[rows], values)
-    of_image = np.zeros(len(result.network.images.names))
-    of_point = np.zeros(len(result.network.points.names))
-    np.maximum.at(of_image, table.image, size)
-    np.maximum.at(of_point, table.point, size)
-    return np.asarray(
-        (size > limit) & (size >= of_image[table.image]) & (size >= of_point[table.point])
-    )
 
 
 def _components_changing(result: Adjustment) -> bool:
@@ -337,6 +415,8 @@ def _is_estimable(group: ObservationGroup) -> bool:
 
 def _rescaled(network: Network, factors: Mapping[str, float]) -> Network:
     """The network with each kind's sigmas multiplied by the root of its variance factor."""
+    if not factors:
+        return network
     root = {name: float(np.sqrt(value)) for name, value in factors.items()}
 
     def of(name: str) -> float:

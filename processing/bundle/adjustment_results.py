@@ -226,13 +226,15 @@ def control_residuals(result: Adjustment) -> PointDifferences:
         result: the adjustment.
 
     Returns:
-        Differences, NaN for coordinates without a sigma; `sigma_m` is a priori.
+        Differences, NaN for coordinates without a sigma and for those that data snooping left out;
+        `sigma_m` is a priori.
     """
     sigma = result.network.points.sigma_m
     rows = np.flatnonzero((np.nan_to_num(sigma) > 0.0).any(axis=1))
     rows = rows[np.isfinite(result.point_cofactor[rows]).all(axis=(1, 2))]
     difference = result.state.points[rows] - result.network.points.xyz_m[rows]
-    difference = np.where(np.nan_to_num(sigma[rows]) > 0.0, difference, np.nan)
+    used = (np.nan_to_num(sigma[rows]) > 0.0) & ~result.excluded.control[rows]
+    difference = np.where(used, difference, np.nan)
     weighted = difference / sigma[rows]
     return PointDifferences(
         tuple(result.network.points.names[k] for k in rows),

@@ -49,6 +49,7 @@ class Equations:
         group: (m,) index into `groups`.
         groups: kinds of observations.
         source: (m,) row of the table the observation comes from (image points, ...).
+        axis: (m,) coordinate of that row, 0 to 2.
     """
 
     misclosure: Array
@@ -59,6 +60,7 @@ class Equations:
     group: Indices
     groups: tuple[str, ...]
     source: Indices
+    axis: Indices
 
 
 GROUPS = (
@@ -118,7 +120,7 @@ class _Builder:
         self._rows: list[Indices] = []
         self._columns: list[Indices] = []
         self._values: list[Array] = []
-        self._tables: list[tuple[Array, Array, Indices, Array, Indices, Indices]] = []
+        self._tables: list[tuple[Array, Array, Indices, Array, Indices, Indices, Indices]] = []
 
     def add(
         self,
@@ -131,16 +133,26 @@ class _Builder:
         point: Indices | None = None,
         point_part: Array | None = None,
         weight: Array | None = None,
+        axis: int = 0,
     ) -> None:
-        """Append rows (n,); entries are (columns (n, k), values (n, k))."""
-        n = len(misclosure)
-        factor = 1.0 / sigma if weight is None else np.sqrt(weight) / sigma
-        part = np.zeros((n, 3)) if point_part is None else point_part * factor[:, None]
-        who = np.full(n, -1, dtype=np.int64) if point is None else point
-        self._tables.append((misclosure * factor, sigma, group, part, who, source))
+        """Append rows (n,); entries are (columns (n, k), values (n, k)).
+
+        An observation with an infinite sigma has no row.
+        """
+        taken = np.isfinite(sigma)
+        n = int(taken.sum())
+        sigma = sigma[taken]
+        factor = 1.0 / sigma if weight is None else np.sqrt(weight[taken]) / sigma
+        part = np.zeros((n, 3)) if point_part is None else point_part[taken] * factor[:, None]
+        who = np.full(n, -1, dtype=np.int64) if point is None else point[taken]
+        of_axis = np.full(n, axis, dtype=np.int64)
+        self._tables.append(
+            (misclosure[taken] * factor, sigma, group[taken], part, who, source[taken], of_axis)
+        )
         if self.derivatives:
             rows = np.arange(self.count, self.count + n)
-            for columns, values in entries:
+            for every_column, every_value in entries:
+                columns, values = every_column[taken], every_value[taken]
                 there = columns >= 0
                 self._rows.append(np.broadcast_to(rows[:, None], columns.shape)[there])
                 self._columns.append(columns[there])
@@ -155,8 +167,8 @@ class _Builder:
             reduced = sparse.coo_array((np.concatenate(self._values), where), shape=shape).tocsr()
         else:
             reduced = sparse.csr_array(shape)
-        misclosure, sigma, group, part, point, source = joined
-        return Equations(misclosure, reduced, part, point, sigma, group, GROUPS, source)
+        misclosure, sigma, group, part, point, source, axis = joined
+        return Equations(misclosure, reduced, part, point, sigma, group, GROUPS, source, axis)
 
 
 def _image_rows(
@@ -243,6 +255,7 @@ def _image_rows(
                 point=part[rows],
                 point_part=np.where(locked | (part[rows] < 0)[:, None], 0.0, by_point[:, axis]),
                 weight=weight[rows],
+                axis=axis,
             )
     if behind:
         raise BehindCameraError(np.concatenate(behind))
@@ -264,7 +277,7 @@ def _control_rows(
     sigma = network.points.sigma_m
     part = layout.eliminated
     for axis in range(3):
-        known = np.nan_to_num(sigma[:, axis]) > 0.0
+        known = np.isfinite(sigma[:, axis]) & (sigma[:, axis] > 0.0)
         rows = np.flatnonzero(known & ((part >= 0) | (layout.retained_points[:, axis] >= 0)))
         if not rows.size:
             continue
@@ -278,6 +291,7 @@ def _control_rows(
             [(layout.retained_points[rows, axis][:, None], np.ones((len(rows), 1)))],
             point=part[rows],
             point_part=unit,
+            axis=axis,
         )
 
 
@@ -318,6 +332,7 @@ def _gnss_rows(
             np.full(n, 4 if axis < 2 else 5),
             rows,
             entries,
+            axis=axis,
         )
 
 
@@ -349,6 +364,7 @@ def _attitude_rows(
             np.full(n, 6),
             np.arange(n),
             [(layout.attitude[measured_attitudes.attitude], d_rotation[:, axis])],
+            axis=axis,
         )
 
 

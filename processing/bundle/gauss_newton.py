@@ -17,13 +17,16 @@ from processing.bundle.network import Network, NetworkError
 from processing.bundle.normal_equations import (
     ReducedEquations,
     SingularError,
+    point_normals,
     reduced_equations,
     solve,
 )
 from processing.bundle.rank_diagnosis import RankDefectError, rank_defects
 from processing.bundle.unknowns import ParameterLayout, ParameterValues, apply_corrections
+from processing.errors import ProcessingError
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
 Progress = Callable[[str, int, float], None]
 
 _CONVERGED: Final = 1e-14
@@ -32,8 +35,29 @@ _CONVERGED: Final = 1e-14
 _OBJECTIVE_CONVERGED: Final = 1e-10
 """Predicted decrease, in squared a priori sigmas, below the printed precision."""
 
+_SLOW_CONVERGED: Final = 1e-6
+"""After the last iteration: every unknown is within a thousandth of its a priori sigma."""
+
 _HUBER: Final = 2.0
-_MAX_HALVINGS: Final = 8
+_MAX_HALVINGS: Final = 12
+_WEAK_AFTER: Final = 12
+"""Iterations after which a point with rays that are nearly parallel is set aside if it moves."""
+
+_WEAK_INFORMATION: Final = 1e-3
+"""Smallest over largest eigenvalue of a point's normal matrix: rays about 3 degrees apart."""
+
+_FLAT: Final = 1e-12
+_MAX_OWN_SHARE: Final = 0.1
+_WEAK_MOVE: Final = 1e-3
+"""Correction of a point over its distance from a camera that saw it."""
+
+
+class WeakPointsError(ProcessingError, ValueError):
+    """Object points with rays so nearly parallel that iterations do not find their place."""
+
+    def __init__(self, points: Indices) -> None:
+        self.points = points
+        super().__init__(f"{len(points)} object points have rays that are nearly parallel")
 
 
 @dataclass
@@ -74,12 +98,14 @@ def iterate(run: Run) -> tuple[Equations, ReducedEquations]:
     Raises:
         NetworkError: no convergence, or an object point behind a camera that saw it.
         RankDefectError: directions without information.
+        WeakPointsError: object points that keep the others from converging.
     """
     for iteration in range(run.max_iterations + 1):
         rows = _front(run, run.state)
         objective = float(rows.misclosure @ rows.misclosure)
         run.history.append(objective)
         run.report_progress("iteration", iteration, objective)
+        _refuse_flat(run, rows)
         reduced = reduced_equations(rows, run.layout)
         try:
             step = solve(reduced, run.layout.constraints, minimum_norm=run.minimum_norm)
@@ -88,6 +114,10 @@ def iterate(run: Run) -> tuple[Equations, ReducedEquations]:
                 rank_defects(run.network, run.layout, run.state, error.reduced, singular=True)
             ) from None
         if step.predicted_decrease <= max(_CONVERGED * objective, _OBJECTIVE_CONVERGED):
+            return rows, reduced
+        if iteration >= min(_WEAK_AFTER, run.max_iterations):
+            _refuse_moving(run, rows, step.dpoints)
+        if iteration == run.max_iterations and step.predicted_decrease <= _SLOW_CONVERGED:
             return rows, reduced
         run.state = _take_step(run, step.dx, step.dpoints, objective, step.predicted_decrease)
     raise NetworkError(
@@ -116,22 +146,64 @@ def _front(run: Run, state: ParameterValues) -> Equations:
 def _take_step(
     run: Run, dx: Array, dpoints: Array, objective: float, predicted_decrease: float
 ) -> ParameterValues:
-    """The full step, or a half of it as often as needed for the sum of squares to fall."""
+    """The full step, or shorter ones of single points or of all until the sum of squares falls."""
     length = 1.0
+    own = np.ones(len(dpoints))
+    before = _by_point(run, run.rows(run.state, derivatives=False))
     for _ in range(_MAX_HALVINGS):
-        state = apply_corrections(run.state, run.layout, length * dx, length * dpoints)
+        state = apply_corrections(run.state, run.layout, length * dx, own[:, None] * dpoints)
         try:
             rows = run.rows(state, derivatives=False)
-            value = float(rows.misclosure @ rows.misclosure)
-            if (
-                value <= objective - 1e-4 * length * predicted_decrease
-                or predicted_decrease < 1e-7 * objective
-            ):
-                return state
-        except BehindCameraError:
-            pass
-        length *= 0.5
-    return apply_corrections(run.state, run.layout, length * dx, length * dpoints)
+        except BehindCameraError as error:
+            who = run.layout.eliminated[run.network.image_points.point[error.image_points]]
+            behind = np.unique(who[who >= 0])
+            own[behind] *= 0.5
+            if not len(behind) or len(behind) > _MAX_OWN_SHARE * len(own):
+                length, own = 0.5 * length, 0.5 * own
+            continue
+        value = float(rows.misclosure @ rows.misclosure)
+        if (
+            value <= objective - 1e-4 * length * predicted_decrease
+            or predicted_decrease < 1e-7 * objective
+        ):
+            return state
+        # A point that a few rays fix badly must not shorten the step of all others.
+        worse = _by_point(run, rows) > before + 0.5 * (value - objective)
+        if 0 < worse.sum() <= _MAX_OWN_SHARE * len(own) and value > objective:
+            own[worse] *= 0.5
+        else:
+            length, own = 0.5 * length, 0.5 * own
+    return state
+
+
+def _by_point(run: Run, rows: Equations) -> Array:
+    """Sum of squares of the rows of each eliminated point."""
+    there = rows.point >= 0
+    squares = rows.misclosure[there] ** 2
+    count = len(run.layout.eliminated_points)
+    return np.bincount(rows.point[there], weights=squares, minlength=count).astype(np.float64)
+
+
+def _refuse_flat(run: Run, rows: Equations) -> None:
+    """Points that have no information left in a direction, to working precision."""
+    values = np.linalg.eigvalsh(point_normals(rows, run.layout))
+    flat = values[:, 0] <= _FLAT * values[:, 2]
+    if flat.any():
+        raise WeakPointsError(run.layout.eliminated_points[flat])
+
+
+def _refuse_moving(run: Run, rows: Equations, dpoints: Array) -> None:
+    """Points of nearly parallel rays that still move, if they are few."""
+    points = run.layout.eliminated_points
+    values = np.linalg.eigvalsh(point_normals(rows, run.layout))
+    table, images = run.network.image_points, run.network.images
+    distance = np.full(len(run.layout.locked), np.inf)
+    ray = run.state.points[table.point] - run.state.station[images.station[table.image]]
+    np.minimum.at(distance, table.point, np.linalg.norm(ray, axis=1))
+    moving = np.linalg.norm(dpoints, axis=1) > _WEAK_MOVE * distance[points]
+    weak = moving & (values[:, 0] < _WEAK_INFORMATION * values[:, 2])
+    if weak.any():
+        raise WeakPointsError(points[weak])
 
 
 def robust_weights(run: Run) -> None:

@@ -17,6 +17,7 @@ from processing.bundle.equations import Equations
 from processing.bundle.normal_equations import ReducedEquations
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
 
 _PART_BYTES = 64_000_000
 
@@ -112,6 +113,49 @@ def _own_products(reduced: ReducedEquations, cofactor: Array) -> Array:
     return np.asarray(result)
 
 
+def observation_cofactors(
+    equations: Equations, rows: Indices, reduced: ReducedEquations, cofactor: Array
+) -> Array:
+    """Cofactors of adjusted or predicted observations.
+
+    Args:
+        equations: rows of the same columns and points as the reduced ones; they need not have
+            taken part.
+        rows: k groups of n rows, shape (k, n).
+        reduced: reduced equations of the adjustment.
+        cofactor: of the columns, shape (c, c).
+
+    Returns:
+        Shape (k, n, n), whitened by the sigmas of the rows.
+    """
+    count, width = rows.shape
+    result = np.zeros((count, width, width))
+    thin, dense = reduced.sparse_columns, reduced.dense_columns
+    points = 3 * len(reduced.point_factor)
+    step = max(1, _PART_BYTES // (8 * width * max(len(cofactor), 1)))
+    for low in range(0, count, step):
+        flat = rows[low : low + step].ravel()
+        part, at = np.zeros((len(flat), 3)), np.clip(equations.point[flat], 0, None)
+        if points:
+            part = np.einsum("mi,mij->mj", equations.point_part[flat], reduced.point_factor[at])
+        where = (np.repeat(np.arange(len(flat)), 3), (3 * at[:, None] + np.arange(3)).ravel())
+        through = sparse.coo_array(
+            (part.ravel(), where), shape=(len(flat), max(points, 3))
+        ).tocsr()[:, :points]
+        design = equations.reduced[flat]
+        own = (design[:, thin] - through @ reduced.coupling_sparse).tocsr()
+        own_dense = design[:, dense].toarray() - through @ reduced.coupling_dense
+        spread = own @ cofactor[thin] + own_dense @ cofactor[dense]
+        for i in range(width):
+            for j in range(width):
+                result[low : low + step, i, j] = (
+                    _row_products(own[i::width], spread[j::width][:, thin])
+                    + np.einsum("md,md->m", own_dense[i::width], spread[j::width][:, dense])
+                    + np.einsum("mi,mi->m", part[i::width], part[j::width])
+                )
+    return result
+
+
 def groups_of(
     equations: Equations, residual: Array, redundancy: Array, factors: Mapping[str, float]
 ) -> tuple[ObservationGroup, ...]:
@@ -133,7 +177,7 @@ def groups_of(
 
         >>> rows = Equations(
         ...     np.zeros(2), sparse.csr_array((2, 1)), np.zeros((2, 3)), np.array([-1, -1]),
-        ...     np.full(2, 0.01), np.array([0, 0]), ("distance",), np.array([0, 1])
+        ...     np.full(2, 0.01), np.array([0, 0]), ("distance",), np.array([0, 1]), np.array([0, 0])
         ... )
         >>> (group,) = groups_of(rows, np.array([0.5, -0.5]), np.array([0.5, 0.5]), {})
         >>> group.factor, group.rms, group.worst

@@ -32,6 +32,7 @@ class CsvTable:
     columns: tuple[str, ...]
     rows: list[list[str]]
     lines: list[int]
+    header: int = 1
     problems: list[str] = field(default_factory=list)
 
     def has(self, column: str) -> bool:
@@ -87,10 +88,11 @@ def read_table(path: Path, needed: Sequence[str], known: Sequence[str]) -> CsvTa
         known: columns it may have in addition.
 
     Raises:
-        ProjectError: no such file, or columns that are missing or not known.
+        ProjectError: no such file, columns that are missing or not known, or a remark that looks
+            like a row.
     """
     try:
-        text = read_regular_file(path, _MAX_BYTES).decode("utf-8")
+        text = read_regular_file(path, _MAX_BYTES).decode("utf-8-sig")
     except ForeignFileError as error:
         raise ProjectError([str(error)]) from error
     except UnicodeDecodeError as error:
@@ -99,13 +101,22 @@ def read_table(path: Path, needed: Sequence[str], known: Sequence[str]) -> CsvTa
     rows: list[list[str]] = []
     lines: list[int] = []
     problems: list[str] = []
+    header = 1
     for number, line in enumerate(text.splitlines(), 1):
         bare = line.strip()
-        if not bare or bare.startswith("#"):
+        if not bare:
+            continue
+        if bare.startswith("#"):
+            if _is_row(bare, columns) and len(problems) < _MAX_PROBLEMS:
+                name = bare.split(",")[0]
+                problems.append(
+                    f"{path.name}:{number}: {name!r} looks like a name, and # begins a remark: "
+                    "write a space after the # of a remark, or rename it"
+                )
             continue
         cells = [cell.strip() for cell in next(csv.reader([bare]))]
         if not columns:
-            columns = tuple(cells)
+            columns, header = tuple(cells), number
             missing = [c for c in needed if c not in columns]
             foreign = [c for c in columns if c not in needed and c not in known]
             if missing:
@@ -128,7 +139,12 @@ def read_table(path: Path, needed: Sequence[str], known: Sequence[str]) -> CsvTa
         problems.append(f"{path.name}: empty; its first line names the columns {list(needed)}")
     if problems:
         raise ProjectError(problems)
-    return CsvTable(path.name, columns, rows, lines)
+    return CsvTable(path.name, columns, rows, lines, header)
+
+
+def _is_row(remark: str, columns: Sequence[str]) -> bool:
+    """Whether a line that begins with # has the cells of a row and no space after the #."""
+    return len(columns) > 1 and remark[1:2].isalnum() and remark.count(",") == len(columns) - 1
 
 
 def write_table(

@@ -16,6 +16,12 @@ from numpy.typing import NDArray
 
 from daemon.mission.foreign_files import ForeignFileError, within
 from daemon.postflight.adjustment.csv_tables import CsvTable, ProjectError, read_table
+from daemon.postflight.adjustment.plausibility import (
+    check_control,
+    check_distances,
+    check_image_points,
+    check_sigmas,
+)
 from daemon.postflight.adjustment.project_file import (
     AdjustmentHeadSection,
     CameraSection,
@@ -114,6 +120,7 @@ def read_project(path: Path) -> Project:
         constraints=tuple(LinearConstraint(dict(c.coefficients)) for c in file.constraint),
         rays=RayModel(file.adjust.earth_radius_m, file.adjust.refraction, file.adjust.ground_m),
     )
+    build.check(network)
     problems += [p for table in build.tables for p in table.problems]
     if problems:
         raise ProjectError(problems)
@@ -122,6 +129,7 @@ def read_project(path: Path) -> Project:
         max_iterations=a.max_iterations,
         robust=a.robust,
         reject_beyond=a.reject_beyond,
+        max_rounds=a.max_rounds,
         variance_components=a.variance_components,
         minimum_norm=a.minimum_norm,
     )
@@ -276,6 +284,15 @@ class _TableIndex:
             table.add_problem(table.lines[row], "an image point needs both coordinates")
         return ImagePoints(image, point, np.nan_to_num(xy), sigma * 1e-3)
 
+    def check(self, network: Network) -> None:
+        """Report what cannot be right although it can be read."""
+        for table in self.tables:
+            if table.problems:
+                return
+        check_image_points(self._seen, network.image_points, network.images, network.cameras)
+        if self._points is not None:
+            check_control(self._points, self._roles, network.points.xyz_m[: len(self._roles)])
+
     def _from_pixels(self, file: ProjectFile, image: NDArray[np.int64], px: Array) -> Array:
         camera_at = {c.name: c for c in file.camera}
         names = self._images.text("camera")
@@ -398,6 +415,7 @@ def _distances(folder: Path, file: ProjectFile, build: _TableIndex) -> Distances
     if table is None:
         return no_distances()
     build.tables.append(table)
+    check_distances(table)
     return Distances(
         build.index(table, "point_a", build.point_at, "point"),
         build.index(table, "point_b", build.point_at, "point"),
@@ -414,6 +432,7 @@ def _gnss(folder: Path, file: ProjectFile, build: _TableIndex) -> Gnss:
     if table is None:
         return no_gnss()
     build.tables.append(table)
+    check_sigmas(table, SIGMAS)
     station = build.index(table, "exposure", build.exposure_at, "exposure")
     levers = np.array([table.numbers(c, 0.0) for c in lever]).T.reshape(-1, 3)
     attitude = np.array([build.attitude_at.get(n, -1) for n in table.text("exposure")])
@@ -442,6 +461,7 @@ def _bearings(folder: Path, file: ProjectFile, build: _TableIndex) -> MeasuredAt
     if table is None:
         return no_measured_attitudes()
     build.tables.append(table)
+    check_sigmas(table, ("sigma_deg",))
     angles = np.array([table.numbers(c) for c in ANGLES]).T.reshape(-1, 3)
     sigma = np.radians(np.array(table.numbers("sigma_deg")))
     return MeasuredAttitudes(

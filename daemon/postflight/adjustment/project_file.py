@@ -25,6 +25,7 @@ class AdjustSection(_ProjectSection):
 
     robust: bool = False
     reject_beyond: float | None = Field(default=None, gt=1.0)
+    max_rounds: int = Field(default=100, ge=1, le=10_000)
     variance_components: bool = False
     minimum_norm: bool = False
     max_iterations: int = Field(default=30, ge=1, le=1000)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 
 from daemon.postflight.adjustment.project import CheckPoints
 from daemon.terminal.console import Console
@@ -20,6 +21,7 @@ from processing.bundle.adjustment_results import (
     heads_of,
     parameters_of,
 )
+from processing.bundle.data_snooping import names_of
 from processing.bundle.self_calibration import parameter_count
 
 Array = NDArray[np.float64]
@@ -32,6 +34,7 @@ _UNIT_OF_GROUP = {
     "prior": ("", 1.0),
 }
 _MAX_LISTED = 20
+_MAX_SIGMA0 = 20.0
 
 
 def report_of(
@@ -46,6 +49,8 @@ def report_of(
         {
             "name": name,
             "sigma0": result.sigma0,
+            "global_test": _global_test(result),
+            "cautions": _cautions(result),
             "redundancy": result.redundancy,
             "observations": result.observations,
             "unknowns": result.unknowns,
@@ -114,6 +119,9 @@ def report_of(
                 }
                 for k in np.flatnonzero(result.rejected)
             ],
+            "excluded": names_of(network, result.excluded),
+            "rounds": result.rounds,
+            "problems": result.problems,
             "left_out": [network.points.names[k] for k in np.flatnonzero(result.left_out)],
             "not_determined": [d.sentence for d in result.rank_defects],
         }
@@ -134,6 +142,16 @@ def print_report(console: Console, report: Mapping[str, Any]) -> None:
         f"{report['iterations']} iterations, {report['seconds']} s, {report['peak_mib']} MiB",
         highlight=False,
     )
+    test = report["global_test"]
+    if test["limits"]:
+        low, high = test["limits"]
+        console.print(
+            f"Global test: sigma0 is {'inside' if test['passed'] else 'outside'} {low:.4g} to "
+            f"{high:.4g}, the interval of 99 % for sigmas that are right",
+            highlight=False,
+        )
+    for sentence in report["cautions"]:
+        console.print(sentence, style="yellow", markup=False, highlight=False)
     groups = light_table(
         "Observations", ("",), ("count", "redundancy", "RMS", "worst", "unit", "variance factor")
     )
@@ -190,12 +208,28 @@ def print_report(console: Console, report: Mapping[str, Any]) -> None:
             f"{r['point']} in {r['image']}" for r in report["rejected"][:_MAX_LISTED]
         )
         console.print(f"{len(report['rejected'])} image points left out: {listed}", markup=False)
+    if report["excluded"]:
+        listed = ", ".join(report["excluded"][:_MAX_LISTED])
+        console.print(
+            f"{len(report['excluded'])} other observations left out: {listed}",
+            markup=False,
+            highlight=False,
+        )
+    if report["rounds"]:
+        console.print(
+            f"Data snooping: {report['rounds']} rounds, "
+            f"{len(report['rejected']) + len(report['excluded'])} observations left out, "
+            + ("not final" if report["problems"] else "none left beyond the limit"),
+            highlight=False,
+        )
     if report["left_out"]:
         listed = ", ".join(report["left_out"][:_MAX_LISTED])
         console.print(
             f"{len(report['left_out'])} object points that their rays do not fix: {listed}",
             markup=False,
         )
+    for sentence in report["problems"]:
+        console.print(sentence, style="red", markup=False, highlight=False)
     for sentence in report["not_determined"]:
         console.print(sentence, markup=False, highlight=False)
 
@@ -247,6 +281,34 @@ def _agreement(found: PointDifferences) -> dict[str, Any]:
         "predicted_m": predicted,
         "squares": found.squares,
     }
+
+
+def _global_test(result: Adjustment) -> dict[str, Any]:
+    """Limits of sigma0 (99 %) if the a priori sigmas are right, and whether it is inside."""
+    if result.redundancy <= 0:
+        return {"limits": [], "passed": None}
+    low, high = np.sqrt(stats.chi2.ppf([0.005, 0.995], result.redundancy) / result.redundancy)
+    return {"limits": [low, high], "passed": bool(low <= result.sigma0 <= high)}
+
+
+def _cautions(result: Adjustment) -> list[str]:
+    """What a reader would see at once in the tables."""
+    found = []
+    if result.sigma0 > _MAX_SIGMA0:
+        found.append(
+            f"sigma0 is {result.sigma0:.5g}: image coordinates may be of another unit, y may point "
+            "down, a sigma may be of another unit, or blunders are in the observations (--reject)"
+        )
+    points, seen = result.network.points, result.network.image_points.point
+    control = np.flatnonzero((np.nan_to_num(points.sigma_m, nan=-1.0) >= 0.0).any(axis=1))
+    tied = np.concatenate([result.network.distances.point_a, result.network.distances.point_b])
+    used = np.union1d(seen, tied)
+    unseen = [points.names[k] for k in np.setdiff1d(control, used)]
+    if unseen:
+        found.append(
+            f"{len(unseen)} control points have no image point: {', '.join(unseen[:_MAX_LISTED])}"
+        )
+    return found
 
 
 def _unit(group: str) -> tuple[str, float]:

@@ -249,5 +249,80 @@ def test_each_round_of_data_snooping_is_announced_with_its_number() -> None:
 
     result = adjust(network, AdjustmentSettings(reject_beyond=5.0), progress=report_progress)
     assert [number for _, number in rounds] == list(range(1, len(rounds) + 1))
-    assert rounds[-1][0] == f"{int(result.rejected.sum())} image points left out"
+    assert rounds[-1][0] == f"{int(result.rejected.sum())} observations left out"
     assert set(wrong) <= set(np.flatnonzero(result.rejected))
+
+
+def _with_narrow_rays(base_m: float) -> Network:
+    """A block with one more image next to the first, and twelve points that only these two see."""
+    simulated = aerial(seed=2, sigma_mm=5e-3, points=80)
+    network, random = simulated.network, np.random.default_rng(2)
+    place, rotation = simulated.station[0], simulated.attitude[0]
+    neighbour = place + rotation @ np.array([base_m, 0.0, 0.0])
+    new = np.column_stack(
+        [place[:2] + random.uniform(-200, 200, (12, 2)), random.uniform(0, 60, 12)]
+    )
+    ground = np.vstack([simulated.points, new])
+    image, point, xy = [], [], []
+    for which, station, points in ((0, place, range(80, 92)), (8, neighbour, range(92))):
+        for p in points:
+            ray = rotation.T @ (ground[p] - station)
+            seen = -70.0 * ray[:2] / ray[2]
+            if abs(seen[0]) < 29.0 and abs(seen[1]) < 19.0:
+                image.append(which)
+                point.append(p)
+                xy.append(seen + random.normal(0, 5e-3, 2))
+    stations, attitudes = network.stations, network.attitudes
+    images, points, table = network.images, network.points, network.image_points
+    return replace(
+        network,
+        stations=replace(
+            stations,
+            names=(*stations.names, "neighbour"),
+            position_m=np.vstack([stations.position_m, neighbour]),
+            fixed=np.append(stations.fixed, False),
+        ),
+        attitudes=replace(
+            attitudes,
+            names=(*attitudes.names, "neighbour"),
+            rotation=np.concatenate([attitudes.rotation, rotation[None]]),
+            fixed=np.append(attitudes.fixed, False),
+        ),
+        images=replace(
+            images,
+            names=(*images.names, "neighbour"),
+            station=np.append(images.station, 8),
+            attitude=np.append(images.attitude, 8),
+            camera=np.append(images.camera, 0),
+            head=np.append(images.head, -1),
+        ),
+        points=replace(
+            points,
+            names=(*points.names, *(f"w{k}" for k in range(12))),
+            xyz_m=np.vstack([points.xyz_m, new + random.normal(0, 1, new.shape) * [5, 5, 100]]),
+            sigma_m=np.vstack([points.sigma_m, np.full((12, 3), np.nan)]),
+            at_infinity=np.append(points.at_infinity, np.zeros(12, dtype=bool)),
+        ),
+        image_points=replace(
+            table,
+            image=np.append(table.image, image),
+            point=np.append(table.point, point),
+            xy_mm=np.vstack([table.xy_mm, xy]),
+            sigma_mm=np.full((len(table.image) + len(image), 2), 5e-3),
+        ),
+    )
+
+
+@pytest.mark.parametrize("base_m", [5.0, 1.0, 0.2, 0.05])
+def test_points_of_nearly_parallel_rays_never_stop_a_block(base_m) -> None:
+    """0.3, 0.06, 0.01 and 0.003 degrees."""
+    network = _with_narrow_rays(base_m)
+    assert network.images.names[8] == "neighbour"
+    result = adjust(network)
+    assert result.sigma0 == pytest.approx(1.0, abs=0.1)
+    if base_m == 5.0:
+        assert not result.left_out[80:].any()
+    reference = adjust(aerial(seed=2, sigma_mm=5e-3, points=80).network)
+    spread = np.sqrt(np.diag(reference.cofactor)[reference.layout.station.ravel()])
+    moved = (result.state.station[:8] - reference.state.station).ravel()
+    assert np.abs(moved / spread).max() < 3.0

@@ -1,0 +1,159 @@
+"""`syntopic adjust` with mistakes in a project: each ends in one sentence with file and line."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from daemon.cli import app
+from daemon.postflight.adjustment.csv_tables import ProjectError
+from daemon.postflight.adjustment.project import CheckPoints
+from daemon.postflight.adjustment.project_file import AdjustSection, CameraSection, ProjectFile
+from daemon.postflight.adjustment.project_writer import write_project
+from processing.bundle.network import Distances
+from tests.processing.bundle.simulated_networks import aerial
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small block with GNSS positions and a distance."""
+    simulated = aerial(seed=3, sigma_mm=1e-3, points=40, gnss_sigma_m=0.05)
+    length = float(np.linalg.norm(simulated.points[10] - simulated.points[11]))
+    network = replace(
+        simulated.network,
+        distances=Distances(np.array([10]), np.array([11]), np.array([length]), np.array([0.01])),
+    )
+    folder = tmp_path_factory.mktemp("mistakes") / "block"
+    file = ProjectFile(
+        format=1,
+        name="block",
+        adjust=AdjustSection(),
+        camera=(CameraSection(name="c", f_mm=70.0),),
+    )
+    nothing = np.zeros((0, 3))
+    write_project(folder, file, network, CheckPoints((), nothing, nothing))
+    return folder
+
+
+def _cell(row: int, column: str, change: Callable[[str], str]) -> Callable[[str], str]:
+    """Change a cell of a table; rows count from 0 after the names of columns, -1 is every row."""
+
+    def changed(text: str) -> str:
+        lines = text.splitlines()
+        header = next(k for k, line in enumerate(lines) if not line.startswith("#"))
+        at = lines[header].split(",").index(column)
+        for k in range(header + 1, len(lines)):
+            if row in (-1, k - header - 1):
+                cells = lines[k].split(",")
+                cells[at] = change(cells[at])
+                lines[k] = ",".join(cells)
+        return "\n".join(lines) + "\n"
+
+    return changed
+
+
+def _scaled(factor: float) -> Callable[[str], str]:
+    both = [_cell(-1, c, lambda v: repr(float(v) * factor)) for c in ("x_mm", "y_mm")]
+    return lambda text: both[1](both[0](text))
+
+
+def _repeated(text: str) -> str:
+    return text + text.splitlines()[-1] + "\n"
+
+
+def _repeated_off(text: str) -> str:
+    image, point, _, _, *rest = text.splitlines()[-1].split(",")
+    return text + ",".join([image, point, "5.0", "-5.0", *rest]) + "\n"
+
+
+def _copied(text: str) -> str:
+    lines = text.splitlines()
+    first, second = lines[-40].split(","), lines[-39].split(",")
+    lines[-39] = ",".join([second[0], *first[1:]])
+    return "\n".join(lines) + "\n"
+
+
+def _emptied(text: str) -> str:
+    return "\n".join(text.splitlines()[:2]) + "\n"
+
+
+MISTAKES = {
+    "pixels": ("image_points.csv", _scaled(200.0), "are these pixels"),
+    "metres": ("image_points.csv", _scaled(1e-3), "are these metres?"),
+    "repeated": ("image_points.csv", _repeated, "a second time (line "),
+    "repeated with a gross error": ("image_points.csv", _repeated_off, "a second time (line "),
+    "no image points": ("image_points.csv", _emptied, "no rows"),
+    "no image sigma": ("image_points.csv", _cell(4, "sx_um", lambda _: "0"), "sx_um is 0;"),
+    "no GNSS sigma": ("gnss.csv", _cell(1, "sz_m", lambda _: "-0.1"), "sz_m is -0.1;"),
+    "no distance sigma": ("distances.csv", _cell(0, "sigma_m", lambda _: "0"), "sigma_m is 0;"),
+    "to itself": ("distances.csv", _cell(0, "point_b", lambda _: "p10"), "from p10 to itself"),
+    "no distance": ("distances.csv", _cell(0, "distance_m", lambda _: "0"), "distance_m is 0;"),
+    "identical": ("points.csv", _copied, "has the coordinates of "),
+    "remark": ("image_points.csv", _cell(3, "image", lambda v: f"#{v}"), "looks like a name"),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_mistake_is_one_sentence_with_file_and_line(mistake, written, tmp_path) -> None:
+    name, change, sentence = MISTAKES[mistake]
+    folder = shutil.copytree(written, tmp_path / "block")
+    path = folder / name
+    path.write_text(change(path.read_text()))
+    outcome = CliRunner().invoke(app, ["adjust", str(folder)])
+    assert isinstance(outcome.exception, ProjectError), outcome.output
+    (problem,) = outcome.exception.problems
+    assert problem.startswith(f"{name}:")
+    assert problem.split(":")[1].isdigit()
+    assert sentence in problem
+
+
+def test_a_byte_order_mark_changes_nothing(written, tmp_path) -> None:
+    folder = shutil.copytree(written, tmp_path / "block")
+    plain = CliRunner().invoke(app, ["adjust", str(folder), "--json"])
+    for path in folder.glob("*.csv"):
+        path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    outcome = CliRunner().invoke(app, ["adjust", str(folder), "--json"])
+    assert json.loads(outcome.stdout)["sigma0"] == json.loads(plain.stdout)["sigma0"]
+
+
+def test_a_principal_distance_of_zero_is_refused_with_its_line(written, tmp_path) -> None:
+    folder = shutil.copytree(written, tmp_path / "block")
+    path = folder / "project.toml"
+    path.write_text(path.read_text().replace("f_mm = 70.0", "f_mm = 0.0"))
+    outcome = CliRunner().invoke(app, ["adjust", str(folder)])
+    assert isinstance(outcome.exception, ProjectError), outcome.output
+    (problem,) = outcome.exception.problems
+    assert problem.startswith("project.toml:")
+    assert "f_mm is 0.0; it is more than 0" in problem
+
+
+def test_the_global_test_and_a_control_point_without_images_are_reported(written, tmp_path) -> None:
+    folder = shutil.copytree(written, tmp_path / "block")
+    report = json.loads(CliRunner().invoke(app, ["adjust", str(folder), "--json"]).stdout)
+    low, high = report["global_test"]["limits"]
+    assert low < report["sigma0"] < high
+    assert report["global_test"]["passed"] is True
+    assert report["cautions"] == []
+    path = folder / "image_points.csv"
+    rows = [line for line in path.read_text().splitlines() if line.split(",")[1:2] != ["p2"]]
+    path.write_text("\n".join(rows) + "\n")
+    report = json.loads(CliRunner().invoke(app, ["adjust", str(folder), "--json"]).stdout)
+    assert report["cautions"] == ["1 control points have no image point: p2"]
+
+
+def test_sigmas_of_another_unit_fail_the_global_test(written, tmp_path) -> None:
+    folder = shutil.copytree(written, tmp_path / "block")
+    path = folder / "image_points.csv"
+    change = _cell(-1, "sx_um", lambda value: repr(float(value) * 1e-3))
+    path.write_text(change(path.read_text()))
+    report = json.loads(CliRunner().invoke(app, ["adjust", str(folder), "--json"]).stdout)
+    assert report["global_test"]["passed"] is False
+    (caution,) = report["cautions"]
+    assert "a sigma may be of another unit" in caution
