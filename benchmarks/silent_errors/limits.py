@@ -46,7 +46,7 @@ LIMITS: Final[Mapping[str, Limit]] = {
     "smear": Limit("a PAN head smeared along or across", "px", _same_limit(STITCHED, 4.0)),
     "gain-step": Limit("signal of a PAN frame from one line on", "%", _same_limit(EVERY, 8.0)),
     "gain-step-colour": Limit(
-        "signal of a colour frame from one line on", "%", {X: 16.5, L: 8.0, DMC: 8.0}
+        "signal of a colour frame from one line on", "%", {X: 16.5, L: 8.0, DMC: 16.5}
     ),
     "banding": Limit("lines of a PAN frame brighter, 8 to 40 in turn", "%",
                      _same_limit(EVERY, 5.5)),
