@@ -141,8 +141,8 @@ def test_the_check_before_a_flight_warns_and_passes(tmp_path: Path) -> None:
 
 
 def test_heads_of_the_same_band_are_images_of_their_own() -> None:
-    first, second = UNCALIBRATED.cones
-    parallel = replace(UNCALIBRATED, cones=(first, replace(second, rotation_rad=(0.0, 0.0, 0.0))))
+    cones = [replace(cone, rotation_rad=(0.0, 0.0, 0.0)) for cone in UNCALIBRATED.cones]
+    parallel, first = replace(UNCALIBRATED, cones=tuple(cones)), cones[0]
     assert has_head_images(parallel)
     single = replace(UNCALIBRATED, cones=(first,))
     assert has_head_images(single)
