@@ -31,6 +31,7 @@ from drivers.contract import (
 )
 from drivers.errors import DriverError
 from drivers.timescales.clock import Clock
+from drivers.transport.line_errors import LineErrors, overrun_sentence
 from drivers.transport.port_users import (
     holders,
     is_pseudo_terminal,
@@ -305,6 +306,7 @@ class SerialDevice(DeviceDriver):
         self._last_message_ns = 0
         self._is_silent = False
         self._sender: SenderFilter | None = None
+        self._line_errors = LineErrors(None)
         self._unlogged: deque[RawBytes] = deque(maxlen=UNLOGGED_MAX)
 
     # Overridden by drivers
@@ -426,6 +428,7 @@ class SerialDevice(DeviceDriver):
         if isinstance(port, UdpPort) and port.sender is not None:
             # The accepted sender does not change when the port is reopened.
             self._sender = port.sender = self._sender or port.sender
+        self._line_errors = LineErrors(port)
         self.connected()
         return SerialLine(port, self._received, lambda data: self._received(data, STALE_SUFFIX))
 
@@ -449,6 +452,7 @@ class SerialDevice(DeviceDriver):
                 for sample in self.step(line):
                     sink(sample)
                 self._count_other_senders()
+                self._count_line_errors()
             except LineLostError as error:
                 self._state = LifeCycle.INACTIVE
                 self._emit_lost(
@@ -468,6 +472,12 @@ class SerialDevice(DeviceDriver):
             "other-sender",
             f"The {self.what} {self.name} at {self.port}: {self._sender.sentence()}.",
         )
+
+    def _count_line_errors(self) -> None:
+        self.counters.update(found := self._line_errors.new())
+        if count := found["overruns"]:
+            sentence = overrun_sentence(f"{self.what} {self.name}", self.port, count)
+            self.emitter.emit_throttled("overrun", sentence)
 
     def _emit_silent(self) -> None:
         if self._is_silent:

@@ -26,6 +26,7 @@ from drivers.contract import (
     TemperatureSample,
 )
 from sim_hw.faults.plan import PlannedFault
+from sim_hw.gige import acquisition
 from sim_hw.gige.gige_head import (
     ExposureRequest,
     FrameSize,
@@ -187,6 +188,40 @@ def test_every_format_comes_as_right_justified_values_bit_for_bit(pixel_format: 
     assert {f.temperature_c for f in pair.frames} == {36.5}
     devices = [pair.clock.device_ns(start_ns) for start_ns in pair.starts_ns]
     assert [f.device_ns for f in pair.frames] == devices
+
+
+def test_frames_whose_chunk_data_cannot_be_read_are_whole_and_reported(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    written = acquisition.chunk_data
+
+    def displaced(image_nbytes: int, chunks: Sequence[tuple[int, bytes]]) -> bytes:
+        """Four bytes behind the last tag, as a Lucid TRI204S-C appends them."""
+        return written(image_nbytes, chunks)[4:] + bytes(4)
+
+    with flying() as (pair,):
+        pair.pulse(1)
+        pair.wait_frames(1)
+        monkeypatch.setattr(acquisition, "chunk_data", displaced)
+        for number in (2, 3):
+            pair.pulse(number)
+            pair.wait_frames(number)
+        pair.wait(
+            lambda: "chunks-unreadable" in [e.name for e in pair.events], "the report of chunks"
+        )
+        monkeypatch.undo()
+        pair.pulse(4)
+        pair.wait_frames(4)
+        statistics = pair.driver.statistics()
+    for picture in pair.pictures:
+        np.testing.assert_array_equal(picture, PATTERN)
+    assert [f.status for f in pair.frames] == [FrameStatus.COMPLETE] * 4
+    assert [f.counter for f in pair.frames] == [1, None, None, 4]
+    devices = [pair.clock.device_ns(start_ns) for start_ns in pair.starts_ns]
+    assert [f.device_ns for f in pair.frames] == devices, "the leader packet has the time too"
+    assert statistics["chunks_unreadable"] == 2
+    (event,) = [e for e in pair.events if e.name == "chunks-unreadable"]
+    assert event.is_fault and "set chunks = false" in event.sentence
 
 
 def test_a_packed_frame_without_chunks_is_unpacked_alike() -> None:

@@ -26,7 +26,7 @@ from drivers.cameras.aravis.gvcp import (
 )
 from drivers.cameras.aravis.library import OPENING, aravis_error
 from drivers.cameras.aravis.settings import AravisSettings
-from drivers.cameras.aravis.stream import FrameStream, ReceivedFrame
+from drivers.cameras.aravis.stream import FrameStream, ReceivedFrame, unreadable_chunks_sentence
 from drivers.cameras.head_device import HeadDevice
 from drivers.contract import (
     DeviceError,
@@ -457,6 +457,8 @@ class AravisHead(AravisSettings, HeadDevice):
             )
         if now["other_senders"] > before["other_senders"]:
             self._report_other_senders(session, now["other_senders"])
+        if now["chunks_unreadable"] > before["chunks_unreadable"]:
+            self.emitter.emit_throttled("chunks-unreadable", unreadable_chunks_sentence(self.name))
         if session.stream.restart_if_behind():
             self.emitter.emit_throttled(
                 "stream-restarted",

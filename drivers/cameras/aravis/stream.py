@@ -66,6 +66,15 @@ class ReceivedFrame:
     chunk_temperature_c: float | None
     chunk_frame_id: int | None
 
+    @property
+    def has_chunk_data(self) -> bool:
+        """Whether at least one value behind the pixels could be read."""
+        values = (
+            *(self.chunk_timestamp, self.chunk_exposure_us, self.chunk_counter),
+            *(self.chunk_gain, self.chunk_temperature_c, self.chunk_frame_id),
+        )
+        return any(value is not None for value in values)
+
 
 class FrameStream:
     """The stream of an opened head into `memory`.
@@ -122,6 +131,7 @@ class FrameStream:
         self._senders: StreamSocketFilter | None = None
         self._ignored = 0
         self._restarts = 0
+        self._chunks_unreadable = 0
         if camera.raw.is_gv_device():
             self._filter_to_head(camera, settings)
             self._tune(settings)
@@ -155,7 +165,7 @@ class FrameStream:
         if is_complete:
             self._ignored = self._ignored_packets()
         parser = self._parser if is_complete and buffer.has_chunks() else None
-        return ReceivedFrame(
+        received = ReceivedFrame(
             slot=self._slots[hash(buffer)],
             reason=reason,
             frame_id=int(buffer.get_frame_id()),
@@ -170,6 +180,9 @@ class FrameStream:
             chunk_temperature_c=_chunk(parser, "get_float_value", buffer, "ChunkTemperature"),
             chunk_frame_id=_chunk(parser, "get_integer_value", buffer, "ChunkFrameID"),
         )
+        if is_complete and self._parser is not None and not received.has_chunk_data:
+            self._chunks_unreadable += 1
+        return received
 
     def unpack(self, slot: int) -> None:
         """Convert the received pixels of a slot to right-justified 16-bit words; after `pop`.
@@ -188,6 +201,7 @@ class FrameStream:
 
         Returns:
             Counts by the names of STATISTIC_NAMES; also `underruns` in frames, `stream_restarts`,
+            `chunks_unreadable`, complete frames whose chunk data could not be read,
             `other_senders`, dropped datagrams of other senders, and `kernel_drops`, datagrams of
             the head that found the buffer of the socket full.
         """
@@ -196,6 +210,7 @@ class FrameStream:
             found[ours] = self._info(theirs)
         found["underruns"] = -(-found["underrun_packets"] // self._packets_per_frame)
         found["stream_restarts"] = self._restarts
+        found["chunks_unreadable"] = self._chunks_unreadable
         if self._senders is not None:
             found["other_senders"] = self._senders.poll(found["received_packets"])
             found["kernel_drops"] = self._senders.kernel_drops()
@@ -280,6 +295,22 @@ class FrameStream:
         stream.set_property("packet-request-ratio", 1.0)
         stream.set_property("packet-timeout", round(settings.packet_timeout_ms * 1e3))
         stream.set_property("frame-retention", round(settings.frame_retention_ms * 1e3))
+
+
+def unreadable_chunks_sentence(head: str) -> str:
+    """What it means that chunk data cannot be read, and the remedy.
+
+    Args:
+        head: name of the head.
+
+    Returns:
+        Sentences for the operator.
+    """
+    return (
+        f"The head {head} sent frames whose chunk data cannot be read. They are used with the time "
+        "of their leader packet and without an exposure counter. Update the head's firmware, or "
+        "set chunks = false."
+    )
 
 
 def receive_buffer_limit() -> int:
