@@ -92,6 +92,25 @@ def test_edges_hold_the_clock_to_microseconds_and_one_late_interrupt_does_not_mo
     assert 1_000 < estimate.sigma_ns < 5_000
 
 
+@pytest.mark.parametrize("stray_ms", [5, 300, 700, 900])
+@pytest.mark.parametrize("count", [1, 3])
+def test_stray_edges_between_the_seconds_do_not_move_the_clock(stray_ms: int, count: int) -> None:
+    rng = random.Random(7)
+    clock = GpsClock()
+    for second in range(1, 60):
+        edge_ns = second * NS + round(rng.gauss(0, 800))
+        clock.pps_edge(edge_ns, 2_000)
+        clock.message_arrived(OFFSET_NS + second * NS, second * NS + 60_000_000)
+        if 30 <= second < 30 + count:
+            clock.pps_edge(edge_ns + stray_ms * 1_000_000, 2_000)
+        at_ns = second * NS + 950_000_000
+        estimate = clock.gps_at(at_ns)
+        if second >= 30:
+            assert estimate is not None and estimate.source == "pps"
+            assert abs(estimate.gps_ns - OFFSET_NS - at_ns) < 3_000
+    assert estimate is not None and estimate.sigma_ns < 5_000
+
+
 def test_edges_that_are_missing_for_minutes_are_still_the_right_seconds() -> None:
     clock = GpsClock()
     for k in range(3):
