@@ -30,6 +30,7 @@ def test_a_head_in_order_passes_with_its_packet_size(network: HeadNetwork) -> No
     network.serve(HEAD)
     found = network.diagnose({**HEAD, **SMALL_BUFFER})
     assert {item["outcome"] for item in found.values()} == {"pass"}
+    assert found["path of SU00"]["sentence"] == ""
     assert found["path of SU00"]["found"] == {"packet_size": "1500"}
     assert "kernel drops" in found
 
