@@ -74,6 +74,8 @@ def v4l2_heads() -> tuple[list[dict[str, Any]], list[str]]:
         ours = [name for name in node.formats if name in FORMATS]
         if node.problem:
             problems.append(f"{node.path}: {node.problem}; add this user to the group video")
+        elif node.refusal:
+            problems.append(f"{node.path} ({node.card}): {node.refusal}")
         elif not ours:
             problems.append(f"{node.path} ({node.card}) has no format that is one of ours")
         else:

@@ -40,6 +40,8 @@ class Packing(enum.Enum):
     """MIPI RAW10: 4 bytes with the upper bits of 4 pixels, then one with their lowest 2 bits."""
     MIPI_12 = "12P"
     """MIPI RAW12: 2 bytes with the upper bits of 2 pixels, then one with their lowest 4 bits."""
+    MIPI_14 = "14P"
+    """MIPI RAW14: 4 bytes with the upper bits of 4 pixels, then 3 with their lowest 6 bits, each."""
 
 
 @dataclass(frozen=True)
@@ -99,6 +101,18 @@ def _mipi_12(x: NDArray[Any]) -> NDArray[Any]:
     return pixels
 
 
+def _mipi_14(x: NDArray[Any]) -> NDArray[Any]:
+    pixels = (x & 0xFF) << 6
+    pixels |= (x & 0xFF00) << 14
+    pixels |= (x & 0xFF_0000) << 22
+    pixels |= (x & 0xFF00_0000) << 30
+    pixels |= (x >> 32) & 0x3F
+    pixels |= (x >> 22) & 0x3F_0000
+    pixels |= (x >> 12) & 0x3F_0000_0000
+    pixels |= (x >> 2) & 0x3F_0000_0000_0000
+    return pixels
+
+
 _GROUPS: Final = {
     Packing.LSB_10: _Group(4, 5, _lsb_10),
     Packing.LSB_12: _Group(2, 3, _lsb_12),
@@ -106,6 +120,7 @@ _GROUPS: Final = {
     Packing.GVSP_12: _Group(2, 3, _gvsp_12),
     Packing.MIPI_10: _Group(4, 5, _mipi_10),
     Packing.MIPI_12: _Group(2, 3, _mipi_12),
+    Packing.MIPI_14: _Group(4, 7, _mipi_14),
 }
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -19,6 +22,7 @@ BITS = {
     Packing.GVSP_12: 12,
     Packing.MIPI_10: 10,
     Packing.MIPI_12: 12,
+    Packing.MIPI_14: 14,
 }
 
 
@@ -45,7 +49,7 @@ def packed(packing: Packing, pixels: list[int]) -> bytes:
     for at in range(0, len(pixels), count):
         group = pixels[at : at + count]
         last = sum((p & ((1 << low) - 1)) << (low * i) for i, p in enumerate(group))
-        out += bytes([*(p >> low for p in group), last])
+        out += bytes(p >> low for p in group) + last.to_bytes(count * low // 8, "little")
     return bytes(out)
 
 
@@ -81,3 +85,17 @@ def test_sizes_that_do_not_fit_are_refused_with_both() -> None:
         unpack(Packing.LSB_12, np.zeros(11, np.uint8), np.zeros(8, np.uint16))
     with pytest.raises(ValueError, match="6 pixels are not a multiple of 4, as 10p needs"):
         packed_nbytes(Packing.LSB_10, 6)
+
+
+@pytest.mark.parametrize(
+    ("name", "packing"), [("RAW10", Packing.MIPI_10), ("RAW12", Packing.MIPI_12)]
+)
+def test_pixels_packed_by_a_foreign_transmitter_model_come_back(
+    name: str, packing: Packing
+) -> None:
+    """Bytes that cocotbext-mipi-csi2, a model of CSI-2 transmitters, made of random pixels."""
+    recorded = json.loads((Path(__file__).parent / "data/mipi_packed.json").read_text())[name]
+    source = np.frombuffer(bytes.fromhex(recorded["packed"]), np.uint8)
+    target = np.zeros(len(recorded["pixels"]), np.uint16)
+    unpack(packing, source, target)
+    assert target.tolist() == recorded["pixels"]

@@ -63,6 +63,13 @@ def main() -> None:
         action="store_true",
         help="use KVM where it can be had: faster, but where KVM is itself virtual it may not boot",
     )
+    parser.add_argument(
+        "--module",
+        type=Path,
+        action="append",
+        default=[],
+        help="a further kernel module that the tests may load, such as vimc.ko built for this kernel",
+    )
     parser.add_argument("--command", help="a shell command to run instead of pytest")
     parser.add_argument("pytest", nargs="*", help="arguments for pytest, after --")
     options = parser.parse_args()
@@ -77,12 +84,12 @@ def main() -> None:
     chosen = options.pytest or ["-v", "--durations=5", "tests/kernel"]
     command = options.command or shlex.join([*python, *chosen])
     started = time.monotonic()
-    status = run(image, command, with_kvm=options.kvm)
+    status = run(image, command, with_kvm=options.kvm, modules=options.module)
     print(f"virtual machine: {time.monotonic() - started:.0f} s, exit status {status}")
     sys.exit(status)
 
 
-def run(image: Path, command: str, *, with_kvm: bool = False) -> int:
+def run(image: Path, command: str, *, with_kvm: bool = False, modules: Sequence[Path] = ()) -> int:
     """Run a shell command as root of the machine, its output on ours; its exit status.
 
     `NO_STATUS` if the machine ended, or had to be ended, without reporting one.
@@ -90,7 +97,11 @@ def run(image: Path, command: str, *, with_kvm: bool = False) -> int:
     has_kvm = with_kvm and os.access("/dev/kvm", os.R_OK | os.W_OK)
     with tempfile.TemporaryDirectory(prefix="kernel-machine-") as name:
         out = Path(name)
-        (out / "command.sh").write_text(_script(command), encoding="utf-8")
+        copies = "".join(
+            f"cp {shlex.quote(str(module.resolve()))} /dev/kernel-guest/modules/\n"
+            for module in modules
+        )
+        (out / "command.sh").write_text(_script(copies + command), encoding="utf-8")
         qemu = [
             *("qemu-system-x86_64", "-nodefaults", "-no-user-config", "-no-reboot"),
             *("-display", "none", "-serial", "stdio", "-machine", "q35", "-cpu", "max"),

@@ -181,3 +181,16 @@ def test_an_absent_head_is_reported_with_its_cure() -> None:
         vivid.load(node_types="0x1", input_types="0x0", num_inputs=1, multiplanar=1)
         head.wait_frames(2)
     assert head.reported == ["lost", "opened"]
+
+
+def test_a_format_that_another_program_changes_before_the_stream_is_set_again() -> None:
+    head = flight()
+    head.head.bind()
+    vivid.ctl(0, "--set-fmt-video=width=640,height=360,pixelformat=GREY")
+    with head:
+        head.wait_event("lost")
+        head.wait_frames(2)
+    lost = next(event for event in head.events if event.name == "lost")
+    assert "another program changed its format" in lost.sentence
+    assert head.head.statistics()["formats_changed"] == 1
+    assert {(f.width_px, f.height_px, f.pixel_format) for f in head.frames} == {(320, 180, "Y12")}

@@ -121,7 +121,8 @@ class Flight:
     def wait(self, true: Callable[[], bool], what: str) -> None:
         with self.changed:
             assert self.changed.wait_for(true, TIMEOUT_S), (
-                f"{what} did not come: {self.names}, {dict(self.head.statistics())}"
+                f"{what} did not come: {self.names}, {dict(self.head.statistics())}, "
+                f"{[event.sentence for event in self.events][-1:]}"
             )
 
     def wait_frames(self, more: int) -> None:

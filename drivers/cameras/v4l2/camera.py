@@ -6,6 +6,7 @@ Frames are taken from the node in `drivers.cameras.v4l2.v4l2_head`.
 from __future__ import annotations
 
 import errno
+import os
 from collections.abc import Mapping
 from typing import Final, TypeAlias
 
@@ -13,7 +14,15 @@ from drivers.cameras.v4l2 import uapi
 from drivers.cameras.v4l2.control import Control
 from drivers.cameras.v4l2.discovery import path_of, serial_number
 from drivers.cameras.v4l2.formats import FORMATS, PixelFormat, format_of_code
+from drivers.cameras.v4l2.media import graph_of
+from drivers.cameras.v4l2.module_parameters import wrong_parameters
 from drivers.cameras.v4l2.node import FrameLayout, VideoNode
+from drivers.cameras.v4l2.pipeline import SensorPipeline
+from drivers.cameras.v4l2.sensor_timing import (
+    blanking_for_exposure,
+    blanking_for_interval,
+    line_time_us,
+)
 from drivers.cameras.v4l2.settings import V4l2Settings, assignments
 from drivers.contract import DeviceError
 
@@ -40,6 +49,7 @@ class V4l2Camera:
 
     def __init__(self, settings: V4l2Settings) -> None:
         self._settings = settings
+        self._pipeline: SensorPipeline | None = None
         self._who = f"{settings.name} at {settings.device}"
         path = path_of(settings.device)
         if path is None:
@@ -78,6 +88,7 @@ class V4l2Camera:
             "driver": f"{self.node.driver} {self.node.kernel}",
             "bus": self.node.bus,
             "path": self.node.path,
+            "sensor": "" if self._pipeline is None else self._pipeline.sensor_name,
         }
 
     def exposure_time_us(self, values: Mapping[str, float | int | str]) -> float | None:
@@ -166,8 +177,7 @@ class V4l2Camera:
         writes: list[Write] = []
         if (automatic := by_id.get(uapi.CID_EXPOSURE_AUTO)) is not None:
             writes.append(("exposure_time_us", automatic, uapi.EXPOSURE_MANUAL))
-        steps = max(1, round(exposure_time_us / self._exposure_unit_us))
-        writes.append(("exposure_time_us", self._exposure, steps))
+        writes += self._exposure_writes(exposure_time_us)
         if gain_db == self.gain_db:
             return writes
         if not settings.gain_unit_db or self._gain_control is None:
@@ -206,11 +216,13 @@ class V4l2Camera:
                     f"video_input = {settings.video_input} is refused ({_message_of(error)}); see "
                     "v4l2-ctl --list-inputs"
                 )
+        refusals += wrong_parameters(settings.module_parameters)
+        self._open_pipeline(refusals)
         self.layout = self._write_format(refusals)
         self.format: PixelFormat = FORMATS[settings.pixel_format]
+        self.controls = node.controls()
         if settings.frame_interval_s > 0:
             self._write_interval(refusals)
-        self.controls = node.controls()
         self._named = {name for name, _ in assignments(settings.controls)}
         self._find_exposure(refusals)
         self._write_controls(refusals)
@@ -220,12 +232,37 @@ class V4l2Camera:
         if refusals:
             raise DeviceError("\n".join(f"{self._who}: {refusal}" for refusal in refusals))
 
+    def _open_pipeline(self, refusals: list[str]) -> None:
+        """Open and configure the parts before a node whose driver leaves them to its user."""
+        settings = self._settings
+        if not self.node.is_media_centric:
+            return
+        try:
+            graph = graph_of(self.node.path)
+            entity = None if graph is None else graph.entity_at(os.path.realpath(self.node.path))
+            if graph is None or entity is None:
+                raise DeviceError(
+                    "its media device is not found below /dev; see media-ctl -p, and whether the "
+                    "sensor's driver is loaded"
+                )
+            self._pipeline = pipeline = SensorPipeline(graph, entity)
+        except PermissionError:
+            raise DeviceError(
+                f"{self._who}: its media device may not be opened; add this user to the group video"
+            ) from None
+        except DeviceError as error:
+            raise DeviceError(f"{self._who}: {error}") from None
+        for part in pipeline.parts.values():
+            self.node.attach(part)
+        refusals += pipeline.configure(settings.width_px, settings.height_px, settings.pixel_format)
+
     def _write_format(self, refusals: list[str]) -> FrameLayout:
         settings, node = self._settings, self.node
         requested = FORMATS[settings.pixel_format]
         current = node.layout()
-        width = settings.width_px or current.width_px
-        height = settings.height_px or current.height_px
+        sent = current if self._pipeline is None else self._pipeline.sensor_format
+        width = settings.width_px or sent.width_px
+        height = settings.height_px or sent.height_px
         try:
             layout = node.set_layout(width, height, requested.code)
         except OSError as error:
@@ -250,6 +287,9 @@ class V4l2Camera:
 
     def _write_interval(self, refusals: list[str]) -> None:
         requested_s = self._settings.frame_interval_s
+        if self._pipeline is not None:
+            self._write_blanking(requested_s, refusals)
+            return
         try:
             granted_s = self.node.set_interval(requested_s)
         except OSError as error:
@@ -258,6 +298,32 @@ class V4l2Camera:
             return
         if abs(granted_s - requested_s) > 0.01 * requested_s:
             refusals.append(f"frame_interval_s is {requested_s:g}; the head gives {granted_s:g}")
+
+    def _write_blanking(self, requested_s: float, refusals: list[str]) -> None:
+        """Set the frame interval of a sensor by its blank lines."""
+        by_id = {c.id: c for c in self.controls.values()}
+        blanking, line_us = by_id.get(uapi.CID_VBLANK), self._line_time_us(by_id)
+        if blanking is None or not line_us:
+            refusals.append(
+                f"frame_interval_s is {requested_s:g}; the sensor does not report its blank lines "
+                "and the time of a line, set 0"
+            )
+            return
+        lines = blanking_for_interval(requested_s, line_us, self._sensor_height_px())
+        self._write("frame_interval_s", blanking, lines, refusals)
+
+    def _sensor_height_px(self) -> int:
+        pipeline = self._pipeline
+        return self.layout.height_px if pipeline is None else pipeline.sensor_format.height_px
+
+    def _line_time_us(self, by_id: Mapping[int, Control]) -> float:
+        """The time of a line; 0 where the sensor does not report it, or not without ambiguity."""
+        rate, blank = by_id.get(uapi.CID_PIXEL_RATE), by_id.get(uapi.CID_HBLANK)
+        pipeline = self._pipeline
+        if rate is None or blank is None or (pipeline is not None and pipeline.is_scaled):
+            return 0.0
+        width = self.layout.width_px if pipeline is None else pipeline.sensor_format.width_px
+        return line_time_us(width, self.node.read(blank), self.node.read(rate))
 
     def _find_exposure(self, refusals: list[str]) -> None:
         """The control of the exposure time and its unit."""
@@ -278,18 +344,34 @@ class V4l2Camera:
             if not self._exposure_unit_us:
                 refusals.append(
                     f"exposure_unit_us is 0, and the head does not report the unit of its control "
-                    f"{self._exposure.name}; give it (the time of a line, as a rule)"
+                    f"{self._exposure.name}; give it (the time of a line, as a rule; a sensor that "
+                    "bins or skips does not report it)"
                 )
 
     def _unit_of(self, control: Control, by_id: Mapping[int, Control]) -> float:
         if control.id == uapi.CID_EXPOSURE_ABSOLUTE:
             return ABSOLUTE_UNIT_US
-        rate, blank = by_id.get(uapi.CID_PIXEL_RATE), by_id.get(uapi.CID_HBLANK)
-        if control.id != uapi.CID_EXPOSURE or rate is None or blank is None:
-            return 0.0
-        pixels_per_s = self.node.read(rate)
-        pixels = self.layout.width_px + self.node.read(blank)
-        return pixels / pixels_per_s * 1e6 if pixels_per_s > 0 else 0.0
+        return self._line_time_us(by_id) if control.id == uapi.CID_EXPOSURE else 0.0
+
+    def _exposure_writes(self, exposure_time_us: float) -> list[Write]:
+        """The exposure in its unit, and before it the blank lines without which it does not fit."""
+        assert self._exposure is not None
+        steps = max(1, round(exposure_time_us / self._exposure_unit_us))
+        write = ("exposure_time_us", self._exposure, steps)
+        by_id = {c.id: c for c in self.controls.values()}
+        blanking = by_id.get(uapi.CID_VBLANK)
+        if blanking is None or self._exposure.id != uapi.CID_EXPOSURE:
+            return [write]
+        exposure_max = self.node.queried(self._exposure).maximum
+        lines = blanking_for_exposure(steps, exposure_max, current := self.node.read(blanking))
+        if lines <= current:
+            return [write]
+        if self._settings.frame_interval_s:
+            raise DeviceError(
+                f"{self._who}: an exposure of {exposure_time_us:g} us does not fit into a frame of "
+                f"{self._settings.frame_interval_s:g} s; shorten it, or set frame_interval_s = 0"
+            )
+        return [("exposure_time_us", blanking, lines), write]
 
     def _write_controls(self, refusals: list[str]) -> None:
         settings = self._settings
@@ -300,8 +382,7 @@ class V4l2Camera:
             if automatic is not None:
                 writes.append(("exposure_time_us", automatic, uapi.EXPOSURE_MANUAL))
             if self._exposure is not None and self._exposure_unit_us:
-                steps = max(1, round(settings.exposure_time_us / self._exposure_unit_us))
-                writes.append(("exposure_time_us", self._exposure, steps))
+                writes += self._exposure_writes(settings.exposure_time_us)
             elif self._exposure is None and not settings.exposure_control:
                 refusals.append(
                     f"exposure_time_us is {settings.exposure_time_us:g}; the head has no control "
@@ -340,6 +421,9 @@ class V4l2Camera:
 
     def _write(self, key: str, control: Control, value: int, refusals: list[str]) -> None:
         bounded = not control.is_button
+        if bounded and not control.minimum <= value <= control.maximum:
+            # Another control may have changed the bounds.
+            control = self.node.queried(control)
         if bounded and not control.minimum <= value <= control.maximum:
             refusals.append(
                 f"{key} would set {control.name} to {value}; the head takes {control.minimum} to "

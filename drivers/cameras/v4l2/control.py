@@ -1,6 +1,6 @@
 """Controls of a head: their names, kinds and bounds.
 
-They are read and written in `drivers.cameras.v4l2.node`.
+They are read and written in `drivers.cameras.v4l2.control_port`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ NUMBERS: Final = (
 
 @dataclass(frozen=True)
 class Control:
-    """A control of the head, named as v4l2-ctl does."""
+    """A control of the head, named as v4l2-ctl does; `path` is its sub-device, empty for the node."""
 
     id: int
     name: str
@@ -32,6 +32,7 @@ class Control:
     minimum: int
     maximum: int
     flags: int
+    path: str = ""
 
     @property
     def is_button(self) -> bool:

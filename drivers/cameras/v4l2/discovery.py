@@ -8,8 +8,11 @@ from pathlib import Path
 from typing import Final
 
 from drivers.cameras.v4l2.formats import format_of_code
+from drivers.cameras.v4l2.media import graph_of
 from drivers.cameras.v4l2.node import VideoNode
+from drivers.cameras.v4l2.pipeline import route_of
 from drivers.cameras.v4l2.uapi import fourcc_name
+from drivers.contract import DeviceError
 
 NODES: Final = Path("/dev")
 SYSFS: Final = Path("/sys/class/video4linux")
@@ -17,7 +20,10 @@ SYSFS: Final = Path("/sys/class/video4linux")
 
 @dataclass(frozen=True)
 class FoundNode:
-    """A capture node; `problem` is the reason why it cannot be queried."""
+    """A capture node.
+
+    `problem` is the reason why it cannot be queried, `refusal` why it cannot be a head.
+    """
 
     path: str
     card: str = ""
@@ -26,6 +32,7 @@ class FoundNode:
     serial: str = ""
     formats: tuple[str, ...] = ()
     problem: str = ""
+    refusal: str = ""
 
 
 def capture_nodes() -> list[FoundNode]:
@@ -44,13 +51,20 @@ def capture_nodes() -> list[FoundNode]:
             continue
         try:
             formats = tuple(_name(code) for code in node.formats())
+            refusal = _refusal(node)
         except OSError:
-            formats = ()
+            formats, refusal = (), ""
         finally:
             node.close()
         found.append(
             FoundNode(
-                str(path), node.card, node.driver, node.bus, serial_number(str(path)), formats
+                str(path),
+                node.card,
+                node.driver,
+                node.bus,
+                serial_number(str(path)),
+                formats,
+                refusal=refusal,
             )
         )
     return found
@@ -88,6 +102,21 @@ def serial_number(path: str) -> str:
             return (folder / "serial").read_text(encoding="utf-8").strip()
         except (OSError, UnicodeDecodeError):
             continue
+    return ""
+
+
+def _refusal(node: VideoNode) -> str:
+    """Why no sensor can be reached through a node of a media pipeline; empty where one can."""
+    if not node.is_media_centric:
+        return ""
+    graph = graph_of(node.path)
+    entity = None if graph is None else graph.entity_at(node.path)
+    if graph is None or entity is None:
+        return ""
+    try:
+        route_of(graph, entity)
+    except DeviceError as error:
+        return str(error)
     return ""
 
 

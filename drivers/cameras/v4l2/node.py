@@ -1,4 +1,4 @@
-"""An opened video node of the kernel: its ioctls, its buffers, its controls.
+"""An opened video node of the kernel: its formats and its buffers.
 
 Every call either returns or raises OSError; none waits but `wait`, which has a time-out. What is
 asked when, and what an error means for the head, is in `drivers.cameras.v4l2.v4l2_head`.
@@ -11,16 +11,13 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import errno
-import fcntl
 import mmap
-import os
 import select
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 from drivers.cameras.v4l2 import uapi
-from drivers.cameras.v4l2.control import NUMBERS, Control, control_name
+from drivers.cameras.v4l2.control_port import ControlPort, text_of
 
 if TYPE_CHECKING:
     import numpy as np
@@ -57,7 +54,7 @@ class FilledBuffer:
     is_start_of_exposure: bool
 
 
-class VideoNode:
+class VideoNode(ControlPort):
     """A video capture node, open until `close`; single- and multi-planar API alike.
 
     Raises:
@@ -65,8 +62,7 @@ class VideoNode:
     """
 
     def __init__(self, path: str) -> None:
-        self.path = path
-        self._fd = os.open(path, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
+        super().__init__(path)
         self._maps: list[tuple[mmap.mmap, int]] = []
         try:
             capability = self._call(uapi.QUERYCAP, uapi.Capability())
@@ -79,14 +75,15 @@ class VideoNode:
                 self.buffer_type = uapi.BUF_TYPE_VIDEO_CAPTURE_MPLANE
             else:
                 raise OSError(errno.ENODEV, "it is no capture node")
+            self.is_media_centric = bool(capabilities & uapi.CAP_IO_MC)
             if not capabilities & uapi.CAP_STREAMING:
                 raise OSError(errno.ENODEV, "it cannot stream")
         except OSError:
             self.close()
             raise
-        self.driver = _text(capability.driver)
-        self.card = _text(capability.card)
-        self.bus = _text(capability.bus_info)
+        self.driver = text_of(capability.driver)
+        self.card = text_of(capability.card)
+        self.bus = text_of(capability.bus_info)
         self.kernel = ".".join(str(capability.version >> s & 0xFF) for s in (16, 8, 0))
 
     @property
@@ -97,9 +94,7 @@ class VideoNode:
     def close(self) -> None:
         """Release mappings and descriptor: a device that was unplugged waits for both."""
         self.free_buffers()
-        if self._fd >= 0:
-            os.close(self._fd)
-            self._fd = -1
+        super().close()
 
     def wait(self, timeout_s: float) -> int:
         """Wait for a frame.
@@ -280,7 +275,9 @@ class VideoNode:
 
         mapped, length = self._maps[filled.index]
         end = min(filled.nbytes, length)
-        return np.frombuffer(mapped, np.uint8, max(0, end - filled.offset), filled.offset)
+        if end <= filled.offset:
+            return np.empty(0, np.uint8)
+        return np.frombuffer(mapped, np.uint8, end - filled.offset, filled.offset)
 
     def queue(self, index: int) -> None:
         """Give a buffer to the kernel.
@@ -352,112 +349,3 @@ class VideoNode:
             buffer.m.planes = ctypes.cast(planes, ctypes.POINTER(uapi.BufferPlane))
             buffer.length = 1
         return buffer, planes
-
-    # Controls
-
-    def controls(self) -> dict[str, Control]:
-        """All controls except classes, strings and compounds.
-
-        Returns:
-            Controls by name.
-
-        Raises:
-            OSError: the head is lost.
-        """
-        found: dict[str, Control] = {}
-        query = uapi.QueryExtCtrl(id=uapi.CTRL_FLAG_NEXT_CTRL)
-        while True:
-            try:
-                self._call(uapi.QUERY_EXT_CTRL, query)
-            except OSError as error:
-                if error.errno in (errno.EINVAL, errno.ENOTTY):
-                    return found
-                raise
-            usable = query.type in (*NUMBERS, uapi.CTRL_TYPE_BUTTON) and query.elems <= 1
-            if usable and not query.flags & uapi.CTRL_FLAG_DISABLED:
-                name = control_name(_text(query.name))
-                found[name] = Control(
-                    int(query.id),
-                    name,
-                    int(query.type),
-                    int(query.minimum),
-                    int(query.maximum),
-                    int(query.flags),
-                )
-            query = uapi.QueryExtCtrl(id=query.id | uapi.CTRL_FLAG_NEXT_CTRL)
-
-    def read(self, control: Control) -> int:
-        """Read a control.
-
-        Args:
-            control: a control with a value.
-
-        Returns:
-            Its value, in the control's own unit.
-
-        Raises:
-            OSError: it cannot be read now, or the head is lost.
-        """
-        one = uapi.ExtControl(id=control.id)
-        self._control(uapi.G_EXT_CTRLS, one)
-        is_wide = control.type == uapi.CTRL_TYPE_INTEGER64
-        return int(one.u.value64 if is_wide else one.u.value)
-
-    def write(self, control: Control, value: int) -> None:
-        """Write a control.
-
-        Args:
-            control: the control.
-            value: value in the control's own unit; 1 for a button.
-
-        Raises:
-            OSError: the head refuses or is lost.
-        """
-        one = uapi.ExtControl(id=control.id)
-        if control.type == uapi.CTRL_TYPE_INTEGER64:
-            one.u.value64 = value
-        else:
-            one.u.value = value
-        self._control(uapi.S_EXT_CTRLS, one)
-
-    def read_all(self, controls: Mapping[str, Control]) -> dict[str, int]:
-        """Read several controls.
-
-        Args:
-            controls: controls by name.
-
-        Returns:
-            Values by name of those that can be read now.
-
-        Raises:
-            OSError: ENODEV, the head is lost.
-        """
-        found: dict[str, int] = {}
-        for name, control in controls.items():
-            if not control.is_readable_number:
-                continue
-            try:
-                found[name] = self.read(control)
-            except OSError as error:
-                if error.errno == errno.ENODEV:
-                    raise
-        return found
-
-    def _control(self, request: int, one: uapi.ExtControl) -> None:
-        several = uapi.ExtControls(which=uapi.CTRL_WHICH_CUR_VAL, count=1)
-        several.controls = ctypes.pointer(one)
-        self._call(request, several)
-
-    def _call(self, request: int, argument: Any) -> Any:
-        if self._fd < 0:
-            raise OSError(errno.ENODEV, "the node is closed")
-        while True:
-            try:
-                fcntl.ioctl(self._fd, request, argument)
-            except InterruptedError:
-                continue
-            return argument
-
-
-def _text(value: bytes) -> str:
-    return value.decode("utf-8", errors="replace").strip()

@@ -8,6 +8,7 @@ from typing import Any, Final
 
 from drivers.base.settings import Configured, Setting
 from drivers.cameras.v4l2.formats import FORMATS
+from drivers.cameras.v4l2.module_parameters import ASSIGNMENT as MODULE_ASSIGNMENT
 
 ASSIGNMENT: Final = re.compile(r"([a-z0-9_]+)=(-?\d+)")
 
@@ -50,6 +51,10 @@ class V4l2Settings(Configured):
     controls = Setting(
         tuple[str, ...](), help="further controls to be set, each name=number, in this order"
     )
+    module_parameters = Setting(
+        tuple[str, ...](),
+        help="parameters of kernel modules that must have a value, each module/parameter=value",
+    )
     temperature_control = Setting("", help="control that reports the head's temperature")
     temperature_unit_c = Setting(1.0, minimum=1e-6, maximum=1000, help="unit of that control, degC")
     trigger_source = Setting("line", choices=("line", "software"), help="what starts an exposure")
@@ -86,6 +91,11 @@ class V4l2Settings(Configured):
             f"controls has {text!r}; name=number as in 'trigger_mode=1', the name as printed by v4l2-ctl"
             for text in values["controls"]
             if not ASSIGNMENT.fullmatch(text)
+        ]
+        found += [
+            f"module_parameters has {text!r}; module/parameter=value as in 'imx296/trigger_mode=1'"
+            for text in values["module_parameters"]
+            if not MODULE_ASSIGNMENT.fullmatch(text)
         ]
         if values["trigger_source"] == "software" and not values["trigger_control"]:
             found.append(

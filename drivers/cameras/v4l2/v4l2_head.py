@@ -73,6 +73,7 @@ class V4l2Head(V4l2Settings, HeadDevice):
         "stamps_implausible",
         "queue_failures",
         "silences",
+        "formats_changed",
     )
 
     _session: _Session | None = None
@@ -189,6 +190,13 @@ class V4l2Head(V4l2Settings, HeadDevice):
                 f"{self.name} at {self.device}: width_px is {layout.width_px}; "
                 f"{camera.format.name} needs a multiple of {group}"
             )
+        row_nbytes = packed_nbytes(camera.format.packing, layout.width_px)
+        if layout.row_nbytes and layout.row_nbytes < row_nbytes:
+            raise DeviceError(
+                f"{self.name} at {self.device}: the kernel's driver announces {layout.row_nbytes} "
+                f"bytes for a row of {layout.width_px} pixels {camera.format.name}, which has "
+                f"{row_nbytes}; choose another pixel_format, and report it to the driver's maker"
+            )
         nbytes = layout.width_px * layout.height_px * 2
         if self._memory.slot_nbytes < nbytes:
             raise DeviceError(
@@ -209,6 +217,10 @@ class V4l2Head(V4l2Settings, HeadDevice):
         reason = ""
         try:
             count = node.make_buffers(self.buffers)
+            if node.layout() != session.camera.layout:
+                # From here on the kernel refuses other programs to change it.
+                self.counters["formats_changed"] += 1
+                raise V4l2HeadLostError("another program changed its format")
             session.unqueued_buffers = dict.fromkeys(range(count), 0)
             self._queue_again(session)
             node.stream_on()
@@ -385,4 +397,6 @@ def _loss(error: OSError) -> str:
         errno.ENODEV: "it was unplugged",
         errno.EIO: "its stream broke off",
         errno.EBUSY: "another program uses it",
+        errno.EPIPE: "formats along its media pipeline differ, see media-ctl -p",
+        errno.ENOLINK: "no enabled link of its media pipeline leads to it, see media-ctl -p",
     }.get(error.errno or 0, reason_text)
