@@ -195,6 +195,22 @@ class ClockReading:
 
 
 @dataclass(frozen=True)
+class PtpReading:
+    """What a device reports of its clock's synchronisation by PTP (IEEE 1588).
+
+    `status` is the state of its port as GenICam names it: "Slave", "Master", "Listening" and others.
+    `offset_ns` is its clock less its master's, None if it was not read. `grandmaster` is the
+    identity of the grandmaster, of its master if it reports no grandmaster, or empty.
+    """
+
+    device: str
+    mono_ns: int
+    status: str
+    offset_ns: int | None
+    grandmaster: str
+
+
+@dataclass(frozen=True)
 class RawBytes:
     """Bytes as received from a device, for the flight log."""
 
@@ -225,6 +241,7 @@ Record = (
     | TemperatureSample
     | PpsEdge
     | ClockReading
+    | PtpReading
     | RawBytes
     | DeviceEvent
 )

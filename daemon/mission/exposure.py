@@ -34,7 +34,7 @@ from daemon.mission.record_types import (
 from processing.rig.problem_sentences import Finding, shown
 from processing.rig.value_types import Flag, Name
 
-TimeSource = Literal["event-mark", "pps", "interpolated", "host", "none"]
+TimeSource = Literal["event-mark", "ptp", "pps", "interpolated", "host", "none"]
 RecordState = Literal["complete", "degraded", "lost"]
 _KNOWN_KEYS_ONLY: Final = ConfigDict(extra="forbid")
 

@@ -62,10 +62,12 @@ def _node(feature: Feature) -> str:
     match feature:
         case IntegerFeature():
             maximum = feature.maximum if feature.length == 4 else 2**63 - 1
+            minimum = -(2**63) if feature.is_signed else feature.minimum
+            register = _integer_register(feature, feature.bits, is_signed=feature.is_signed)
             return (
                 f'<Integer Name="{feature.name}"><pValue>{feature.name}Register</pValue>'
-                f"<Min>{feature.minimum}</Min><Max>{maximum}</Max><Inc>{feature.increment}</Inc>"
-                f"{_unit(feature.unit)}</Integer>" + _integer_register(feature, feature.bits)
+                f"<Min>{minimum}</Min><Max>{maximum}</Max><Inc>{feature.increment}</Inc>"
+                f"{_unit(feature.unit)}</Integer>{register}"
             )
         case FloatFeature():
             return (
@@ -122,10 +124,15 @@ def _place(feature: Feature, selector: str | None = None) -> str:
 
 
 def _integer_register(
-    feature: Feature, bits: tuple[int, int] | None = None, selector: str | None = None
+    feature: Feature,
+    bits: tuple[int, int] | None = None,
+    selector: str | None = None,
+    *,
+    is_signed: bool = False,
 ) -> str:
     name = f"{feature.name}Register"
-    end = "<Sign>Unsigned</Sign><Endianess>BigEndian</Endianess>"
+    sign = "Signed" if is_signed else "Unsigned"
+    end = f"<Sign>{sign}</Sign><Endianess>BigEndian</Endianess>"
     if bits is None:
         return f'<IntReg Name="{name}">{_place(feature, selector)}{end}</IntReg>'
     # GenICam counts the bits of a big-endian register from the most significant one.

@@ -86,6 +86,19 @@ CHUNKS = {
     "FrameID": 5,
 }
 
+PTP_STATUSES = {
+    "Initializing": 1,
+    "Faulty": 2,
+    "Disabled": 3,
+    "Listening": 4,
+    "PreMaster": 5,
+    "Master": 6,
+    "Passive": 7,
+    "Uncalibrated": 8,
+    "Slave": 9,
+}
+"""Values of IEEE 1588-2008, table 8."""
+
 IMAGE_CHUNK_ID = 0x0001
 CHUNK_IDS = {
     "Timestamp": 0x1001,
@@ -130,6 +143,7 @@ class IntegerFeature(Feature):
     default: int = 0
     unit: str = ""
     bits: tuple[int, int] | None = None
+    is_signed: bool = False
 
 
 @dataclass(frozen=True)
@@ -185,7 +199,7 @@ def head_features(width_px: int, height_px: int) -> tuple[Feature, ...]:
     """The registers of a head with that many pixels, in the order a person reads them."""
     device, image, acquisition = "DeviceControl", "ImageFormatControl", "AcquisitionControl"
     analog, transport, chunk = "AnalogControl", "TransportLayerControl", "ChunkDataControl"
-    action = "ActionControl"
+    action, ptp = "ActionControl", "PtpControl"
     return (
         StringFeature("DeviceVendorName", device, MANUFACTURER),
         StringFeature("DeviceModelName", device, MODEL),
@@ -297,6 +311,21 @@ def head_features(width_px: int, height_px: int) -> tuple[Feature, ...]:
             "GevTimestampControlLatch", transport, TIMESTAMP_CONTROL, value=TIMESTAMP_LATCH
         ),
         IntegerFeature("GevTimestampValue", transport, TIMESTAMP_VALUE, "RO", length=8, unit="ns"),
+        BooleanFeature("PtpEnable", ptp, 0x1_0700),
+        CommandFeature("PtpDataSetLatch", ptp, 0x1_0704),
+        EnumerationFeature(
+            "PtpStatus",
+            ptp,
+            0x1_0708,
+            "RO",
+            entries=PTP_STATUSES,
+            default=PTP_STATUSES["Disabled"],
+        ),
+        IntegerFeature(
+            "PtpOffsetFromMaster", ptp, 0x1_0710, "RO", length=8, unit="ns", is_signed=True
+        ),
+        IntegerFeature("PtpParentClockID", ptp, 0x1_0720, "RO", length=8, is_signed=True),
+        IntegerFeature("PtpGrandmasterClockID", ptp, 0x1_0728, "RO", length=8, is_signed=True),
         BooleanFeature("ChunkModeActive", chunk, 0x1_0500, locked_while_acquiring=True),
         EnumerationFeature("ChunkSelector", chunk, 0x1_0504, entries=CHUNKS),
         BooleanFeature(

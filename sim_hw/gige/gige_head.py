@@ -22,6 +22,7 @@ from sim_hw.gige.gvcp import ForceIpRequest, Status
 from sim_hw.gige.head_faults import NO_FAULTS, HeadClock, WireFaults, channel_of
 from sim_hw.gige.interface_address import replace_address
 from sim_hw.gige.pacing import Pacing
+from sim_hw.gige.ptp_slave import PtpSlave
 from sim_hw.gige.registers import FrameSize, HeadIdentity, RegisterMemory
 from sim_hw.gige.server import ControlServer
 from sim_hw.gige.stream import StreamChannel
@@ -82,7 +83,8 @@ class GigeHead:
     formats make of it is in `packing`. `temperature_c` gets a monotonic time in ns.
     `packet_pacing` defaults to what suits this host's rmem_max. `interface` is the interface of a
     network namespace that the head is; it then answers broadcasts there and takes an address by
-    FORCEIP, until it is closed.
+    FORCEIP, until it is closed. `ptp` is the clock of a head that has PTP;
+    one without it stays Disabled.
     """
 
     def __init__(
@@ -95,7 +97,9 @@ class GigeHead:
         faults: WireFaults = NO_FAULTS,
         packet_pacing: Pacing | None = None,
         interface: str = "",
+        ptp: PtpSlave | None = None,
     ) -> None:
+        self._ptp = ptp
         self.identity = identity
         self._interface = interface
         self.size = size
@@ -122,6 +126,7 @@ class GigeHead:
         self._registers.provide(
             "DeviceTemperature", lambda: struct.pack(">d", temperature_c(time.monotonic_ns()))
         )
+        self._registers.provide("PtpStatus", lambda: struct.pack(">I", self._ptp_status()))
         self._registers.provide(
             "PayloadSize", lambda: struct.pack(">I", self._acquisition.payload_bytes())
         )
@@ -160,6 +165,8 @@ class GigeHead:
     def close(self) -> None:
         """Stop and let go of the sockets. May be called twice."""
         self._server.close()
+        if self._ptp is not None:
+            self._ptp.close()
         self._acquisition.close()
         self._stream.close()
 
@@ -199,6 +206,10 @@ class GigeHead:
             self._acquisition.software_trigger()
         elif address == registers.address_of("DeviceReset"):
             self._reset()
+        elif address == registers.address_of("PtpEnable"):
+            self._switch_ptp()
+        elif address == registers.address_of("PtpDataSetLatch"):
+            self._latch_ptp()
         elif address == at.TIMESTAMP_CONTROL:
             self._latch_timestamp()
         elif address == at.STREAM_PORT:
@@ -239,6 +250,34 @@ class GigeHead:
             now_ns = self._clock.device_ns(time.monotonic_ns())
             self._registers.set_register64(at.TIMESTAMP_VALUE, now_ns)
         self._registers.set_register(at.TIMESTAMP_CONTROL, 0)
+
+    def _ptp_status(self) -> int:
+        return at.PTP_STATUSES["Disabled" if self._ptp is None else self._ptp.status]
+
+    def _switch_ptp(self) -> None:
+        if self._ptp is None:
+            return
+        if self._registers.integer("PtpEnable"):
+            try:
+                self._ptp.start()
+            except OSError:
+                self._counts["ptp_start_failures"] += 1
+            self._clock.ptp = self._ptp
+        else:
+            self._ptp.close()
+            self._clock.ptp = None
+
+    def _latch_ptp(self) -> None:
+        if self._ptp is None:
+            return
+        registers, master = self._registers, self._ptp.master
+        identities = (0, 0) if master is None else (master.grandmaster, master.parent_identity)
+        for name, value in (
+            ("PtpOffsetFromMaster", self._ptp.offset_ns),
+            ("PtpGrandmasterClockID", identities[0]),
+            ("PtpParentClockID", identities[1]),
+        ):
+            registers.set_register64(registers.address_of(name), value & 0xFFFF_FFFF_FFFF_FFFF)
 
     def _fire_test_packet(self) -> None:
         register = self._registers.register(at.STREAM_PACKET_SIZE)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from sim_hw.faults.channel import Channel
 from sim_hw.faults.plan import PlannedFault
+from sim_hw.gige.ptp_slave import PtpSlave
 from sim_hw.world.world_clock import FreeRunningClock
 
 
@@ -74,10 +75,14 @@ class HeadClock:
     def __init__(self, clock: FreeRunningClock, channel: Channel[ExposedFrame]) -> None:
         self._clock = clock
         self._channel = channel
+        self.ptp: PtpSlave | None = None
+        """The clock that PTP disciplines, while it is switched on."""
 
     def device_ns(self, mono_ns: int) -> int:
         """What the clock shows at a monotonic time."""
-        return self._clock.device_ns(mono_ns) + self._channel.clock_error_ns(mono_ns)
+        ptp = self.ptp
+        shown_ns = self._clock.device_ns(mono_ns) if ptp is None else ptp.clock_ns(mono_ns)
+        return shown_ns + self._channel.clock_error_ns(mono_ns)
 
     def mono_ns(self, device_ns: int) -> int:
         """When, near now, the clock shows `device_ns`."""

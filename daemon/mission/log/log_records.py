@@ -40,6 +40,7 @@ from drivers.contract import (
     FrameStatus,
     NavSample,
     PpsEdge,
+    PtpReading,
     RawBytes,
     Record,
     TemperatureSample,
@@ -82,6 +83,7 @@ LoggedRecord = (
     | TemperatureSample
     | PpsEdge
     | ClockReading
+    | PtpReading
     | DeviceEvent
     | LoggedTrigger
 )
@@ -189,6 +191,7 @@ _KINDS: Final[Mapping[str, type[Any]]] = {
     "temperature": TemperatureSample,
     "pps": PpsEdge,
     "clock": ClockReading,
+    "ptp": PtpReading,
     "event": DeviceEvent,
 }
 """By the first word of their topic; the second word is the value of the first field."""
@@ -203,6 +206,7 @@ _TYPES: Final[Mapping[Any, Any]] = {
     "leap_seconds": LeapSeconds | None,
     **{(name, int): Instant for name in _INSTANTS},
     **{(name, int | None): Instant | None for name in _INSTANTS},
+    ("offset_ns", int | None): Integer | None,
     str: LongText,
     int: Count,
     int | None: Count | None,

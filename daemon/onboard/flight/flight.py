@@ -18,11 +18,17 @@ from daemon.onboard.flight.fault_latches import DELIVERING
 from daemon.onboard.flight.flight_identity import FlightIdentity
 from daemon.onboard.flight.ledger import Ledger
 from daemon.onboard.flight.open_exposure import OpenExposure
-from daemon.onboard.flight.record_builder import build_record, instant_of
+from daemon.onboard.flight.record_builder import (
+    build_record,
+    compare_ptp,
+    instant_of,
+    ptp_instant_of,
+)
 from daemon.onboard.flight.temperatures import TemperatureHistory
 from daemon.onboard.timing.device_clocks import DeviceClocks
 from daemon.onboard.timing.gps_clock import ClockEvent, GpsClock
 from daemon.onboard.timing.matching import Cause, FiredPulse, Matcher
+from daemon.onboard.timing.ptp_time import PtpTime
 from daemon.orientation.navigation import Track
 from drivers.contract import (
     ClockReading,
@@ -31,6 +37,7 @@ from drivers.contract import (
     Frame,
     NavSample,
     PpsEdge,
+    PtpReading,
     Record,
     TemperatureSample,
 )
@@ -71,6 +78,7 @@ class Flight:
         self.ledger = ledger
         self.clock = GpsClock()
         self.device_clocks = DeviceClocks()
+        self.ptp = PtpTime()
         self._steps_reported: dict[str, int] = {}
         self.track = Track()
         self.temperatures = TemperatureHistory(lagged_sensors(rig))
@@ -174,6 +182,8 @@ class Flight:
         if at_ns is not None and mono_ns is not None and frame.latch_sigma_ns is not None:
             reading = ClockReading(frame.head, at_ns, mono_ns, frame.latch_sigma_ns)
             self.device_clocks.read(reading)
+            latched = self.clock.gps_at(mono_ns)
+            self.ptp.compare_latch(frame.head, at_ns, latched, frame.latch_sigma_ns)
 
     def _mark(self, mark: EventMark) -> Cause:
         cause = self._matcher.mark(mark).cause
@@ -195,6 +205,9 @@ class Flight:
     def _clock_reading(self, reading: ClockReading) -> None:
         self.device_clocks.read(reading)
 
+    def _ptp_reading(self, reading: PtpReading) -> None:
+        self.ptp.read(reading)
+
     def _temperature(self, sample: TemperatureSample) -> None:
         self.temperatures.add(sample)
 
@@ -212,6 +225,7 @@ class Flight:
         NavSample: _navigation,
         PpsEdge: _pps,
         ClockReading: _clock_reading,
+        PtpReading: _ptp_reading,
         TemperatureSample: _temperature,
         DeviceEvent: _device_event,
     }
@@ -231,7 +245,11 @@ class Flight:
             provisional = self._due_provisionally() if seal is None else None
         else:
             seal = provisional = None
-        clock_events = (*self.clock.events(mono_ns), *self._clock_steps())
+        clock_events = (
+            *self.clock.events(mono_ns),
+            *self.ptp.events(mono_ns),
+            *self._clock_steps(),
+        )
         next_ns = self._next_ns(mark_wait_ns)
         return Actions(mono_ns, store, lost, spurious, seal, provisional, clock_events, next_ns)
 
@@ -432,11 +450,17 @@ class Flight:
     def _compose(
         self, exposure: OpenExposure, stored: CaptureRecord, mark: EventMark | None
     ) -> Exposure:
+        frames, pulse = exposure.frames.values(), exposure.pulse
+        now_ns = max((frame.mono_ns for frame in frames), default=exposure.ordered_mono_ns)
+        starts = [(frame.head, frame.device_ns) for frame in frames]
+        ptp = ptp_instant_of(self.rig, starts, pulse, self.ptp, now_ns)
+        if mark is not None:
+            compare_ptp(self.rig, starts, pulse, mark, self.ptp)
         record = build_record(
             self.rig,
             stored,
-            exposure.pulse,
-            instant_of(mark, exposure.pulse, self.clock),
+            pulse,
+            instant_of(mark, pulse, self.clock, ptp),
             self.track,
             self.temperatures,
             exposure.reported_flags,

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from typing import TypeAlias
 
 from daemon.mission.exposure import (
     CaptureRecord,
@@ -19,11 +20,15 @@ from daemon.mission.exposure import (
 )
 from daemon.onboard.flight.temperatures import TemperatureHistory
 from daemon.onboard.timing.gps_clock import GpsClock, Source
+from daemon.onboard.timing.ptp_time import PtpInstant, PtpTime, combined
 from daemon.onboard.timing.pulses import FiredPulse
 from daemon.orientation.navigation import Track
 from drivers.contract import EventMark
 from processing.quality.report import Flag
 from processing.rig import Rig
+
+Starts: TypeAlias = Iterable[tuple[str, int | None]]
+"""Heads, and the start of exposure that each one's own clock stamped, ns."""
 
 
 @dataclass(frozen=True)
@@ -41,8 +46,20 @@ class Instant:
     in_holdover: bool = False
 
 
-def instant_of(mark: EventMark | None, pulse: FiredPulse | None, clock: GpsClock) -> Instant:
-    """The instant of the strobe: the receiver's mark, else from the pulse through the clock."""
+def instant_of(
+    mark: EventMark | None,
+    pulse: FiredPulse | None,
+    clock: GpsClock,
+    ptp: PtpInstant | None = None,
+) -> Instant:
+    """The instant of the strobe: the receiver's mark, else the better of the host's clock and PTP.
+
+    Args:
+        mark: of the exposure, if there is one.
+        pulse: of the exposure, if it was given.
+        clock: GPS time of the host's instants.
+        ptp: the instant by the clocks of heads that PTP synchronises, see `ptp_instant_of`.
+    """
     if mark is not None:
         budget = {"receiver": mark.accuracy_ns}
         count = mark.count if mark.count_bits else None
@@ -51,6 +68,8 @@ def instant_of(mark: EventMark | None, pulse: FiredPulse | None, clock: GpsClock
         return Instant(None, None, "none", None)
     strobe_ns = pulse.mono_ns + pulse.strobe_delay_ns
     estimate = clock.pulse_at(strobe_ns, pulse.sigma_ns)
+    if ptp is not None and (estimate is None or ptp.sigma_ns < estimate.sigma_ns):
+        return Instant(ptp.gps_ns, ptp.sigma_ns, "ptp", None, {"ptp": ptp.sigma_ns})
     if estimate is None:
         return Instant(None, None, "none", None)
     clock_ns = min(clock.sigma_of(strobe_ns, estimate.source), estimate.sigma_ns)
@@ -63,6 +82,56 @@ def instant_of(mark: EventMark | None, pulse: FiredPulse | None, clock: GpsClock
         budget_ns={"clock": clock_ns, "trigger": trigger_ns},
         in_holdover=estimate.in_holdover,
     )
+
+
+def ptp_instant_of(
+    rig: Rig,
+    starts: Starts,
+    pulse: FiredPulse | None,
+    ptp: PtpTime,
+    mono_ns: int,
+) -> PtpInstant | None:
+    """The instant of the strobe by the starts of exposure that PTP clocks stamped.
+
+    Args:
+        rig: for the cones of the heads.
+        starts: of one exposure.
+        pulse: of that exposure; its delays lead from the strobe to each start.
+        ptp: the clocks.
+        mono_ns: now.
+
+    Returns:
+        None where no head's PTP time may be used, or heads contradict each other.
+    """
+    if pulse is None:
+        return None
+    found = []
+    for head, device_ns in starts:
+        start = None if device_ns is None else ptp.at(head, device_ns, mono_ns)
+        if start is not None:
+            to_strobe_ns = strobe_from_start_ns(rig, head, pulse)
+            sigma_ns = math.ceil(math.hypot(start.sigma_ns, pulse.spread_ns))
+            found.append(PtpInstant(start.gps_ns + to_strobe_ns, sigma_ns))
+    return combined(found)
+
+
+def compare_ptp(
+    rig: Rig, starts: Starts, pulse: FiredPulse | None, mark: EventMark, ptp: PtpTime
+) -> None:
+    """Compare the starts of exposure that PTP clocks stamped with the receiver's mark."""
+    if pulse is None:
+        return
+    for head, device_ns in starts:
+        if device_ns is not None:
+            start_ns = mark.gps_ns - strobe_from_start_ns(rig, head, pulse)
+            sigma_ns = math.hypot(mark.accuracy_ns, pulse.spread_ns)
+            ptp.compare(head, device_ns, start_ns, sigma_ns)
+
+
+def strobe_from_start_ns(rig: Rig, head: str, pulse: FiredPulse) -> int:
+    """From the start of a head's exposure to the strobe, ns."""
+    cone = rig.cone_of(head)
+    return pulse.strobe_delay_ns - pulse.delays_ns[cone.name] - cone.mark_to_mid_exposure_ns
 
 
 def build_record(

@@ -10,12 +10,20 @@ from collections.abc import Sequence
 from daemon.mission.exposure import CaptureRecord, Exposure
 from daemon.mission.log.log_records import LoggedRecord, LoggedTrigger
 from daemon.mission.verification.recovery import Complete
-from daemon.onboard.flight.record_builder import build_record, instant_of
+from daemon.onboard.flight.record_builder import build_record, instant_of, ptp_instant_of
 from daemon.onboard.flight.temperatures import TemperatureHistory
 from daemon.onboard.timing.gps_clock import GpsClock
 from daemon.onboard.timing.matching import FiredPulse, Matcher
+from daemon.onboard.timing.ptp_time import PtpTime
 from daemon.orientation.navigation import Track
-from drivers.contract import EventMark, NavSample, PpsEdge, TemperatureSample
+from drivers.contract import (
+    EventMark,
+    Frame,
+    NavSample,
+    PpsEdge,
+    PtpReading,
+    TemperatureSample,
+)
 from processing.geometry.drift import lagged_sensors
 from processing.quality.report import Flag
 from processing.rig import Rig
@@ -30,7 +38,9 @@ def seal_from_log(rig: Rig) -> Complete:
         matcher = Matcher(cone_of_head, clock)
         track = Track()
         temperatures = TemperatureHistory(lagged_sensors(rig))
+        ptp = PtpTime()
         pulse: FiredPulse | None = None
+        now_ns = capture.trigger_mono_ns
         for record in records:
             if isinstance(record, NavSample) and record.time_valid:
                 track.add(record)
@@ -45,10 +55,27 @@ def seal_from_log(rig: Rig) -> Complete:
                 clock.pps_edge(record.mono_ns, record.sigma_ns)
             elif isinstance(record, TemperatureSample):
                 temperatures.add(record)
-        instant = instant_of(matcher.mark_of(capture.number), pulse, clock)
+            elif isinstance(record, PtpReading):
+                ptp.read(record)
+                now_ns = max(now_ns, record.mono_ns)
+            elif isinstance(record, Frame):
+                _compare_latch(record, ptp, clock)
+        starts = [(frame.sensor, frame.device_ns) for frame in capture.frames]
+        by_ptp = ptp_instant_of(rig, starts, pulse, ptp, now_ns)
+        instant = instant_of(matcher.mark_of(capture.number), pulse, clock, by_ptp)
         return build_record(rig, capture, pulse, instant, track, temperatures, Flag(0))
 
     return complete
+
+
+def _compare_latch(frame: Frame, ptp: PtpTime, clock: GpsClock) -> None:
+    at_ns, mono_ns, sigma_ns = (
+        frame.device_clock_ns,
+        frame.device_clock_mono_ns,
+        frame.latch_sigma_ns,
+    )
+    if at_ns is not None and mono_ns is not None and sigma_ns is not None:
+        ptp.compare_latch(frame.head, at_ns, clock.gps_at(mono_ns), sigma_ns)
 
 
 def pulse_of(logged: LoggedTrigger) -> FiredPulse:

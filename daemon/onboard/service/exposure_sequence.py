@@ -48,6 +48,7 @@ from drivers.contract import (
     Frame,
     NavSample,
     PpsEdge,
+    PtpReading,
     RawBytes,
     Record,
     TemperatureSample,
@@ -100,6 +101,7 @@ class ExposureSequence:
             NavSample: self._on_record,
             PpsEdge: self._on_record,
             ClockReading: self._on_record,
+            PtpReading: self._on_record,
             TemperatureSample: self._on_record,
             RawBytes: self._on_record,
             # writer

@@ -25,6 +25,7 @@ from drivers.cameras.aravis.gvcp import (
     send_action,
 )
 from drivers.cameras.aravis.library import OPENING, aravis_error
+from drivers.cameras.aravis.ptp import SLAVE
 from drivers.cameras.aravis.settings import AravisSettings
 from drivers.cameras.aravis.stream import FrameStream, ReceivedFrame, unreadable_chunks_sentence
 from drivers.cameras.head_device import HeadDevice
@@ -33,6 +34,7 @@ from drivers.contract import (
     FrameMemory,
     FrameStatus,
     LifeCycle,
+    PtpReading,
     Sink,
     TemperatureSample,
 )
@@ -62,6 +64,7 @@ class _Session:
     stream: FrameStream
     latch: ClockLatch | None = None
     temperature_c: float | None = None
+    ptp: PtpReading | None = None
     loss_suspected_ns: int | None = None
     is_lost: bool = False
 
@@ -80,7 +83,7 @@ class AravisHead(AravisSettings, HeadDevice):
     kind: ClassVar = "head"
     counted: ClassVar = (
         *("frames", "frames_incomplete", "frames_corrupt", "underruns", "opened", "latches"),
-        *("other_senders", "kernel_drops"),
+        *("other_senders", "kernel_drops", "ptp_readings", "ptp_not_slave"),
     )
 
     def __init__(
@@ -379,6 +382,8 @@ class AravisHead(AravisSettings, HeadDevice):
                 healthy = self._check(session)
                 if healthy:
                     self._deliver_temperature(session, sink)
+                if healthy and session.ptp is not None:
+                    sink(session.ptp)
                 pause_s = self.latch_interval_s if healthy else 0.0
                 next_check_ns = self.clock.mono_ns() + round(pause_s * 1e9)
 
@@ -437,6 +442,10 @@ class AravisHead(AravisSettings, HeadDevice):
         with self._control:
             session.latch = session.camera.latch()
             session.temperature_c = session.camera.temperature_c()
+            if session.camera.ptp is not None:
+                session.ptp = session.camera.ptp.read(self.name, self.clock.mono_ns())
+                self.counters["ptp_readings"] += 1
+                self.counters["ptp_not_slave"] += session.ptp.status != SLAVE
             if session.latch is None and session.temperature_c is None:
                 session.camera.check_alive()
         self.counters["latches"] += session.latch is not None

@@ -23,6 +23,7 @@ from drivers.cameras.aravis.head_configuration import HeadConfiguration
 from drivers.cameras.aravis.library import aravis, aravis_error, message_of
 from drivers.cameras.aravis.packet_filter import ControlSocketFilter, SocketCapture
 from drivers.cameras.aravis.packet_pacing import write_pacing
+from drivers.cameras.aravis.ptp import PtpFeatures
 from drivers.cameras.aravis.settings import AravisSettings
 from drivers.cameras.pixels import Packing, packed_nbytes
 from drivers.contract import DeviceError
@@ -118,6 +119,9 @@ class AravisCamera:
         refusals = self._configure(settings)
         if refusals:
             raise DeviceError("\n".join(f"{self._who}: {refusal}" for refusal in refusals))
+        self.ptp = PtpFeatures(self._features) if settings.ptp else None
+        if self.ptp is not None and (refusal := self.ptp.enable()):
+            raise DeviceError(f"{self._who}: {refusal}")
         self._tick_hz = self._read_tick_frequency()
         self._latch_features = self._find_latch()
         self._temperature_feature = self._find_temperature()

@@ -111,6 +111,9 @@ class AravisSettings(Configured):
     latch_interval_s = Setting(
         2.0, minimum=0.5, maximum=2.5, help="time between readings of the head's clock and health"
     )
+    ptp = Setting(
+        False, help="let a PTP master on the network (IEEE 1588) discipline the head's clock"
+    )
     control_wait_limit_s = Setting(
         15.0, minimum=1, maximum=120, help="how long a dead controller's hold is waited out"
     )

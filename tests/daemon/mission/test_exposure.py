@@ -29,7 +29,7 @@ numbers = st.floats(allow_nan=False, allow_infinity=False)
 texts = st.text(max_size=20)
 names = st.from_regex(r"[A-Z][A-Z0-9]{0,6}", fullmatch=True)
 hashes = st.just("") | st.from_regex(r"[0-9a-f]{64}", fullmatch=True)
-sources = st.sampled_from(["event-mark", "interpolated", "host", "none"])
+sources = st.sampled_from(["event-mark", "ptp", "interpolated", "host", "none"])
 
 frames = st.builds(
     FrameRecord,

@@ -23,6 +23,7 @@ from drivers.contract import (
     FrameStatus,
     NavSample,
     PpsEdge,
+    PtpReading,
     RawBytes,
     TemperatureSample,
     TriggerPulse,
@@ -38,6 +39,8 @@ RECORDS = [
     TemperatureSample("1", None, 8),
     PpsEdge("receiver", 2**32 - 1, 10**15 + 1, 2_500),
     ClockReading("autopilot", 2**61, 10**15 + 2, 300_000),
+    PtpReading("SU00", 10**15 + 3, "Slave", -812, "001122fffe334455"),
+    PtpReading("SU01", 10**15 + 4, "Listening", None, ""),
     DeviceEvent("SU00", "lost", True, "SU00 does not answer; look at its cable", 9),
     Frame(
         "SU00", 2, FrameStatus.INCOMPLETE, 2**60, 41, 1248, 832, "Mono12", 2**62, 2**62 + 5,
