@@ -255,6 +255,8 @@ class V4l2Camera:
         for part in pipeline.parts.values():
             self.node.attach(part)
         refusals += pipeline.configure(settings.width_px, settings.height_px, settings.pixel_format)
+        for part in pipeline.side_parts:
+            part.close()
 
     def _write_format(self, refusals: list[str]) -> FrameLayout:
         settings, node = self._settings, self.node

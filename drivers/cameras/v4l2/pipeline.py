@@ -119,6 +119,7 @@ class SensorPipeline:
         self._graph = graph
         self._route = route_of(graph, node)
         self.parts: dict[int, SubDevice] = {}
+        self.side_parts: list[SubDevice] = []
         for link in self._route:
             entity = graph.entities[link.source[0]]
             try:
@@ -178,7 +179,32 @@ class SensorPipeline:
             for place in (link.sink, following.source):
                 if refusal := self._set(place, wanted):
                     return [refusal]
-        return []
+        return self._set_side_branches(wanted)
+
+    def _set_side_branches(self, wanted: PadFormat) -> list[str]:
+        """Set parts that hang on the way: the kernel compares the formats of every enabled link.
+
+        Source: media_pipeline_start in drivers/media/mc/mc-entity.c of the kernel.
+        """
+        sources = {link.source for link in self._route}
+        refusals = []
+        for link in self._graph.links:
+            entity = self._graph.entities.get(link.sink[0])
+            is_side = link.source in sources and link not in self._route and link.is_enabled
+            if not is_side or entity is None or not entity.path.startswith("/dev/v4l-subdev"):
+                continue
+            if entity.id not in self.parts:
+                try:
+                    self.parts[entity.id] = SubDevice(entity.path)
+                except OSError:
+                    continue  # the kernel refuses to stream if it matters
+                self.side_parts.append(self.parts[entity.id])
+            if refusal := self._set(link.sink, wanted):
+                refusals.append(
+                    f"{refusal}; disable its link: media-ctl -d {self._graph.path} -l "
+                    f"'{self._graph.described(link)} [0]'"
+                )
+        return refusals
 
     def _set(self, place: tuple[int, int], wanted: PadFormat) -> str:
         entity, pad = self._graph.entities[place[0]], place[1]

@@ -177,6 +177,18 @@ def test_a_head_that_reports_nothing_more_is_not_trusted() -> None:
     assert faults(ptp, 16) == ["ptp-silent"]
 
 
+def test_a_clock_that_disagreed_once_has_to_agree_three_times_again() -> None:
+    ptp = synchronised()
+    latched(ptp, 6, error_ns=-37 * NS)
+    latched(ptp, 7)
+    ptp.read(reading(7))
+    assert instant(ptp, 7) is None
+    for second in (8, 9):
+        ptp.read(reading(second))
+        latched(ptp, second)
+    assert instant(ptp, 9) is not None
+
+
 def test_a_repeated_latch_is_one_witness() -> None:
     ptp = PtpTime()
     for second in range(6):
