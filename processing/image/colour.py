@@ -96,7 +96,8 @@ class BandRegistration:
     `band_from_green` (3, 3) carries a VIP point in mm to where the band's own placement has it.
     Where too few points were found it is the identity: the band stays as calibrated, and
     `registered` is False; `textured` counts the positions that were tried there and where the band
-    has texture well above noise. `rms_px` is the residual length per point, colour pixels.
+    has texture well above noise, `matched` those that matched all the same. `rms_px` is the
+    residual length per point, colour pixels.
     """
 
     band: str
@@ -106,20 +107,26 @@ class BandRegistration:
     rms_px: float | None
     registered: bool
     textured: int = 0
+    matched: int = 0
 
 
-def nominal_registration(band: str, sensor: str, *, textured: int = 0) -> BandRegistration:
+def nominal_registration(
+    band: str, sensor: str, *, textured: int = 0, matched: int = 0
+) -> BandRegistration:
     """A band at its calibrated position.
 
     Args:
         band: name of the band.
         sensor: name of its sensor.
         textured: positions tried where the band has texture.
+        matched: positions that matched, too few for a transformation.
 
     Returns:
         The identity, `registered` False.
     """
-    return BandRegistration(band, sensor, np.eye(3), 0, None, registered=False, textured=textured)
+    return BandRegistration(
+        band, sensor, np.eye(3), 0, None, registered=False, textured=textured, matched=matched
+    )
 
 
 def register_band(
@@ -151,7 +158,12 @@ def register_band(
         expected = raw_from_vip_mm(other, vip_mm_from_raw(green, positions.astype(np.float64)))
         at = np.rint(expected[np.isfinite(expected).all(axis=1)]).astype(np.int64)
         rough = has_texture(band_frame, other.sensor, at, settings.window_px)
-        return nominal_registration(band, other.sensor.name, textured=int(np.count_nonzero(rough)))
+        return nominal_registration(
+            band,
+            other.sensor.name,
+            textured=int(np.count_nonzero(rough)),
+            matched=len(sigma),
+        )
     source = vip_mm_from_raw(green, raw_green)
     target = vip_mm_from_raw(other, raw_band)
     unit_mm = other.sensor.pitch_mm * _magnification(other, raw_band)

@@ -8,6 +8,7 @@ searched again farther away; what is found there moves the prediction, and what 
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
@@ -38,9 +39,15 @@ MIN_ATTEMPTED: Final = 40
 SUSPICIOUS_SHARE: Final = 0.25
 """A frame of whose positions so few were matched is looked at again."""
 MIN_TEXTURED: Final = 100
-"""Textured positions of a band from which on no match with green is no accident."""
+"""Textured positions of a band from which on hardly a match with green is no accident."""
+MISMATCHED_BAND_SHARE: Final = 0.01
+"""A band of whose textured positions fewer match green shows something else: of a desert's, with
+texture little above noise, 0.02 to 0.2 match, of other ground none."""
 MISMATCHED_SHARE: Final = 0.1
 """A frame of whose textured positions so few were matched shows something else."""
+AMBIGUOUS_SHARE: Final = 0.1
+"""A frame of which so many positions resemble several places has repeated texture, such as rows of
+vines: 0.2 and more of them do there, at most 0.02 of a frame that shows other ground."""
 WIDE_SEARCH_PX: Final = 60
 WIDE_POINTS: Final = 60
 MIN_AGREEING: Final = 12
@@ -57,6 +64,22 @@ class ContentCheck:
 
     shifted_px: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     mismatched: Mapping[str, int] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class WideSearch:
+    """Positions (n,) of one frame pair that were looked for far from their prediction.
+
+    `correlated` resemble a place, `distinct` one place only. `differences_mm` (m, 2) is how far
+    those that do both lie apart in the VIP, the first frame less the second.
+    """
+
+    correlated: NDArray[np.bool_]
+    distinct: NDArray[np.bool_]
+    differences_mm: Array
+
+
+NOT_SEARCHED: Final = WideSearch(np.zeros(0, np.bool_), np.zeros(0, np.bool_), np.zeros((0, 2)))
 
 
 def check_content(
@@ -94,6 +117,8 @@ def check_content(
     tried = tie_points.counts()
     textured = dict.fromkeys(suspicious, 0)
     matched = dict.fromkeys(suspicious, 0)
+    searched = dict.fromkeys(suspicious, 0)
+    ambiguous = dict.fromkeys(suspicious, 0)
     shifts: dict[str, list[Array]] = {name: [] for name in suspicious}
     for search in searches:
         if not len(search.at_b) or search.pair[0] not in frames:
@@ -104,20 +129,25 @@ def check_content(
                 continue
             textured[name] += int(np.count_nonzero(rough))
             matched[name] += tried[search.pair]
+            wide = _wide_search(placements, frames, search, rough, settings)
+            searched[name] += len(wide.correlated)
+            ambiguous[name] += int(np.count_nonzero(wide.correlated & ~wide.distinct))
             other = search.pair[search.pair[0] == name]
             if other not in suspicious or len(suspicious) == len(attempted):
-                shifts[name] += _wide_search_shifts(
-                    placements, frames, search, rough, settings, name, image.pitch_mm
-                )
+                # The first frame lies where its neighbour shows the ground: it goes by what it is off.
+                sign = -1.0 if name == search.pair[0] else 1.0
+                shifts[name] += list(sign * wide.differences_mm / image.pitch_mm)
     shifted, mismatched = {}, {}
     for name in sorted(suspicious):
         if textured[name] < MIN_ATTEMPTED or matched[name] >= MISMATCHED_SHARE * textured[name]:
             continue
         shift = _consensus_shift(shifts[name])
-        if shift is None:
+        if shift is not None:
+            # Matches rare but in place: the frame is where it should be.
+            if math.hypot(*shift) > AGREEING_PX:
+                shifted[name] = shift
+        elif ambiguous[name] < AMBIGUOUS_SHARE * searched[name] or not searched[name]:
             mismatched[name] = textured[name]
-        else:
-            shifted[name] = shift
     return ContentCheck(shifted, mismatched)
 
 
@@ -186,18 +216,16 @@ def _textured(
     return in_b & has_texture(frames[a.name], a, middle, window * search.step)
 
 
-def _wide_search_shifts(
+def _wide_search(
     placements: Mapping[str, SensorPlacement],
     frames: Mapping[str, Frame],
     search: PairSearch,
     textured: NDArray[np.bool_],
     settings: TiePointSettings,
-    name: str,
-    pitch_mm: float,
-) -> list[Array]:
-    """Displacement of points of frame `name` from their prediction, px of `pitch_mm` in the VIP."""
+) -> WideSearch:
+    """Look for some of the textured positions up to `WIDE_SEARCH_PX` away."""
     if search.region is not None:
-        return []
+        return NOT_SEARCHED
     a, b = search.pair
     to_pan = search.kind == PAN_TO_PAN
     window = settings.window_pp_px if to_pan else settings.window_pc_px
@@ -213,7 +241,7 @@ def _wide_search_shifts(
     rows = np.flatnonzero(textured & inside)
     rows = rows[:: max(1, len(rows) // WIDE_POINTS)]
     if not len(rows):
-        return []
+        return NOT_SEARCHED
     found = match_patches(
         frames[a],
         frames[b],
@@ -226,16 +254,13 @@ def _wide_search_shifts(
         frames[a].dtype == np.uint16,
         INTERPOLATION,
     )
-    good = (
-        (found[:, 7] > 0.0)
-        & (found[:, 5] >= settings.min_correlation)
-        & (found[:, 6] >= settings.min_peak_margin)
-    )
-    differences = vip_mm_from_raw(placements[a], found[good, 0:2]) - vip_mm_from_raw(
+    correlated = (found[:, 7] > 0.0) & (found[:, 5] >= settings.min_correlation)
+    distinct = found[:, 6] >= settings.min_peak_margin
+    good = correlated & distinct
+    differences_mm = vip_mm_from_raw(placements[a], found[good, 0:2]) - vip_mm_from_raw(
         placements[b], found[good, 2:4]
     )
-    # Frame a lies where its neighbour shows the ground: it goes by what it is off.
-    return [(-row if name == a else row) / pitch_mm for row in differences]
+    return WideSearch(correlated, distinct, differences_mm)
 
 
 def _consensus_shift(shifts: list[Array]) -> tuple[float, float] | None:

@@ -38,6 +38,7 @@ from processing.image.resampling import SATURATED_SOURCE
 from processing.matching.band_gaps import filled_gaps
 from processing.matching.content_check import (
     MIN_TEXTURED,
+    MISMATCHED_BAND_SHARE,
     ContentCheck,
     check_content,
     moved_placements,
@@ -308,7 +309,9 @@ class Pipeline(
             area,
             nominal_bands=tuple(r.band for r in bands if not r.registered and r.sensor in present),
             mismatched_bands=tuple(
-                r.band for r in bands if r.textured >= MIN_TEXTURED and r.points == 0
+                r.band
+                for r in bands
+                if r.textured >= MIN_TEXTURED and r.matched < MISMATCHED_BAND_SHARE * r.textured
             ),
         )
 

@@ -108,9 +108,11 @@ class Outcome:
 
 
 @cache
-def rendered(rig: str, *, seed: int = 11, dc_k: float = 8.0) -> InjectedExposure:
-    """A healthy exposure over the emulator's photographs; rendered once a process."""
-    world = World(world_settings(rig, seed, dc_k=dc_k))
+def rendered(
+    rig: str, *, seed: int = 11, dc_k: float = 8.0, ground: str = "landscape"
+) -> InjectedExposure:
+    """A healthy exposure over the emulator's photographs or a ground; rendered once a process."""
+    world = World(world_settings(rig, seed, dc_k=dc_k, ground=ground))
     with TemporaryDirectory(prefix="syntopic-planted-") as scenes:
         exposure = take(world, Path(scenes))
     heads = RigElectronics(world, seed=seed)

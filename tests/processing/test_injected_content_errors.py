@@ -155,3 +155,18 @@ def test_a_shifted_frame_is_sought_where_it_lies_at_any_pitch_of_the_image(
     assert np.allclose(layers[0], layers[1], atol=1e-9)
     moved_px = layers[0][:2, 2] / rig.sensor("SU20").pitch_mm
     assert np.hypot(*moved_px) == pytest.approx(24.0, abs=1.0)
+
+
+@pytest.mark.parametrize(("ground", "seed"), [("rows", 2), ("rows", 3), ("desert", 1)])
+def test_repeated_and_weak_texture_is_not_called_other_ground(ground: str, seed: int) -> None:
+    outcome = rendered("ultracam-x-mini", seed=seed, ground=ground, dc_k=12.0).outcome()
+    assert "other ground" not in outcome.sentences and "TIE_POINTS" in outcome.flags
+    assert outcome.figure("stitched_sigma_px") < 0.6
+    assert outcome.absolute_px < 3.0 * outcome.figure("stitched_sigma_px")
+
+
+def test_other_ground_among_rows_of_vines_is_never_good(error_free: InjectedExposure) -> None:
+    vines = rendered("ultracam-x-mini", seed=2, ground="rows", dc_k=12.0)
+    frames = {**vines.frames, "SU11": error_free.frames["SU11"]}
+    outcome = replace(vines, frames=frames).outcome()
+    assert outcome.verdict != "good" and "TIE_POINTS" in outcome.flags

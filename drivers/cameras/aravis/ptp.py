@@ -72,7 +72,7 @@ class PtpFeatures:
             The reading; what the head does not return is absent in it.
         """
         if self._latch is not None:
-            # Some heads list the command and refuse it while they have no master.
+            # Without a master the command may be refused; the other features can still be read.
             with contextlib.suppress(FeatureError):
                 self._features.execute(self._latch)
         return PtpReading(
