@@ -8,6 +8,7 @@ written, and a frame trigger. Every other one is refused with a sentence that na
 from __future__ import annotations
 
 import functools
+import gc
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -45,6 +46,15 @@ FRAME_TRIGGERS = {"FrameStart", "ExposureStart", "FrameTrigger"}
 MISSING = ("AcquisitionStart", "pixel format", "PixelFormat", "exposure", "trigger", "Trigger")
 ARMED_MIN = 50
 """Of the 62 descriptions, so many must arm; about a dozen are of grabbers and other links."""
+
+
+@pytest.fixture(autouse=True, scope="module")
+def fewer_collections() -> Iterator[None]:
+    """A description makes many small objects; looking for cycles in them takes a third of the time."""
+    before = gc.get_threshold()
+    gc.set_threshold(100_000, *before[1:])
+    yield
+    gc.set_threshold(*before)
 
 
 class Port(genapi.AbstractPort):  # type: ignore[misc]
