@@ -380,20 +380,20 @@ class AravisCamera:
                 # setting packet_size_limit bounds it. Upstream: AravisProject/aravis#1065.
                 size = min(int(camera.gv_auto_packet_size()), settings.packet_size_limit)
             camera.gv_set_packet_size(size)
+            size = int(camera.gv_get_packet_size())
         except aravis_error() as error:
             refusals.append(
                 f"packet_size = {settings.packet_size} is refused ({message_of(error)}); set 0, or "
                 "a size that the network transports"
             )
+            return
         # The size is final: it is not negotiated again when the stream is created.
         camera.gv_set_packet_size_adjustment(library.GvPacketSizeAdjustment.NEVER)
         options = library.GvStreamOption
         camera.gv_set_stream_options(
             options.NONE if settings.packet_socket else options.PACKET_SOCKET_DISABLED
         )
-        held, problems = write_pacing(
-            self._features, settings, int(camera.gv_get_packet_size()), self._read_tick_frequency()
-        )
+        held, problems = write_pacing(self._features, settings, size, self._read_tick_frequency())
         self._pacing = held
         refusals += problems
 
