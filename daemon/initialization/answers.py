@@ -95,15 +95,7 @@ def focal_length_mm(value: float) -> float:
     Raises:
         AnswerError: it is out of range; the message names the unit that was probably meant.
     """
-    low, high = FOCAL_LENGTH_MM
-    if low <= value <= high:
-        return value
-    sentence = f"a focal length of {value:g} mm is outside {low:g} to {high:g} mm"
-    if 0 < value < low:
-        sentence += f"; {value:g} m would be {value * 1000:g} mm: write {value * 1000:g}"
-    elif value > high:
-        sentence += f"; {value:g} um would be {value / 1000:g} mm: write {value / 1000:g}"
-    raise AnswerError(sentence)
+    return _in_range(value, FOCAL_LENGTH_MM, "focal length", ("um", "mm", "m"))
 
 
 def pixel_size_um(value: float) -> float:
@@ -112,15 +104,25 @@ def pixel_size_um(value: float) -> float:
     Raises:
         AnswerError: it is out of range; the message names the unit that was probably meant.
     """
-    low, high = PIXEL_SIZE_UM
+    return _in_range(value, PIXEL_SIZE_UM, "pixel size", ("nm", "um", "mm"))
+
+
+def _in_range(
+    value: float, limits: tuple[float, float], what: str, units: tuple[str, str, str]
+) -> float:
+    """The value, in the middle one of three units that are a thousand apart."""
+    (low, high), (smaller, unit, larger) = limits, units
     if low <= value <= high:
         return value
-    sentence = f"a pixel size of {value:g} um is outside {low:g} to {high:g} um"
+    sentence = f"a {what} of {value:g} {unit} is outside {low:g} to {high:g} {unit}"
     if 0 < value < low:
-        sentence += f"; {value:g} mm would be {value * 1000:g} um: write {value * 1000:g}"
+        meant, factor = larger, 1000.0
     elif value > high:
-        sentence += f"; {value:g} nm would be {value / 1000:g} um: write {value / 1000:g}"
-    raise AnswerError(sentence)
+        meant, factor = smaller, 1e-3
+    else:
+        raise AnswerError(sentence)
+    right = f"{value * factor:g}"
+    raise AnswerError(f"{sentence}; {value:g} {meant} would be {right} {unit}: write {right}")
 
 
 def in_range(value: float, limits: tuple[float, float], what: str, unit: str) -> float:

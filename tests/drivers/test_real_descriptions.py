@@ -33,9 +33,9 @@ from sim_hw.gige.genicam.power_on_state import (
 )
 from tests.drivers.described_frames import Memory, first_frame
 from tests.genicam_descriptions import description, names, needs_descriptions
+from tests.genicam_reference import Port, genapi
 
 pytest.importorskip("gi", reason="needs PyGObject (extra aravis) and gir1.2-aravis-0.8")
-genapi = pytest.importorskip("genicam.genapi", reason="needs the genicam package (x86-64)")
 pytestmark = [needs_descriptions, pytest.mark.timeout(180)]
 
 NETWORK = f"127.{1 + os.getpid() % 250}.79"
@@ -55,24 +55,6 @@ def fewer_collections() -> Iterator[None]:
     gc.set_threshold(100_000, *before[1:])
     yield
     gc.set_threshold(*before)
-
-
-class Port(genapi.AbstractPort):  # type: ignore[misc]
-    def __init__(self, memory: SparseMemory) -> None:
-        super().__init__()
-        self._memory = memory
-
-    def read(self, address: int, length: int) -> bytes:
-        return self._memory.read(address, length)
-
-    def write(self, address: int, value: Any) -> None:
-        self._memory.write(address, bytes(value))
-
-    def is_open(self) -> bool:
-        return True
-
-    def get_access_mode(self) -> Any:
-        return genapi.EAccessMode.RW
 
 
 @functools.cache

@@ -90,7 +90,7 @@ def test_the_manual_page_has_every_command_option_and_status(tmp_path: Path) -> 
 
 def test_the_manual_page_is_formatted_without_a_warning(tmp_path: Path) -> None:
     if shutil.which("groff") is None:
-        pytest.skip("needs groff")
+        pytest.skip("groff is absent; install Debian's groff-base")
     path = tmp_path / "syntopic.1"
     path.write_text(man_page(), "utf-8")
     done = subprocess.run(

@@ -21,8 +21,8 @@ from sim_hw.gige.genicam.power_on_state import (
     write_power_on_state,
 )
 from tests.genicam_descriptions import description, names, needs_descriptions
+from tests.genicam_reference import Port, genapi
 
-genapi = pytest.importorskip("genicam.genapi", reason="needs the genicam package (x86-64)")
 pytestmark = [needs_descriptions, pytest.mark.peer]
 
 DIFFERENCES_MAX = 5
@@ -36,26 +36,6 @@ ACCESS = {
     genapi.EAccessMode.NA: Access.NOT_AVAILABLE,
     genapi.EAccessMode.NI: Access.NOT_IMPLEMENTED,
 }
-
-
-class Port(genapi.AbstractPort):  # type: ignore[misc]
-    """The registers, as the reference implementation reads them."""
-
-    def __init__(self, memory: SparseMemory) -> None:
-        super().__init__()
-        self._memory = memory
-
-    def read(self, address: int, length: int) -> bytes:
-        return self._memory.read(address, length)
-
-    def write(self, address: int, value: Any) -> None:
-        self._memory.write(address, bytes(value))
-
-    def is_open(self) -> bool:
-        return True
-
-    def get_access_mode(self) -> Any:
-        return genapi.EAccessMode.RW
 
 
 def is_same(theirs: Any, ours: float) -> bool:
