@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Final, Protocol
 
-from drivers.errors import DriverError
+from drivers import DriverError
 
 
 class DeviceError(DriverError):

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import RectBivariateSpline
 
-from sim_hw.errors import SimulatorError
+from sim_hw import SimulatorError
 
 Array = NDArray[np.float64]
 

@@ -2,7 +2,7 @@
 
 Under pytest-xdist whole flights (tests/system) run first and one after another in one worker, at
 normal priority since they run in real time; everything else runs file by file in parallel, at a
-lower one.
+lower one, the pages of the documents first since they take longest.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from tests.stopwatch import slowdown
 __all__ = ["pytest_addoption", "pytest_sessionfinish", "pytest_terminal_summary"]
 
 FLIGHTS = Path(__file__).parent / "system"
+PAGES = Path(__file__).parent / "documents"
 NICENESS = 10
 
 settings.register_profile("patient", settings.default, deadline=None)
@@ -42,7 +43,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """The longest first; time-outs against hanging grow with the load of the machine."""
-    items.sort(key=lambda item: not _is_flight(item))
+    items.sort(key=lambda item: (not _is_flight(item), PAGES not in item.path.parents))
     factor = slowdown()
     for item in items:
         if _is_flight(item):

@@ -73,8 +73,8 @@ def _print_refusal(error: Exception) -> NoReturn:
     Raises:
         Exception: `error` itself, where it is no error of the user or of the machine.
     """
+    from daemon import DaemonError
     from daemon.configuration.model import ConfigurationError
-    from daemon.errors import DaemonError
     from daemon.terminal.console import Console
     from drivers.base.extras import MissingExtraError, missing_module
     from processing.rig import RigError
@@ -103,7 +103,7 @@ def _disk_refusal(error: OSError) -> Exception:
     Raises:
         OSError: `error` itself, if it names no file: then it is not about a disk.
     """
-    from daemon.errors import DaemonError
+    from daemon import DaemonError
 
     names = [
         os.fsdecode(n) for n in (error.filename, error.filename2) if isinstance(n, str | bytes)

@@ -21,6 +21,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from daemon import DaemonError
 from daemon.cli.exit_status import ExitStatus, status_of
 from daemon.cli.options import AsJson
 from daemon.cli.sim import (
@@ -30,7 +31,6 @@ from daemon.cli.sim import (
     simulator_arguments,
     write_service_file,
 )
-from daemon.errors import DaemonError
 from daemon.terminal.console import Console
 from daemon.terminal.tables import light_table
 from drivers.base.extras import require

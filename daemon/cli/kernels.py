@@ -26,7 +26,7 @@ def kernels(
 ) -> None:
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-    from daemon.errors import DaemonError
+    from daemon import DaemonError
     from daemon.terminal.console import Console
     from processing.pipelines import kernel_compilation
     from processing.pipelines.parallel_compilation import KernelCompilationError

@@ -16,8 +16,8 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
+from daemon import DaemonError
 from daemon.cli.exit_status import ExitStatus
-from daemon.errors import DaemonError
 from daemon.onboard.monitoring.flight_state import EXPOSURES_MAX, PARTS, PREVIEW_PARTS
 from daemon.terminal.tables import light_table
 from processing.rig.problem_sentences import findings_of, sentences

@@ -17,9 +17,9 @@ from typing import Annotated, Any
 
 import typer
 
+from daemon import DaemonError
 from daemon.cli.options import AsJson
 from daemon.configuration.schemas import SCHEMA_FILES, schema_file_name, schema_line
-from daemon.errors import DaemonError
 from daemon.mission.store.durable import replace_file
 from daemon.terminal.console import Console
 from drivers.base.extras import require

@@ -24,7 +24,7 @@ from pydantic import (
     model_validator,
 )
 
-from daemon.errors import DaemonError
+from daemon import DaemonError
 from processing.image.kernels import DEFAULT_INTERPOLATION, Interpolation
 from processing.quality.report import Thresholds
 from processing.rig.problem_sentences import ProblemList

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
-from daemon.errors import DaemonError
+from daemon import DaemonError
 from drivers.cameras.head_description import HeadDescription
 
 FOCAL_LENGTH_MM: Final = (1.0, 2000.0)

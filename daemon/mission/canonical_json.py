@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from daemon.errors import DaemonError
+from daemon import DaemonError
 from processing.rig.problem_sentences import ProblemList
 from processing.rig.toml_text import is_nested_deeper
 from processing.rig.value_types import plain_name as plain_name

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
-from daemon.errors import DaemonError
+from daemon import DaemonError
 
 T = TypeVar("T")
 

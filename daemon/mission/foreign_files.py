@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 
-from daemon.errors import DaemonError
+from daemon import DaemonError
 
 _LOCAL_FILE_SYSTEMS = frozenset(
     [

@@ -6,7 +6,7 @@ from typing import NoReturn
 from xml.etree import ElementTree
 from xml.parsers import expat
 
-from daemon.errors import DaemonError
+from daemon import DaemonError
 
 DEPTH_MAX = 100
 

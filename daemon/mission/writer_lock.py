@@ -18,7 +18,7 @@ from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
-from daemon.errors import DaemonError
+from daemon import DaemonError
 
 LOCK_FILE = ".held"
 _HOLDER_MAX_BYTES = 4096

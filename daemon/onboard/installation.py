@@ -17,7 +17,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
-from daemon.errors import DaemonError
+from daemon import DaemonError
 from daemon.mission.canonical_json import sha256_hex
 from daemon.mission.store import durable
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pyproj
 
-from daemon.errors import DaemonError
+from daemon import DaemonError
 from daemon.mission.foreign_files import ForeignFileError, open_regular_file
 from daemon.orientation.georeference import Georeference
 from drivers.base.extras import require

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import pyproj
 from pyproj.transformer import TransformerGroup
 
-from daemon.errors import DaemonError
+from daemon import DaemonError
 from daemon.orientation.geodesy import ELLIPSOID, GEODETIC
 
 _CODE = re.compile(r"[A-Za-z]{2,10}:\w{1,10}(\+([A-Za-z]{2,10}:)?\w{1,10})?", re.ASCII)

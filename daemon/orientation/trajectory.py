@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.errors import DaemonError
+from daemon import DaemonError
 from daemon.mission.canonical_json import sha256_hex
 from daemon.mission.exposure import NavigationRecord
 from daemon.mission.foreign_files import ForeignFileError, read_regular_file

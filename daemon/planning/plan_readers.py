@@ -14,7 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from daemon.errors import DaemonError
+from daemon import DaemonError
 from daemon.mission.foreign_files import ForeignFileError, read_regular_file
 from daemon.mission.foreign_xml import XmlError, parse_xml
 from daemon.planning.model import LocalPlane, Plan, PlannedLine, Point, Specification

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from daemon import DaemonError
 from daemon.configuration.model import PlanSection
-from daemon.errors import DaemonError
 from daemon.orientation.elevation import read_elevation
 from daemon.orientation.georeference import Georeference
 from processing.geometry.terrain_rays import HeightModel

@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 import jinja2
 
-from daemon.errors import DaemonError
+from daemon import DaemonError
 from daemon.mission.exposure import Exposure, to_json
 from daemon.mission.exposure_batch import ExposureFailure, cause_of, for_each_exposure
 from daemon.mission.layout import Mission

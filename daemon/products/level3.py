@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.errors import DaemonError
+from daemon import DaemonError
 from daemon.mission.canonical_json import canonical_bytes, sha256_hex
 from daemon.mission.exposure import Exposure
 from daemon.mission.exposure_batch import ExposureFailure, for_each_exposure

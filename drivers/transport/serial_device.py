@@ -17,6 +17,7 @@ from typing import Any, Final, Protocol
 
 import serial
 
+from drivers import DriverError
 from drivers.base.device import DeviceDriver
 from drivers.base.settings import Setting
 from drivers.contract import (
@@ -29,7 +30,6 @@ from drivers.contract import (
     Sink,
     TemperatureSample,
 )
-from drivers.errors import DriverError
 from drivers.timescales.clock import Clock
 from drivers.transport.line_errors import LineErrors, overrun_sentence
 from drivers.transport.port_users import (

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from processing import ProcessingError
 from processing.bundle.camera_model import (
     ideal_mm,
     interior_derivatives,
@@ -21,7 +22,6 @@ from processing.bundle.camera_model import (
 from processing.bundle.curvature_refraction import corrected_rays
 from processing.bundle.network import INTERIOR, Network
 from processing.bundle.unknowns import ParameterLayout, ParameterValues
-from processing.errors import ProcessingError
 from processing.geometry.rotation import skew, vectors_from_rotations
 
 Array = NDArray[np.float64]

@@ -12,6 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from processing import ProcessingError
 from processing.bundle.equations import BehindCameraError, Equations, equations
 from processing.bundle.network import Network, NetworkError
 from processing.bundle.normal_equations import (
@@ -23,7 +24,6 @@ from processing.bundle.normal_equations import (
 )
 from processing.bundle.rank_diagnosis import RankDefectError, rank_defects
 from processing.bundle.unknowns import ParameterLayout, ParameterValues, apply_corrections
-from processing.errors import ProcessingError
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]

@@ -18,9 +18,9 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from processing import ProcessingError
 from processing.bundle.curvature_refraction import RayModel
 from processing.bundle.terms import Term
-from processing.errors import ProcessingError
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]

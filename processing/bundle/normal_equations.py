@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, sparse
 
+from processing import ProcessingError
 from processing.bundle.equations import Equations
 from processing.bundle.unknowns import ParameterLayout
-from processing.errors import ProcessingError
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]

@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
+from processing import ProcessingError
 from processing.bundle.network import Network
 from processing.bundle.normal_equations import MIN_INFORMATION, ReducedEquations, constrained_matrix
 from processing.bundle.unknowns import ParameterLayout, ParameterValues, Unknown
-from processing.errors import ProcessingError
 
 Array = NDArray[np.float64]
 

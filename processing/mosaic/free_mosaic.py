@@ -308,17 +308,11 @@ def adjust_mosaic(
         if iterations >= least and still and not changed and not moved:
             break
     return _mosaic(
-        rig,
         start,
         tie_points,
         model,
         settings,
-        groups,
-        blocks,
-        class_scale,
-        values,
-        solution,
-        iterations,
+        _Adjusted(groups, blocks, class_scale, values, solution, iterations),
         method=method,
         constraints=len(constraints),
         datum_sensors=datum_sensors,
@@ -326,31 +320,38 @@ def adjust_mosaic(
     )
 
 
+@dataclass(frozen=True)
+class _Adjusted:
+    """What the iterations of an adjustment ended with."""
+
+    groups: Sequence[TiePointGroup]
+    blocks: Sequence[ObservationBlock]
+    class_scale: Mapping[int, float]
+    values: Array
+    solution: ConstrainedSolution | None
+    iterations: int
+
+
 def _mosaic(
-    rig: Rig,
     start: Mapping[str, SensorPlacement],
     tie_points: TiePoints,
     model: MosaicModel,
     settings: MosaicSettings,
-    groups: Sequence[TiePointGroup],
-    blocks: Sequence[ObservationBlock],
-    class_scale: Mapping[int, float],
-    values: Array,
-    solution: ConstrainedSolution | None,
-    iterations: int,
+    adjusted: _Adjusted,
     *,
     method: str,
     constraints: int,
     datum_sensors: tuple[str, ...],
     supported: bool,
 ) -> Mosaic:
+    class_scale, solution = adjusted.class_scale, adjusted.solution
     unknowns = len(model.names)
     n = len(tie_points)
     residuals, redundancy = np.full((n, 2), np.nan), np.full((n, 2), np.nan)
     outliers = np.ones(n, dtype=np.bool_)
     squares, used_points, free = 0.0, 0, 0.0
     used = dict.fromkeys(tie_points.pairs, 0)
-    for group in groups:
+    for group in adjusted.groups:
         good = group.factor > 0.0
         residuals[group.rows] = group.difference
         redundancy[group.rows] = group.redundancy
@@ -367,9 +368,14 @@ def _mosaic(
     sigma0 = math.sqrt(squares / freedom) if freedom > 0 else 1.0
     cofactor = np.zeros((unknowns, unknowns))
     if solution is not None:
-        scales = np.array([class_scale[group.kind] for group in groups])
+        scales = np.array([class_scale[group.kind] for group in adjusted.groups])
         cofactor = clustered_cofactor(
-            groups, blocks, solution.cofactor, scales, sigma0, pitch_mm=model.pitch_mm
+            adjusted.groups,
+            adjusted.blocks,
+            solution.cofactor,
+            scales,
+            sigma0,
+            pitch_mm=model.pitch_mm,
         )
     ratio = class_scale[PAN_TO_COLOUR] / class_scale[PAN_TO_PAN]
     pitch_um = model.pitch_mm * 1e3
@@ -378,7 +384,7 @@ def _mosaic(
         method=method,
         model=model,
         start=start,
-        placements={name: placement_at(model, p, values) for name, p in start.items()},
+        placements={name: placement_at(model, p, adjusted.values) for name, p in start.items()},
         sigma0=sigma0,
         sigma0_px=sigma0_px,
         sigma0_um=sigma0_px * pitch_um,
@@ -386,13 +392,13 @@ def _mosaic(
         sigma_pc_px=sigma0 * settings.sigma_pc_px * ratio * class_scale[PAN_TO_PAN],
         redundancy=float(freedom),
         observations=2 * used_points,
-        values=values,
+        values=adjusted.values,
         covariance=cofactor * np.outer(model.units, model.units) * sigma0**2,
         residuals_px=residuals,
         redundancy_numbers=redundancy,
         outliers=outliers,
         used=used,
-        iterations=iterations,
+        iterations=adjusted.iterations,
         rank=0 if solution is None else solution.rank,
         constrained_rank=0 if solution is None else solution.constrained_rank,
         constraints=constraints,

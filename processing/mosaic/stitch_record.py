@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
-from processing.errors import ProcessingError
+from processing import ProcessingError
 from processing.geometry.drift import sensor_dc
 from processing.geometry.topology import mosaic_cones
 from processing.image.colour import BandRegistration

@@ -54,14 +54,27 @@ MIN_DISPLACEMENT_PX: Final = 0.02
 """Displacements with a smaller difference count as equal."""
 
 
+@dataclass(frozen=True)
+class CalibrationChecks:
+    """What one exposure shows of its calibration.
+
+    Args:
+        estimated_dc: temperatures by stitching against those of the probes.
+        layers: the other cones against the platform calibration.
+        platform: the mountings of converging heads against it.
+    """
+
+    estimated_dc: Sequence[EstimatedDc] = ()
+    layers: LayerCheck | None = None
+    platform: PlatformCheck | None = None
+
+
 def uncertainty_contribution_of(
     rig: Rig,
     mosaic: Mosaic,
     *,
     validity: Validity | None,
-    estimated_dc: Sequence[EstimatedDc],
-    layers: LayerCheck | None,
-    platform: PlatformCheck | None,
+    checks: CalibrationChecks,
     slips: Sequence[Slip],
     held: HeldQuantities | None,
     temperatures_c: Mapping[str, float],
@@ -76,9 +89,7 @@ def uncertainty_contribution_of(
         rig: the camera.
         mosaic: what the image was made with.
         validity: of the master cone's sensors.
-        estimated_dc: temperatures by stitching against those of the probes.
-        layers: the other cones against the platform calibration.
-        platform: the mountings of converging heads against it.
+        checks: of the calibration.
         slips: shifted bands of frames.
         held: what the adjustment of converging heads holds.
         temperatures_c: temperatures that were read, by probe name.
@@ -92,9 +103,10 @@ def uncertainty_contribution_of(
 
     Source: docs/explanation/mathematics/validity.md#what-findings-add.
     """
-    warmed = tuple(_wrong_temperature(rig, mosaic, estimated_dc))
+    platform = checks.platform
+    warmed = tuple(_wrong_temperature(rig, mosaic, checks.estimated_dc))
     # A wrong temperature changes the common scale of all layers, too.
-    changed = () if warmed else tuple(_changed_master(rig, mosaic, layers))
+    changed = () if warmed else tuple(_changed_master(rig, mosaic, checks.layers))
     datum = np.zeros((4, 4))
     contributions = [*_rotated_heads(mosaic, platform, held), *_stale(rig, mosaic, stale_s)]
     contributions += _miscounted(rig, smear_px or {})

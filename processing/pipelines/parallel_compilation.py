@@ -22,7 +22,7 @@ from typing import Any, Final
 from numba.core import caching, sigutils
 from numba.core.dispatcher import Dispatcher
 
-from processing.errors import ProcessingError
+from processing import ProcessingError
 
 VARIANTS_FILE: Final = Path(__file__).with_name("kernel_variants.toml")
 COMPILATION_TIMEOUT_S: Final = 600.0

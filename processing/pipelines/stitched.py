@@ -51,7 +51,10 @@ from processing.mosaic.held import held_quantities
 from processing.mosaic.layers import check_layers
 from processing.mosaic.mounting import check_platform
 from processing.mosaic.stitching import Method, stitch
-from processing.mosaic.uncertainty_contribution import uncertainty_contribution_of
+from processing.mosaic.uncertainty_contribution import (
+    CalibrationChecks,
+    uncertainty_contribution_of,
+)
 from processing.mosaic.validity import Validity
 from processing.pipelines.exposure_pipeline import ExposureInput, ExposurePipeline, Judgement
 from processing.pipelines.product import PipelineSettings, Product
@@ -247,9 +250,7 @@ class Pipeline(
                 rig,
                 stitching.image,
                 validity=stitching.validity,
-                estimated_dc=estimated,
-                layers=layers,
-                platform=platform,
+                checks=CalibrationChecks(estimated, layers, platform),
                 slips=stitching.slips,
                 held=held,
                 temperatures_c=temperatures.usable_c,

@@ -18,7 +18,7 @@ from typing import IO, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.errors import ProcessingError
+from processing import ProcessingError
 from processing.rig import Sensor
 
 Array = NDArray[Any]

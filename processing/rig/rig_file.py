@@ -21,7 +21,7 @@ from pydantic import (
     ValidationError,
 )
 
-from processing.errors import ProcessingError
+from processing import ProcessingError
 from processing.rig.model import (
     CALIBRATION_VALID_DAYS,
     IMAGE_MAX_PIXELS,

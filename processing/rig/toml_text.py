@@ -9,7 +9,7 @@ import tomllib
 from collections.abc import Mapping
 from typing import Any, Final
 
-from processing.errors import ProcessingError
+from processing import ProcessingError
 
 DEPTH_MAX: Final = 32
 """Tables and lists within one another; no file of ours has more than six."""

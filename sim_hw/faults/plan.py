@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sim_hw.errors import SimulatorError
+from sim_hw import SimulatorError
 from sim_hw.faults.catalogue import CATALOGUE, TOPICS, DeviceKind, FaultKind
 
 SCENARIO_MAX_BYTES = 1 << 20

@@ -12,7 +12,7 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from sim_hw.errors import SimulatorError
+from sim_hw import SimulatorError
 from sim_hw.gige import features as at
 from sim_hw.gige.description import description_xml
 from sim_hw.gige.features import (

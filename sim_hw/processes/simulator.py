@@ -22,9 +22,9 @@ from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from typing import Any
 
+from sim_hw import SimulatorError
 from sim_hw.devices.pps_source import PpsSource
 from sim_hw.devices.pulse_bus import Firing, PulseBus
-from sim_hw.errors import SimulatorError
 from sim_hw.faults.channel import BytesDamage, Channel, for_device
 from sim_hw.faults.faulty_line import FaultyWire, FaultyWorldClock
 from sim_hw.faults.plan import read_plan

@@ -76,6 +76,7 @@ STREAMS = {
 }
 """By MAV_DATA_STREAM; 0 is all."""
 TRIGGER_LATENCY_NS = 4_000_000
+SYSTEM_ID = 1
 MIN_PERIOD_NS = 1_000_000
 REAL32 = 9
 """MAV_PARAM_TYPE of the parameters here."""
@@ -98,7 +99,6 @@ class MavlinkAutopilot(LineDevice):
         *,
         leap_seconds: int = LEAP_SECONDS,
         accuracy: ReceiverAccuracy = ReceiverAccuracy(),  # noqa: B008 - frozen
-        system: int = 1,
         boot_ns: int = 754 * NS_PER_S,
         drift_ppm: float = 3.0,
         triggers_in_utc: bool = False,
@@ -112,7 +112,6 @@ class MavlinkAutopilot(LineDevice):
         self._state = state
         self._leap_seconds = leap_seconds
         self._accuracy = accuracy
-        self._system = system
         self._device_clock = FreeRunningClock(boot_ns, drift_ppm)
         self._triggers_in_utc = triggers_in_utc
         self.utc = UtcErrors(utc_jitter)
@@ -209,7 +208,7 @@ class MavlinkAutopilot(LineDevice):
 
     def _pack_message(self, name: str, **values: Any) -> bytes:
         self._sequence += 1
-        return message(name, self._sequence, self._system, AUTOPILOT_COMPONENT, **values)
+        return message(name, self._sequence, SYSTEM_ID, AUTOPILOT_COMPONENT, **values)
 
     def _trigger(self, gps_ns: int, number: int) -> bytes:
         if self._triggers_in_utc:
@@ -335,7 +334,7 @@ class MavlinkAutopilot(LineDevice):
             self.counts["timesyncs"] += 1
             own_ns = self.boot_ns(self._clock.gps_ns(mono_ns))
             return self._pack_message("TIMESYNC", tc1=own_ns, ts1=values["ts1"])
-        if values.get("target_system", self._system) not in (0, self._system):
+        if values.get("target_system", SYSTEM_ID) not in (0, SYSTEM_ID):
             return b""
         if received.name == "COMMAND_LONG":
             self.counts["commands"] += 1

@@ -23,7 +23,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_hw.errors import SimulatorError
+from sim_hw import SimulatorError
 from sim_hw.world import quilting, spline
 from sim_hw.world.ground_types import GROUNDS
 from sim_hw.world.seeding import random_stream

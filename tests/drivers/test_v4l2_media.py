@@ -7,6 +7,7 @@ from typing import Any, cast
 
 import pytest
 
+from drivers import DriverError
 from drivers.cameras.v4l2 import media_uapi, uapi
 from drivers.cameras.v4l2.camera import V4l2Camera
 from drivers.cameras.v4l2.control import Control
@@ -16,7 +17,6 @@ from drivers.cameras.v4l2.node import FrameLayout, VideoNode
 from drivers.cameras.v4l2.pipeline import PadFormat, SensorPipeline, SubDevice, route_of
 from drivers.cameras.v4l2.settings import V4l2Settings
 from drivers.contract import DeviceError
-from drivers.errors import DriverError
 
 SENSOR, RECEIVER, VIDEO, PROCESSOR, OUTPUT = 1, 2, 3, 4, 5
 RASPBERRY = {

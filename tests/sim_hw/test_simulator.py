@@ -23,7 +23,7 @@ import serial
 from pymodbus.client import ModbusSerialClient
 from pyubx2 import UBXReader
 
-from sim_hw.errors import SimulatorError
+from sim_hw import SimulatorError
 from sim_hw.gige import features as at
 from sim_hw.processes.head_process import FirstLine
 from sim_hw.processes.simulator import head_addresses

@@ -24,6 +24,8 @@ from daemon.cli.exit_status import ExitStatus
 
 ROOT = Path(__file__).parents[2]
 BUILD_TIMEOUT_S = 300.0
+COMPILED_HERE = "radiometry"
+"""The package of `processing` whose kernels the installation compiles itself."""
 FLIGHT_TIMEOUT_S = 900.0
 WHEEL_NBYTES_MAX = 4_000_000
 """The photographs alone have 8 MB."""
@@ -146,8 +148,9 @@ def test_without_the_photographs_the_emulator_names_the_missing_distribution(
 def test_the_demonstration_flies_and_check_reads_its_configuration(
     installed: Installation,
 ) -> None:
+    present = _copy_compiled_kernels(installed)
     compiled = installed.run("syntopic", "kernels", "--json", timeout_s=FLIGHT_TIMEOUT_S)
-    assert json.loads(compiled.stdout)["compiled"] > 100, compiled.stderr
+    assert json.loads(compiled.stdout)["compiled"] > (5 if present else 100), compiled.stderr
     again = installed.run("syntopic", "kernels", "--json")
     assert json.loads(again.stdout)["compiled"] == 0, again.stderr
     done = installed.run(
@@ -173,6 +176,27 @@ def test_the_demonstration_flies_and_check_reads_its_configuration(
     findings = {one["name"]: one for one in json.loads(checked.stdout)["findings"]}
     assert checked.returncode == 1
     assert "python-daemon installs daemon/daemon.py" in findings["python-daemon"]["sentence"]
+
+
+def _copy_compiled_kernels(installed: Installation) -> int:
+    """Copy what `make setup` compiled, but for one package; the number of files.
+
+    All of them take more than a minute of one core, and tests/processing/test_kernel_compilation.py
+    compiles them.
+    """
+    copied = 0
+    packages = Path(sysconfig.get_path("purelib", vars={"base": str(installed.prefix)}))
+    for cache in (ROOT / "processing").rglob("*.nb[ic]"):
+        name = cache.relative_to(ROOT)
+        if COMPILED_HERE not in name.parts:
+            target = packages / name
+            target.parent.mkdir(exist_ok=True)
+            shutil.copy2(cache, target)
+            copied += 1
+    # The compiler's cache holds for a source of the same size and time.
+    for source in (ROOT / "processing").rglob("*.py"):
+        shutil.copystat(source, packages / source.relative_to(ROOT))
+    return copied
 
 
 def _plant_python_daemon(installed: Installation) -> None:

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.errors import DaemonError
+from daemon import DaemonError
 from processing.geometry.placement import SensorPlacement
 from processing.image.lattice import OUTSIDE, fill_lattice, lattice_shape, pan_raster
 from processing.matching.tie_points import PAN_TO_PAN, TiePoints

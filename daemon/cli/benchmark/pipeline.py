@@ -24,10 +24,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from daemon import DaemonError
 from daemon.cli.benchmark import peers
 from daemon.cli.benchmark.measurement import interleaved, machine, spread
 from daemon.configuration.model import PlanSection
-from daemon.errors import DaemonError
 from daemon.mission.layout import Mission
 from daemon.mission.store import direct_io, store
 from daemon.mission.store.radiometry_folder import RadiometryFolder

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from daemon.errors import DaemonError
+from daemon import DaemonError
 from daemon.mission.catalog.catalog_schema import (
     DATABASE_ERRORS,
     SCHEMA_VERSION,

@@ -15,7 +15,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
-from daemon.errors import DaemonError
+from daemon import DaemonError
 from daemon.mission.layout import Mission
 from daemon.mission.mirror.generations import Generations, read_generations
 from daemon.mission.mirror.resync import MirrorError, Resync

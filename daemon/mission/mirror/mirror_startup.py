@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
-from daemon.errors import DaemonError
+from daemon import DaemonError
 from daemon.mission.canonical_json import RecordError
 from daemon.mission.layout import Mission
 from daemon.mission.log.flight_log import logs_of, read

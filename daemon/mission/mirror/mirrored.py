@@ -18,7 +18,7 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.errors import DaemonError
+from daemon import DaemonError
 from daemon.mission.exposure import CaptureRecord, Exposure, FrameRecord
 from daemon.mission.log.flight_log import FlightLog, host_boot_id, new_log_name
 from daemon.mission.mirror.disk_rejoin import RejoiningDisk, RejoinSettings

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
 
-from daemon.errors import DaemonError
+from daemon import DaemonError
 from daemon.mission.layout import DISCARDED, Mission
 from daemon.mission.mirror.generations import STATE_FILE, is_up_to_date_with, read_generations
 from daemon.mission.store import durable

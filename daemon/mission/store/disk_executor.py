@@ -14,7 +14,7 @@ from concurrent.futures import Future
 from functools import partial
 from typing import TypeVar
 
-from daemon.errors import DaemonError
+from daemon import DaemonError
 from daemon.mission.store.disk_identity import Disk
 
 STALL_STEP_S = 0.25

@@ -16,7 +16,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from daemon.errors import DaemonError
+from daemon import DaemonError
 from daemon.mission.store import durable
 
 BLOCK_BYTES = 4 << 20

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.errors import DaemonError
+from daemon import DaemonError
 from daemon.mission.canonical_json import plain_name, sha256_hex
 from daemon.mission.catalog.catalog import Catalog
 from daemon.mission.exposure import (

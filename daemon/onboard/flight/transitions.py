@@ -9,7 +9,7 @@ from __future__ import annotations
 import enum
 from dataclasses import dataclass
 
-from daemon.errors import DaemonError
+from daemon import DaemonError
 
 
 class LedgerError(DaemonError):

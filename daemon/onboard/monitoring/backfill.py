@@ -14,7 +14,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from daemon.errors import DaemonError
+from daemon import DaemonError
 from daemon.mission.canonical_json import RecordError
 from daemon.mission.layout import Mission
 from daemon.onboard.monitoring.flight_state import FlightState

@@ -13,8 +13,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from daemon import DaemonError
 from daemon.configuration.model import PlanSection
-from daemon.errors import DaemonError
 from daemon.mission.layout import Mission
 from daemon.onboard.monitoring.flight_state import FlightState
 from daemon.orientation.exterior_orientation import mount_of

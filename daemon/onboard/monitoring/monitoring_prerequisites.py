@@ -13,8 +13,8 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+from daemon import DaemonError
 from daemon.configuration.model import WatchSection
-from daemon.errors import DaemonError
 from daemon.onboard.monitoring.access.certificates import (
     TlsCertificateError,
     expiry_warning,

@@ -15,8 +15,8 @@ import uvicorn
 from fastapi import FastAPI
 from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 
+from daemon import DaemonError
 from daemon.configuration.model import MountSection, PlanSection, WatchSection
-from daemon.errors import DaemonError
 from daemon.mission.canonical_json import RecordError
 from daemon.mission.exposure import navigation_from_json
 from daemon.mission.layout import Mission

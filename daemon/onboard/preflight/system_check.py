@@ -14,8 +14,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
 
+from daemon import DaemonError
 from daemon.configuration.model import Configuration
-from daemon.errors import DaemonError
 from daemon.onboard.capture.device_states import DeviceStates
 from daemon.onboard.capture.devices import bound_problem, device_specs
 from daemon.onboard.flight.flight import Flight

@@ -13,7 +13,7 @@ from typing import Any, Final
 
 import msgpack
 
-from daemon.errors import DaemonError
+from daemon import DaemonError
 from daemon.onboard.service.messages import (
     Answer,
     CommandRefused,

@@ -18,7 +18,7 @@ from multiprocessing.connection import Connection
 from multiprocessing.reduction import ForkingPickler
 from typing import Any, ClassVar
 
-from daemon.errors import DaemonError
+from daemon import DaemonError
 
 PR_SET_PDEATHSIG = 1  # linux/prctl.h
 TRY_SEND_MAX_BYTES = 100_000

@@ -17,7 +17,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.errors import DaemonError
+from daemon import DaemonError
 from daemon.mission.exposure import CaptureRecord, Exposure, FrameRecord
 from daemon.mission.layout import Mission
 from daemon.mission.log.flight_log import FlightLog

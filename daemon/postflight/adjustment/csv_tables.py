@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from daemon.errors import DaemonError
+from daemon import DaemonError
 from daemon.mission.foreign_files import ForeignFileError, read_regular_file
 from daemon.mission.store.durable import new_file
 from processing.rig.problem_sentences import ProblemList

@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from daemon import DaemonError
 from daemon.configuration.model import MountSection
-from daemon.errors import DaemonError
 from daemon.mission.exposure import Exposure
 from daemon.mission.layout import Mission
 from daemon.orientation.exterior_orientation import sealed_exposures

@@ -19,7 +19,7 @@ from typing import Any, Final
 import jinja2
 from scipy.stats import norm
 
-from daemon.errors import DaemonError
+from daemon import DaemonError
 from daemon.mission.canonical_json import canonical_bytes
 from daemon.mission.store.durable import create_file, make_directories, new_files
 from daemon.terminal.console import visible_value

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.errors import DaemonError
+from daemon import DaemonError
 from daemon.mission.layout import Mission
 from daemon.postflight.calibration.calibration_report import (
     CalibrationReport,

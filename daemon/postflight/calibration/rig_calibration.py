@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from daemon.errors import DaemonError
+from daemon import DaemonError
 from daemon.postflight.adjustment.project import Project
 from daemon.postflight.calibration.calibration_report import (
     CalibrationReport,

@@ -12,8 +12,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from daemon import DaemonError
 from daemon.configuration.schemas import SCHEMA_FILES, schema_file_name
-from daemon.errors import DaemonError
 from daemon.mission.exposure import Exposure
 from daemon.mission.layout import Mission
 from daemon.mission.store.durable import new_file, replace_file

@@ -11,7 +11,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from daemon.errors import DaemonError
+from daemon import DaemonError
 from daemon.mission.exposure_batch import ExposureFailure
 from daemon.mission.layout import Mission
 from daemon.mission.store.durable import make_directories, replace_file

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from daemon import DaemonError
 from daemon.configuration.model import MountSection
-from daemon.errors import DaemonError
 from daemon.mission.canonical_json import plain_name, sha256_hex
 from daemon.mission.exposure import Exposure
 from daemon.mission.exposure_batch import ExposureFailure, for_each_exposure

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.errors import DaemonError
+from daemon import DaemonError
 from daemon.mission.canonical_json import canonical_bytes, sha256_hex
 from daemon.mission.exposure import Exposure, FrameRecord, exposure_bytes
 from daemon.mission.layout import Mission, exposure_name

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from daemon.errors import DaemonError
+from daemon import DaemonError
 from daemon.mission.foreign_xml import XmlError, parse_xml
 
 XMP_MAX_BYTES = 1_000_000

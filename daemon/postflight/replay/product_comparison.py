@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 import tifffile
 
+from daemon import DaemonError
 from daemon.configuration.model import PlanSection, ProcessingSection
-from daemon.errors import DaemonError
 from daemon.mission.canonical_json import RecordError, canonical_bytes, parse_record, sha256_hex
 from daemon.mission.exposure import Exposure, exposure_bytes
 from daemon.mission.layout import Mission

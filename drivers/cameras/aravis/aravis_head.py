@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Final
 
+from drivers import DriverError
 from drivers.cameras.aravis.camera import AravisCamera, ClockLatch, ControlDeniedError
 from drivers.cameras.aravis.frame_record import frame_record, frame_status
 from drivers.cameras.aravis.gvcp import (
@@ -38,7 +39,6 @@ from drivers.contract import (
     Sink,
     TemperatureSample,
 )
-from drivers.errors import DriverError
 from drivers.timescales.clock import Clock
 
 POP_TIMEOUT_S: Final = 0.1

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from drivers import DriverError
 from drivers.cameras.tiff_layout import layout_problem
-from drivers.errors import DriverError
 
 if TYPE_CHECKING:
     import numpy as np

@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import ClassVar, Final
 
+from drivers import DriverError
 from drivers.cameras.head_device import HeadDevice
 from drivers.cameras.pixels import packed_nbytes, pixels_in_a_group, unpack, words_at
 from drivers.cameras.v4l2.camera import V4l2Camera
@@ -19,7 +20,6 @@ from drivers.cameras.v4l2.node import FilledBuffer
 from drivers.cameras.v4l2.sequence import SequenceCounter
 from drivers.cameras.v4l2.settings import V4l2Settings
 from drivers.contract import DeviceError, Frame, FrameStatus, LifeCycle, Sink
-from drivers.errors import DriverError
 
 WAIT_STEP_S: Final = 0.1
 TRIGGER_TIMEOUT_S: Final = 1.0

@@ -15,7 +15,7 @@ import struct
 from collections.abc import Iterator
 from typing import Any, Final
 
-from drivers.errors import DriverError
+from drivers import DriverError
 from drivers.receivers.message_framer import MessageFramer
 
 STARTS: Final = b"\xfa"

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
-from drivers.errors import DriverError
+from drivers import DriverError
 
 MAX_PATTERN: Final = 400
 MAX_STEPS: Final = 800

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from drivers.errors import DriverError
+from drivers import DriverError
 
 MAX_TEXT: Final = 128
 _INPUT: Final = re.compile(r"temp\d+_input")

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
-from drivers.errors import DriverError
+from drivers import DriverError
 
 WORDS: Final = {"int16": 1, "uint16": 1, "float32": 2}
 """Registers per channel, by the type of its value."""

@@ -5,13 +5,14 @@ Source: GenICam Standard 2.1.1, section 2 (GenApi), schemas 1.0 and 1.1.
 
 from __future__ import annotations
 
+import functools
 import io
 import zipfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from xml.etree import ElementTree
 
-from sim_hw.errors import SimulatorError
+from sim_hw import SimulatorError
 
 _CONTAINERS = frozenset({"Group", "RegisterDescription"})
 _BIT_PROPERTIES = frozenset({"Bit", "LSB", "MSB", "Sign"})
@@ -61,6 +62,8 @@ class Description:
     xml: bytes
 
 
+# Emulated heads of one camera share what was read; a description is never written.
+@functools.lru_cache(maxsize=4)
 def read_description(data: bytes) -> Description:
     """Read a description as a camera stores it, also zipped.
 

@@ -5,13 +5,14 @@ Source: GenICam Standard 2.1.1, section 2.8.11 (SwissKnife) and its table of ope
 
 from __future__ import annotations
 
+import functools
 import math
 import operator
 import re
 from collections.abc import Callable, Mapping
 from typing import Final
 
-from sim_hw.errors import SimulatorError
+from sim_hw import SimulatorError
 
 Number = int | float
 Evaluate = Callable[[Mapping[str, Number]], Number]
@@ -30,6 +31,8 @@ class FormulaError(SimulatorError, ValueError):
     """A formula that the standard does not allow, or that has no value."""
 
 
+# A description repeats its formulas, and every emulated head of a camera compiles the same ones.
+@functools.lru_cache(maxsize=8192)
 def compile_formula(text: str, *, is_integer: bool) -> Evaluate:
     """Compile a formula.
 

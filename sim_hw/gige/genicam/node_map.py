@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Protocol
 
-from sim_hw.errors import SimulatorError
+from sim_hw import SimulatorError
 from sim_hw.gige.genicam.description_file import Description, Node
 from sim_hw.gige.genicam.formula import Evaluate, FormulaError, Number, compile_formula
 

@@ -21,6 +21,7 @@ from processing.mosaic.precision import UncertaintyContribution, datum_per_kelvi
 from processing.mosaic.readout_slips import Slip
 from processing.mosaic.uncertainty_contribution import (
     MIN_DISPLACEMENT_PX,
+    CalibrationChecks,
     uncertainty_contribution_of,
 )
 from processing.mosaic.validity import Displacement, Validity
@@ -49,9 +50,7 @@ def found(
         rig,
         mosaic,
         validity=validity,
-        estimated_dc=estimated_dc,
-        layers=layers,
-        platform=platform,
+        checks=CalibrationChecks(estimated_dc, layers, platform),
         slips=slips,
         held=held,
         temperatures_c=dict.fromkeys(rig.probes, 20.0),

@@ -15,7 +15,7 @@ from ipaddress import ip_address
 from pathlib import Path
 from typing import Any, Final
 
-from daemon.errors import DaemonError
+from daemon import DaemonError
 
 EXPIRES_SOON_S: Final = 30 * 86_400
 NO_CHECK_TIME: Final = ssl.VerifyFlags(0x200000)

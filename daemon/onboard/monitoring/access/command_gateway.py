@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from daemon.errors import DaemonError
+from daemon import DaemonError
 from daemon.onboard.monitoring.access.roles import COMMAND_ROLES, Principal, missing_role
 from daemon.onboard.monitoring.web.refusal_limiter import SUMMARY_EVERY_S, RefusalLimiter
 from daemon.onboard.service.messages import Answer, CommandRefused, ServiceCommand

@@ -26,7 +26,7 @@ from typing import Any, Final, get_args
 
 from pydantic import ValidationError
 
-from daemon.errors import DaemonError
+from daemon import DaemonError
 from daemon.onboard.monitoring.access.command_gateway import (
     AnswerTimeoutError,
     CommandGateway,

@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from daemon.errors import DaemonError
+from daemon import DaemonError
 from daemon.mission.store import durable
 from daemon.onboard.monitoring.access.roles import ROLES, Role
 from processing.rig.toml_text import parse_toml

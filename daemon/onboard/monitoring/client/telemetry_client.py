@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Final
 from urllib.parse import urlsplit
 
-from daemon.errors import DaemonError
+from daemon import DaemonError
 from daemon.terminal.printable import printable, printable_tree
 from drivers.base.extras import require
 

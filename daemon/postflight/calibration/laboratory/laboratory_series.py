@@ -21,7 +21,7 @@ from pydantic import (
     ValidationInfo,
 )
 
-from daemon.errors import DaemonError
+from daemon import DaemonError
 from processing.rig import Rig, load_rig
 from processing.rig.problem_sentences import findings_of, sentences, shown
 from processing.rig.value_types import Flag, Text

@@ -19,9 +19,9 @@ from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 from websockets.sync.server import ServerConnection, serve
 
+from daemon import DaemonError
 from daemon.cli import app
 from daemon.cli.monitor import _MonitorState
-from daemon.errors import DaemonError
 from daemon.onboard.monitoring.client import mdns_browser
 from daemon.onboard.monitoring.client.mdns_browser import AnnouncedService, parse_announcement
 from daemon.onboard.monitoring.client.telemetry_client import (

@@ -17,10 +17,10 @@ import numba
 import numpy as np
 import pytest
 
+from daemon import DaemonError
 from daemon.cli.check import collect_results
 from daemon.configuration.model import ConfigurationError
 from daemon.configuration.service_file import load
-from daemon.errors import DaemonError
 from daemon.mission.store.level0 import tiff_parts
 from daemon.onboard.pipeline import worker
 from daemon.onboard.preflight import prerequisites, system_check

@@ -13,10 +13,12 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import signal
 import subprocess
 import time
 import tomllib
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -45,6 +47,14 @@ LONG: Final = {"how-to/processing/calibration.md"}
 
 OWN_NETWORK: Final = {"tutorials/your-own-hardware.md"}
 """Pages that search for heads or change addresses; they run in a network namespace of their own."""
+
+FLIGHTS: Final = {
+    "how-to/processing/midas.md",
+    "how-to/processing/replay.md",
+    "tutorials/getting-started.md",
+}
+"""Pages that fly. They have a network of their own where the kernel allows it, as other flights of
+the tests may run at the same time."""
 
 NOT_RUN: Final[Mapping[tuple[str, str], str]] = {
     ("tutorials/getting-started.md", "clone"): "installs the system; the tests run after it",
@@ -167,11 +177,14 @@ class Session:
 
 
 @contextmanager
-def own_network() -> Iterator[tuple[str, ...]]:
-    """A command that runs others in a new network namespace; a skip where that is not allowed."""
+def network_of(name: str) -> Iterator[tuple[str, ...]]:
+    """A command that runs those of a page in a new network namespace, or none."""
     needed = first_exposure.missing()
-    if needed is not None:
+    if name in OWN_NETWORK and needed is not None:
         pytest.skip(needed)
+    if name not in OWN_NETWORK | FLIGHTS or needed is not None:
+        yield ()
+        return
     holder = subprocess.Popen(
         [*first_exposure.NAMESPACE, "sh", "-c", "ip link set lo up && echo up && exec sleep 86400"],
         stdout=subprocess.PIPE,
@@ -221,6 +234,43 @@ RUNNERS: Final[Mapping[str, Callable[[str], None]]] = {
 """What is done with the blocks that are no commands; text is what a command prints."""
 
 
+BEGINNINGS: Final = Counter(
+    next((block.text for block in blocks(page_of(name)) if block.language == "sh"), "")
+    for name in PAGES
+)
+"""How many pages begin with the same commands."""
+
+
+class Beginnings:
+    """Folders as commands left them with which several pages begin, so that they run once."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._left: dict[str, Path] = {}
+
+    def run(self, session: Session, block: Block, folder: Path) -> None:
+        """Run the first commands of a page, or copy what they left for another one."""
+        if block.text in self._left:
+            shutil.copytree(self._left[block.text], folder, symlinks=True, dirs_exist_ok=True)
+            return
+        session.run(block)
+        if BEGINNINGS[block.text] > 1:
+            left = self._folder / str(len(self._left))
+            shutil.copytree(folder, left, symlinks=True, ignore=lambda *_: (".venv", "bin"))
+            self._left[block.text] = left
+
+
+@pytest.fixture(scope="module")
+def beginnings(tmp_path_factory: pytest.TempPathFactory) -> Beginnings:
+    return Beginnings(tmp_path_factory.mktemp("beginnings"))
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The ground that demonstrations build, for the next one."""
+    return tmp_path_factory.mktemp("scenes")
+
+
 @pytest.mark.system
 @pytest.mark.timeout(PAGE_TIMEOUT_S)
 @pytest.mark.parametrize(
@@ -231,24 +281,33 @@ RUNNERS: Final[Mapping[str, Callable[[str], None]]] = {
         if list(blocks(page_of(name)))
     ],
 )
-def test_the_blocks_of_a_page_run_in_their_order(name: str, tmp_path: Path) -> None:
+def test_the_blocks_of_a_page_run_in_their_order(
+    name: str, tmp_path: Path, beginnings: Beginnings, scenes: Path
+) -> None:
     listed = list(blocks(page_of(name)))
+    if name in FLIGHTS:
+        (tmp_path / "flights").mkdir()
+        (tmp_path / "flights/scenes").symlink_to(scenes)
     if "0000SET" in page_of(name):
         if not RECORDED.is_dir():
             pytest.skip("needs recorded exposures in ../shared/data/rededge")
         (tmp_path / "0000SET").symlink_to(RECORDED / "0000SET")
     with ExitStack() as stack:
-        inside = stack.enter_context(own_network()) if name in OWN_NETWORK else ()
+        inside = stack.enter_context(network_of(name))
         if inside:
             allow_as_root(tmp_path)
         session = stack.enter_context(Session(tmp_path, inside))
-        for block in listed:
+        for number, block in enumerate(listed):
             session.enter(block.section)
             if block.language != "sh":
                 RUNNERS[block.language](block.text)
             elif "until" in block.options:
                 session.start(block)
-            elif "needs" not in block.options:
+            elif "needs" in block.options:
+                continue
+            elif number == 0:
+                beginnings.run(session, block, tmp_path)
+            else:
                 session.run(block)
 
 
