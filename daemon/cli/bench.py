@@ -12,8 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from daemon.cli.options import AsJson
-from daemon.terminal.console import Console
-from daemon.terminal.tables import light_table
+from daemon.terminal.console import Console, light_table
 
 HELP = """Time the pipeline on one emulated exposure of a rig and compare it with other software.
 

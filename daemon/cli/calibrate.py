@@ -20,8 +20,7 @@ from daemon.cli import (
 )
 from daemon.cli.exit_status import status_of
 from daemon.cli.options import AsJson
-from daemon.terminal.console import Console
-from daemon.terminal.tables import light_table
+from daemon.terminal.console import Console, light_table
 
 if TYPE_CHECKING:
     from daemon.postflight.calibration.thermal_calibration import ThermalRecords

@@ -12,8 +12,7 @@ from rich.progress import Progress
 
 from daemon.cli.calibration_output import publish_calibration
 from daemon.cli.options import AsJson, NewFolder
-from daemon.terminal.console import Console
-from daemon.terminal.tables import light_table
+from daemon.terminal.console import Console, light_table
 
 HELP = """Estimate boresight, lever arm and time offset from a controlled block.
 

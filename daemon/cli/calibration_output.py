@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from daemon.terminal.console import Console
-from daemon.terminal.tables import light_table
+from daemon.terminal.console import Console, light_table
 
 if TYPE_CHECKING:
     from daemon.postflight.calibration.calibration_report import (

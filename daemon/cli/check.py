@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.text import Text
@@ -16,7 +16,7 @@ from daemon.cli.exit_status import ExitStatus
 from daemon.cli.find_heads import find_heads
 from daemon.cli.find_ports import find as find_devices
 from daemon.cli.options import AsJson
-from daemon.terminal.console import Console
+from daemon.terminal.console import Console, light_table
 
 if TYPE_CHECKING:
     from daemon.configuration.model import Configuration
@@ -82,10 +82,9 @@ def check(
 
 def check_flight(config: Path, *, fire: bool, as_json: bool) -> None:
     """Look at everything a flight with this configuration needs, and print it."""
-    from daemon.cli.link_tables import print_links
     from daemon.configuration.service_file import load
     from daemon.onboard.preflight.check_results import CheckOutcome, worst_outcome
-    from daemon.onboard.preflight.link_tables import link_tables
+    from daemon.onboard.preflight.prerequisites import link_tables
 
     configuration, rig = load(config)
     console = Console(stderr=as_json)
@@ -116,7 +115,7 @@ def collect_results(
     configuration: Configuration, rig: Rig, config: Path, *, fire: bool
 ) -> list[CheckResult]:
     """All findings: of the running service where there is one, else of what `run` would build."""
-    from daemon.mission.interrupted_mission import interrupted_mission
+    from daemon.mission.mirror.mirror_startup import interrupted_mission
     from daemon.onboard.monitoring.access.service_query import query_service
     from daemon.onboard.preflight.kernel_counters import read_counters
     from daemon.onboard.preflight.network_diagnosis import kernel_results, network_diagnosis
@@ -153,3 +152,40 @@ def _print_tree(console: Console, config: Path, rig: str, results: Sequence[Chec
             label = ": ".join(filter(None, (result.name, result.sentence or found)))
             branch.add(Text.assemble((outcome, COLOURS[outcome]), " ", label))
     console.print(tree)
+
+
+def print_links(console: Console, links: Sequence[Mapping[str, Any]]) -> None:
+    """Print the budget of every link.
+
+    Args:
+        console: where.
+        links: as `daemon.onboard.preflight.prerequisites.link_tables` returns them.
+    """
+    for link in links:
+        table = light_table(
+            _title(link),
+            ("head",),
+            ("packet B", "packets", "MB", "Mbit/s", "pause us", "start ms", "end ms"),
+        )
+        for head in link["heads"]:
+            end_s = head["transfer_delay_us"] * 1e-6 + head["transfer_s"]
+            table.add_row(
+                head["head"],
+                str(head["packet_size"]),
+                str(head["packets"]),
+                f"{head['wire_bytes'] / 1e6:.2f}",
+                f"{head['rate_mbps']:.1f}",
+                f"{head['packet_delay_us']:.1f}",
+                f"{head['transfer_delay_us'] * 1e-3:.1f}",
+                f"{end_s * 1e3:.0f}",
+            )
+        console.print(table)
+
+
+def _title(link: Mapping[str, Any]) -> str:
+    verdict = "fits" if link["fits"] else "does not fit"
+    return (
+        f"{link['interface']}, {link['rate_mbps']:g} Mbit/s: {link['wire_bytes'] / 1e6:.1f} MB on "
+        f"the wire take {link['needed_s']:.2f} s of {link['interval_s']:g} s ({verdict}, "
+        f"{link['usable_s']:.2f} s are usable)"
+    )

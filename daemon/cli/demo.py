@@ -31,8 +31,7 @@ from daemon.cli.sim import (
     simulator_arguments,
     write_service_file,
 )
-from daemon.terminal.console import Console
-from daemon.terminal.tables import light_table
+from daemon.terminal.console import Console, light_table
 from drivers.base.extras import require
 from processing.quality.figures import QualityFigures
 from processing.quality.figures.circumstances import DcFigures

@@ -6,7 +6,11 @@ The help pages, the manual page and docs/reference/exit-status.md are rendered f
 from __future__ import annotations
 
 import enum
-from typing import Final
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from daemon.mission.exposure_batch import ExposureFailure
 
 
 class ExitStatus(enum.IntEnum):
@@ -115,3 +119,25 @@ def help_line(name: str) -> str:
     """The last line of a command's help page."""
     listed = "; ".join(f"{status:d} {meaning}" for status, meaning in statuses_of(name).items())
     return f"Exit status: {listed}."
+
+
+def exit_if_failed(failures: Sequence[ExposureFailure]) -> None:
+    """List the exposures that failed on stderr; a command without any continues.
+
+    Raises:
+        typer.Exit: with status 1, where an exposure failed.
+    """
+    import typer
+    from rich.text import Text
+
+    from daemon.terminal.console import Console, light_table
+
+    if not failures:
+        return
+    count = len({failure.exposure for failure in failures})
+    many = f"{count} exposures" if count > 1 else "1 exposure"
+    table = light_table(f"{many} failed; every other one is done", ("exposure", "cause"), ())
+    for failure in failures:
+        table.add_row(f"{failure.exposure} ", Text(failure.cause, overflow="fold"))
+    Console(stderr=True).print(table)
+    raise typer.Exit(ExitStatus.PROBLEM)

@@ -12,8 +12,7 @@ import typer
 
 from daemon.cli.exit_status import ExitStatus
 from daemon.cli.options import AsJson
-from daemon.terminal.console import Console
-from daemon.terminal.tables import light_table
+from daemon.terminal.console import Console, light_table
 
 if TYPE_CHECKING:
     from daemon.onboard.flight.event_table import EventDefinition

@@ -9,10 +9,9 @@ from typing import Annotated
 import typer
 from rich.progress import Progress
 
-from daemon.cli.exposure_failures import exit_if_failed
+from daemon.cli.exit_status import exit_if_failed
 from daemon.cli.options import AsJson
-from daemon.terminal.console import Console
-from daemon.terminal.tables import light_table
+from daemon.terminal.console import Console, light_table
 from drivers.base.extras import require
 
 ORIENTATION_HELP = """Compute the exterior orientation of every cone of every exposure, at mid-exposure.

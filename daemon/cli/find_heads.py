@@ -8,8 +8,7 @@ from typing import Any, NoReturn
 import typer
 
 from daemon.cli.exit_status import status_of
-from daemon.terminal.console import Console
-from daemon.terminal.tables import light_table
+from daemon.terminal.console import Console, light_table
 
 
 def find_heads(*, as_json: bool) -> NoReturn:

@@ -13,8 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from daemon.cli.exit_status import status_of
-from daemon.terminal.console import Console
-from daemon.terminal.tables import light_table
+from daemon.terminal.console import Console, light_table
 from drivers.base.extras import MissingExtraError, require
 
 if TYPE_CHECKING:

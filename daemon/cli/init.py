@@ -20,8 +20,7 @@ from daemon.cli.init_questions import Questions
 from daemon.cli.options import AsJson
 from daemon.initialization.new_configuration import refuse_existing, write_configuration
 from daemon.initialization.provisional import assumptions
-from daemon.terminal.console import Console
-from daemon.terminal.tables import light_table
+from daemon.terminal.console import Console, light_table
 
 if TYPE_CHECKING:
     from daemon.initialization.answers import Answers

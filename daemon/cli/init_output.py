@@ -10,8 +10,7 @@ from daemon.cli.check import COLOURS
 from daemon.cli.init_answers import optics
 from daemon.initialization.answers import Answers, field_of_view_deg
 from daemon.initialization.provisional import Assumption
-from daemon.terminal.console import Console
-from daemon.terminal.tables import light_table
+from daemon.terminal.console import Console, light_table
 
 if TYPE_CHECKING:
     from daemon.onboard.preflight.check_results import CheckResult

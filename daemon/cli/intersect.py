@@ -9,10 +9,9 @@ from typing import Annotated
 
 import typer
 
-from daemon.cli.exposure_failures import exit_if_failed
+from daemon.cli.exit_status import exit_if_failed
 from daemon.cli.options import AsJson, AttitudeSigma, Crs, MountFile, PositionSigma, Trajectory
-from daemon.terminal.console import Console
-from daemon.terminal.tables import light_table
+from daemon.terminal.console import Console, light_table
 
 HELP = """Compute ground points from measurements in two or more oriented images, with accuracy.
 

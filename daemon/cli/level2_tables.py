@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from daemon.terminal.console import Console
-from daemon.terminal.tables import light_table
+from daemon.terminal.console import Console, light_table
 from processing.quality.figures import QualityFigures
 from processing.quality.figures.stitching import (
     AdjustmentFigures,

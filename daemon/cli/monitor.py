@@ -19,7 +19,7 @@ from rich.text import Text
 from daemon import DaemonError
 from daemon.cli.exit_status import ExitStatus
 from daemon.onboard.monitoring.flight_state import EXPOSURES_MAX, PARTS, PREVIEW_PARTS
-from daemon.terminal.tables import light_table
+from daemon.terminal.console import light_table
 from processing.rig.problem_sentences import findings_of, sentences
 
 if TYPE_CHECKING:

@@ -11,14 +11,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.progress import Progress
 
-from daemon.cli.exposure_failures import exit_if_failed
+from daemon.cli.exit_status import exit_if_failed
 from daemon.cli.options import AsJson
 from daemon.configuration.model import ConfigurationError
 from daemon.mission.exposure_batch import for_each_exposure
 from daemon.mission.layout import Mission
 from daemon.mission.store.publication import sweep
-from daemon.terminal.console import Console
-from daemon.terminal.tables import light_table
+from daemon.terminal.console import Console, light_table
 
 if TYPE_CHECKING:
     from daemon.products.level3 import PansharpenedExposure

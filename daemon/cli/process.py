@@ -12,7 +12,7 @@ import typer
 from pydantic import ValidationError
 from rich.progress import Progress
 
-from daemon.cli.exposure_failures import exit_if_failed
+from daemon.cli.exit_status import exit_if_failed
 from daemon.cli.level2_tables import print_reports
 from daemon.cli.options import AsJson
 from daemon.configuration.model import ConfigurationError, PlanSection, ProcessingSection

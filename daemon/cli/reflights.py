@@ -8,11 +8,9 @@ from typing import Annotated
 
 import typer
 
-from daemon.cli.exit_status import status_of
-from daemon.cli.exposure_failures import exit_if_failed
+from daemon.cli.exit_status import exit_if_failed, status_of
 from daemon.cli.options import AsJson
-from daemon.terminal.console import Console
-from daemon.terminal.tables import light_table
+from daemon.terminal.console import Console, light_table
 
 HELP = """List the segments of the plan that must be flown again.
 

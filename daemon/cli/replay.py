@@ -17,8 +17,7 @@ from daemon.cli.options import AsJson
 from daemon.cli.process import as_flown
 from daemon.configuration.model import Configuration, ConfigurationError
 from daemon.mission.layout import Mission, MissionError
-from daemon.terminal.console import Console
-from daemon.terminal.tables import light_table
+from daemon.terminal.console import Console, light_table
 
 HELP = """Replay a recorded mission through the code and compare the results.
 

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from daemon.cli.exposure_failures import exit_if_failed
+from daemon.cli.exit_status import exit_if_failed
 from daemon.cli.options import AsJson, lock_for
 from daemon.terminal.console import Console
 

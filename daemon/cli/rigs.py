@@ -10,8 +10,7 @@ import typer
 
 from daemon.cli.options import AsJson
 from daemon.mission.store.durable import replace_file
-from daemon.terminal.console import Console
-from daemon.terminal.tables import light_table
+from daemon.terminal.console import Console, light_table
 from processing.rig import Rig, find_rig, load_rig, shipped_rigs
 
 app = typer.Typer(

@@ -40,7 +40,7 @@ def run(
     ] = False,
 ) -> None:
     from daemon.configuration.service_file import load
-    from daemon.mission.interrupted_mission import interrupted_mission
+    from daemon.mission.mirror.mirror_startup import interrupted_mission
     from daemon.onboard.preflight.resumption import close_interrupted
     from daemon.onboard.service.processes import die_with_parent
     from daemon.onboard.service.service import Service

@@ -9,8 +9,7 @@ from typing import Annotated
 import typer
 
 from daemon.cli.options import AsJson
-from daemon.terminal.console import Console
-from daemon.terminal.tables import light_table
+from daemon.terminal.console import Console, light_table
 
 app = typer.Typer(
     help="""Create and revoke access tokens for the API and the operator's page.

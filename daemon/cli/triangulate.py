@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 import typer
 from rich.progress import Progress
 
-from daemon.cli.exposure_failures import exit_if_failed
+from daemon.cli.exit_status import exit_if_failed
 from daemon.cli.options import (
     AsJson,
     AttitudeSigma,

@@ -1,7 +1,7 @@
 """Apply one action to every exposure of a mission, and continue after failures.
 
 Every command over the exposures of a mission uses this. Failures are returned with their causes;
-the command lists them at its end (`daemon.cli.exposure_failures`).
+the command lists them at its end (`daemon.cli.exit_status`).
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ from daemon.products.product_files import Contents, FramesRead
 from processing.quality.evaluation import evaluate
 from processing.quality.figures import QualityFigures
 from processing.quality.report import NO_FLAGS, Flag, as_json
-from processing.radiometry.histogram import sampled_histogram
+from processing.radiometry.exposure_control import sampled_histogram
 from processing.rig import Rig, Sensor
 
 

@@ -10,8 +10,10 @@ import unicodedata
 from collections.abc import Iterable
 from typing import Any
 
+from rich import box
 from rich import console as rich_console
 from rich.segment import Segment
+from rich.table import Table
 
 _REPLACED = {code: 0x2400 + code for code in range(0x20) if code not in (0x09, 0x0A)} | {
     0x7F: 0x2421,
@@ -55,3 +57,13 @@ class Console(rich_console.Console):
                 yield Segment(visible(segment.text), segment.style)
             else:
                 yield segment
+
+
+def light_table(title: str, left: tuple[str, ...], right: tuple[str, ...]) -> Table:
+    """A table with left-aligned words and then right-aligned figures."""
+    table = Table(title=title, title_justify="left", box=box.SIMPLE, pad_edge=False, padding=0)
+    for heading in left:
+        table.add_column(heading)
+    for heading in right:
+        table.add_column(heading, justify="right", no_wrap=True)
+    return table

@@ -6,8 +6,10 @@ rig and are decided here. A kind of rig implements the stages.
 
 from __future__ import annotations
 
+import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
 
@@ -22,7 +24,6 @@ from processing.geometry.conditions import (
     condition_figures,
     usable_temperatures,
 )
-from processing.pipelines.stopwatch import Stopwatch
 from processing.quality.evaluation import evaluate
 from processing.quality.figures import FigureGroup, QualityFigures
 from processing.quality.figures.stitching import MethodFigures
@@ -42,6 +43,30 @@ class StageSettings:
     threads: int = 2
     thresholds: Thresholds = field(default_factory=Thresholds)
     requirements: QualityRequirements = field(default_factory=QualityRequirements)
+
+
+class Stopwatch:
+    """`seconds` by the name of each stage that has ended, in order; a stage may be in parts."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Time what is done inside a `with` block.
+
+        Args:
+            name: of the stage; the seconds of several blocks of one name are added.
+
+        Yields:
+            Nothing.
+        """
+        began = time.perf_counter()
+        try:
+            yield
+        finally:
+            seconds = time.perf_counter() - began
+            self.seconds[name] = self.seconds.get(name, 0.0) + seconds
 
 
 @dataclass(frozen=True)

@@ -408,8 +408,8 @@ def light_that_changes_is_followed() -> dict[str, object]:
         ExposureLimits,
         ExposureSettings,
         next_settings,
+        sampled_histogram,
     )
-    from processing.radiometry.histogram import sampled_histogram
     from sim_hw.gige.gige_head import ExposureRequest, FrameSize, GigeHead, HeadIdentity
     from sim_hw.world.world_clock import FreeRunningClock
 

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any, Final
 
 from daemon.configuration.model import Configuration, HeadDeviceSection
-from daemon.onboard.capture.interval import exposure_interval_s
 from daemon.onboard.capture.link_budget import HeadDemand, Link, LinkPlan, plan_link
 from daemon.onboard.capture.routes import network_heads, parse_routes, route_to
 from daemon.onboard.preflight.check_results import CheckOutcome, CheckResult, failed, passed
@@ -246,3 +245,12 @@ def _demand(head: HeadDeviceSection, rig: Rig, mtu: int) -> HeadDemand:
     largest = int(settings.get("packet_size_limit", PACKET_SIZE_LIMIT))
     packet_size = int(settings.get("packet_size", 0)) or min(largest, mtu)
     return HeadDemand(head.sensor, -(-pixels * bits // 8) + CHUNKS_NBYTES, packet_size)
+
+
+def exposure_interval_s(configuration: Configuration, rig: Rig) -> float:
+    """The shortest time between exposures that the trigger asks for, at the planned speed."""
+    trigger = configuration.trigger
+    interval_s = trigger.interval_s
+    if trigger.distance_m is not None:
+        interval_s = trigger.distance_m / configuration.plan.ground_speed_mps
+    return max(interval_s, rig.frame_interval_s)

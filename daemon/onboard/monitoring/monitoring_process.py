@@ -42,7 +42,7 @@ from daemon.onboard.monitoring.mavlink.camera import MavlinkCamera
 from daemon.onboard.monitoring.mavlink.datagrams import send
 from daemon.onboard.monitoring.monitoring_prerequisites import WatchError, check_monitoring, listen
 from daemon.onboard.monitoring.previews import read_preview
-from daemon.onboard.monitoring.resource_limits import apply_resource_limits
+from daemon.onboard.monitoring.process_restrictions import apply_resource_limits
 from daemon.onboard.monitoring.web.api import AccessSettings, create_app
 from daemon.onboard.monitoring.web.connections import Connections, ListeningSocket
 from daemon.onboard.monitoring.web.listener import ConnectionListener

@@ -12,9 +12,14 @@ from functools import partial
 from pathlib import Path
 
 from daemon.configuration.model import Configuration
-from daemon.mission.interrupted_mission import disks_of, interrupted_mission
 from daemon.mission.layout import Mission
-from daemon.mission.mirror.mirror_startup import FoundDisks, begin_mirrored, resume_mirrored
+from daemon.mission.mirror.mirror_startup import (
+    FoundDisks,
+    begin_mirrored,
+    disks_of,
+    interrupted_mission,
+    resume_mirrored,
+)
 from daemon.onboard.preflight.check_results import CheckOutcome
 from daemon.onboard.preflight.prerequisites import (
     CHECKS_AFTER_RESTART,

@@ -12,7 +12,7 @@ import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Final, TypeAlias
+from typing import Any, Final, TypeAlias
 
 from daemon.configuration.model import Configuration
 from daemon.mission.store import durable
@@ -21,8 +21,12 @@ from daemon.mission.store.disk_space import LEVEL2_SHARE
 from daemon.mission.store.health import read_health
 from daemon.onboard.capture.devices import frame_nbytes
 from daemon.onboard.capture.head_network import head_network
-from daemon.onboard.capture.interval import exposure_interval_s
-from daemon.onboard.capture.link_settings import link_budget
+from daemon.onboard.capture.link_settings import (
+    exposure_interval_s,
+    link_budget,
+    link_plans,
+    plan_as_json,
+)
 from daemon.onboard.preflight.check_results import CheckOutcome, CheckResult, failed, passed
 from daemon.onboard.preflight.import_names import import_names
 from drivers.base import registry
@@ -292,3 +296,8 @@ def measure_write_s(root: Path, nbytes: int) -> float:
 
 def _today() -> datetime.date:
     return datetime.datetime.now(datetime.UTC).date()
+
+
+def link_tables(configuration: Configuration, rig: Rig) -> list[dict[str, Any]]:
+    """The budget of every interface with heads, as plain JSON types."""
+    return [plan_as_json(plan) for plan in link_plans(configuration, rig)[0]]

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from daemon.postflight.adjustment.project import CheckPoints
-from daemon.terminal.console import Console
-from daemon.terminal.tables import light_table
+from daemon.terminal.console import Console, light_table
 from processing.bundle.adjust import Adjustment
 from processing.bundle.adjustment_results import (
     PointDifferences,

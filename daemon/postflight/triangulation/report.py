@@ -22,8 +22,7 @@ from daemon.postflight.adjustment.csv_tables import ProjectError, write_table
 from daemon.postflight.adjustment.project import Project
 from daemon.postflight.adjustment.project_writer import fill_results, new_project
 from daemon.postflight.triangulation.triangulation import ImageBlock
-from daemon.terminal.console import Console
-from daemon.terminal.tables import light_table
+from daemon.terminal.console import Console, light_table
 from processing.bundle.adjust import Adjustment
 from processing.bundle.adjustment_results import (
     check_point_differences,

@@ -16,13 +16,13 @@ from typing import Any, Final
 
 from drivers.cameras.aravis.camera_access import local_interface, open_camera
 from drivers.cameras.aravis.feature_access import FeatureError, Features
-from drivers.cameras.aravis.feature_value import FeatureValue
 from drivers.cameras.aravis.formats import packing_of, packing_problem
 from drivers.cameras.aravis.gvcp import GVCP_PORT, is_ip_address
 from drivers.cameras.aravis.head_configuration import HeadConfiguration
 from drivers.cameras.aravis.library import aravis, aravis_error, message_of
 from drivers.cameras.aravis.packet_filter import ControlSocketFilter, SocketCapture
 from drivers.cameras.aravis.packet_pacing import write_pacing
+from drivers.cameras.aravis.presets import FeatureValue
 from drivers.cameras.aravis.ptp import PtpFeatures
 from drivers.cameras.aravis.settings import AravisSettings
 from drivers.cameras.pixels import Packing, packed_nbytes

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 from drivers import DriverError
-from drivers.cameras.aravis.feature_value import FeatureValue
 from drivers.cameras.aravis.library import aravis, aravis_error, message_of
+from drivers.cameras.aravis.presets import FeatureValue
 
 RELATIVE_TOLERANCE: Final = 1e-3
 """Between a number that was written and the number read back; heads round to their steps."""

@@ -13,10 +13,9 @@ from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 from drivers.cameras.aravis.feature_access import FeatureError, Features
-from drivers.cameras.aravis.feature_value import FeatureValue
 from drivers.cameras.aravis.formats import widest_format
 from drivers.cameras.aravis.neutral_features import switch_off
-from drivers.cameras.aravis.presets import preset_features
+from drivers.cameras.aravis.presets import FeatureValue, preset_features
 from drivers.cameras.aravis.settings import AravisSettings
 
 EXPOSURE_TIMES: Final = ("ExposureTime", "ExposureTimeAbs", "ExposureTimeRaw", "ExposureValue")

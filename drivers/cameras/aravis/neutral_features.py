@@ -14,7 +14,7 @@ from collections.abc import Collection, Mapping
 from typing import Final
 
 from drivers.cameras.aravis.feature_access import FeatureError, Features
-from drivers.cameras.aravis.feature_value import FeatureValue
+from drivers.cameras.aravis.presets import FeatureValue
 
 NEUTRAL: Final[tuple[tuple[str, FeatureValue], ...]] = (
     ("SequencerMode", "Off"),

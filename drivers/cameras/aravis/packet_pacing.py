@@ -12,7 +12,7 @@ import math
 from typing import Final
 
 from drivers.cameras.aravis.feature_access import FeatureError, Features
-from drivers.cameras.aravis.feature_value import FeatureValue
+from drivers.cameras.aravis.presets import FeatureValue
 from drivers.cameras.aravis.settings import AravisSettings
 
 ETHERNET_NBYTES: Final = 38

@@ -10,7 +10,8 @@ import tomllib
 from importlib import resources
 from typing import Final
 
-from drivers.cameras.aravis.feature_value import FeatureValue
+FeatureValue = bool | int | float | str
+"""The value of a GenICam feature, as configurations and records hold it."""
 
 SUFFIX: Final = ".toml"
 

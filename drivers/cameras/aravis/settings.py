@@ -6,9 +6,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from drivers.base.settings import Configured, Setting
-from drivers.cameras.aravis.feature_value import FeatureValue
 from drivers.cameras.aravis.formats import packing_of
-from drivers.cameras.aravis.presets import preset_names
+from drivers.cameras.aravis.presets import FeatureValue, preset_names
 
 
 class AravisSettings(Configured):

@@ -15,8 +15,8 @@ from processing.pipelines.exposure_pipeline import (
     Judgement,
     Stages,
     StageSettings,
+    Stopwatch,
 )
-from processing.pipelines.stopwatch import Stopwatch
 from processing.quality.figures.circumstances import GeometryFigures
 from processing.quality.figures.image import SignalFigures, ValidAreaFigures
 from processing.quality.figures.stitching import MethodFigures
@@ -114,7 +114,7 @@ def test_thresholds_requirements_and_threads_are_those_of_the_settings() -> None
 def test_parts_of_a_stage_are_added_up(monkeypatch: pytest.MonkeyPatch) -> None:
     instants_s = iter([1.0, 1.5, 2.0, 4.0, 7.0, 7.25])
     monkeypatch.setattr(
-        "processing.pipelines.stopwatch.time.perf_counter", lambda: next(instants_s)
+        "processing.pipelines.exposure_pipeline.time.perf_counter", lambda: next(instants_s)
     )
     clock = Stopwatch()
     for stage in ("radiometry", "resampling", "radiometry"):

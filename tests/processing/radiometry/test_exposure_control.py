@@ -11,14 +11,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from processing.radiometry.exposure_control import (
+    BINS,
     ExposureLimits,
     ExposureSettings,
     light_factor,
     next_settings,
+    sampled_histogram,
     settings_for,
     smear_px,
 )
-from processing.radiometry.histogram import BINS, sampled_histogram
 from processing.rig import find_rig
 from sim_hw.world.electronics import Electronics, true_sensor
 

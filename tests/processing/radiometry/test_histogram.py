@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from processing.radiometry.histogram import BINS, EVERY, sampled_histogram
+from processing.radiometry.exposure_control import BINS, EVERY, sampled_histogram
 
 
 @pytest.mark.parametrize(("word_bits", "step"), [(12, 64), (16, 1024), (8, 4)])

@@ -15,9 +15,9 @@ from typing import Any
 import pytest
 
 from daemon.configuration.model import PlanSection, WatchSection
-from daemon.onboard.monitoring import landlock
+from daemon.onboard.monitoring import process_restrictions
 from daemon.onboard.monitoring.access.tokens import add_token
-from daemon.onboard.monitoring.resource_limits import apply_resource_limits
+from daemon.onboard.monitoring.process_restrictions import apply_resource_limits
 from daemon.onboard.service.messages import Answer, ServiceCommand, ServiceEvent, Stop
 from daemon.onboard.service.page_connection import PageConnection, PageProcess
 from tests.daemon.onboard.monitoring import flight_events
@@ -57,9 +57,12 @@ def test_a_confined_page_process_starts_no_program_and_reaches_no_other_process(
     tmp_path: Path,
 ) -> None:
     libc_abi = ctypes.CDLL(None).syscall(
-        landlock.CREATE_RULESET, None, ctypes.c_size_t(0), landlock.ABI_VERSION
+        process_restrictions.CREATE_RULESET,
+        None,
+        ctypes.c_size_t(0),
+        process_restrictions.ABI_VERSION,
     )
-    if libc_abi < landlock.SIGNALS_SINCE_ABI:
+    if libc_abi < process_restrictions.SIGNALS_SINCE_ABI:
         pytest.skip("needs Linux 6.12 or newer with Landlock")
     child = PageProcess("watch", f"{__name__}:attacking", (str(tmp_path),), {})
     sentences: list[str] = []

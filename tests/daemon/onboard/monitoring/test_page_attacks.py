@@ -21,7 +21,7 @@ from daemon.onboard.monitoring.http_limits import (
     MESSAGE_MAX_BYTES,
     RECEIVED_BURST_BYTES,
 )
-from daemon.onboard.monitoring.resource_limits import (
+from daemon.onboard.monitoring.process_restrictions import (
     FILES_MAX,
     MEMORY_MAX_BYTES,
     OOM_SCORE,

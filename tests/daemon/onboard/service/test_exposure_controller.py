@@ -13,7 +13,7 @@ import pytest
 from daemon.configuration.service_file import from_mapping
 from daemon.onboard.capture.exposure_controller import PAN, ExposureController
 from daemon.onboard.service.messages import ApplyExposureSettings
-from processing.radiometry.histogram import BINS
+from processing.radiometry.exposure_control import BINS
 from tests.daemon.configuration.test_configuration import GOOD
 from tests.daemon.onboard.flight.test_flight import nav
 

@@ -11,7 +11,7 @@ import pytest
 
 from daemon.configuration.model import Configuration
 from daemon.configuration.service_file import load
-from daemon.onboard.capture.interval import exposure_interval_s
+from daemon.onboard.capture.link_settings import exposure_interval_s
 from daemon.onboard.preflight import prerequisites
 from daemon.onboard.preflight.check_results import CheckOutcome, CheckResult
 from daemon.onboard.preflight.prerequisites import (

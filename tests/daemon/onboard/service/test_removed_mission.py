@@ -12,8 +12,8 @@ import pytest
 
 from daemon import cli
 from daemon.configuration.service_file import load
-from daemon.mission.interrupted_mission import interrupted_mission
 from daemon.mission.layout import CURRENT_FILE, Mission
+from daemon.mission.mirror.mirror_startup import interrupted_mission
 from daemon.onboard.service.startup import create_mission
 from tests.daemon.onboard.service.flight_parts import Planted
 
