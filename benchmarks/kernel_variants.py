@@ -30,6 +30,7 @@ RIGS = ("ultracam-x-mini", "midas-mini")
 _IN_EMPTY_CACHE = "in-empty-cache"
 
 
+# numba states no types.
 class _Recorder(event.Listener):  # type: ignore[misc]
     """Argument types by kernel, and the processor time without that of other kernels, s."""
 

@@ -20,7 +20,7 @@ ERROR_ROOTS = {
     "processing": "ProcessingError",
     "sim_hw": "SimulatorError",
 }
-"""Root of the exception classes of each package, in its module `errors`."""
+"""Root of the exception classes of each package, in its `__init__.py`."""
 
 
 @pytest.mark.parametrize("package", PACKAGES)
@@ -113,3 +113,19 @@ def test_no_package_raises_a_bare_exception() -> None:
         for path in (ROOT / package).rglob("*.py"):
             found = re.search(r"raise (Base)?Exception\b", path.read_text())
             assert not found, f"{path.relative_to(ROOT)} raises Exception; raise an own class"
+
+
+def test_every_ignored_type_error_has_its_reason_next_to_it() -> None:
+    """A comment in the line before, or behind the mark."""
+    bare = []
+    for path in sorted(
+        path
+        for folder in (*PACKAGES, "benchmarks", "docs", "tests")
+        for path in (ROOT / folder).rglob("*.py")
+    ):
+        lines = path.read_text("utf-8").splitlines()
+        for before, line in zip(["", *lines], lines, strict=False):
+            mark = re.search(r"# type: ignore\[[\w, -]+\](?P<reason>.*)", line)
+            if mark and "#" not in mark["reason"] and "#" not in before:
+                bare.append(f"{path.relative_to(ROOT)}: {line.strip()}")
+    assert not bare, "\n".join(bare)

@@ -47,6 +47,7 @@ def read_record(
     """
     found = list(findings)
     try:
+        # mypy takes no unbound type parameter for a hashable argument.
         adapter: TypeAdapter[T] = _adapter(kind)  # type: ignore[arg-type]
         record = adapter.validate_python(content)
     except ValidationError as error:

@@ -15,6 +15,8 @@ import math
 from typing import Final
 
 import pyproj
+
+# pyproj states no types for this module.
 from pyproj.network import set_network_enabled  # type: ignore[attr-defined]
 
 set_network_enabled(active=False)

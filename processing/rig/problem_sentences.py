@@ -57,6 +57,7 @@ class ProblemList:
 
     def __init__(self, problems: Sequence[str]) -> None:
         self.problems = tuple(problems)
+        # The exception that follows in the order of bases takes the sentence.
         super().__init__("\n".join(problems))  # type: ignore[call-arg]
 
 

@@ -62,6 +62,7 @@ def is_nested_deeper(content: object, depth: int) -> bool:
         level = [
             inner
             for outer in level
+            # mypy does not narrow the type inside a comprehension.
             for inner in (outer.values() if isinstance(outer, Mapping) else outer)  # type: ignore[attr-defined]
             if isinstance(inner, Mapping | list)
         ]

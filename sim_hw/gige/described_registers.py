@@ -11,6 +11,7 @@ import itertools
 import struct
 import threading
 from collections import defaultdict
+from typing import Literal
 
 from sim_hw.gige import features as at
 from sim_hw.gige.genicam.description_file import Description, Node
@@ -343,7 +344,7 @@ class DescribedRegisters:
         length = self.nodes.length(name)
         if node.kind not in INTEGER_REGISTERS or not address <= start <= address + len(data):
             return True
-        order = "big" if is_big_endian(node) else "little"
+        order: Literal["big", "little"] = "big" if is_big_endian(node) else "little"
         shift, bits = bit_field(node, length)
         mask = (1 << bits) - 1 << shift
         before = self.memory.read(start, length)
@@ -351,8 +352,8 @@ class DescribedRegisters:
         offset = start - address
         part = data[offset : offset + length]
         after[: len(part)] = part
-        old = int.from_bytes(before, order)  # type: ignore[arg-type]
-        new = int.from_bytes(after, order)  # type: ignore[arg-type]
+        old = int.from_bytes(before, order)
+        new = int.from_bytes(after, order)
         return (old ^ new) & mask != 0
 
     def _within_limits(self, owners: list[str]) -> set[str]:

@@ -39,6 +39,7 @@ def gnss(tow_s: float = TOW_S, week: int = WEEK, offset_s: float = 18.0, **more:
     channels = bytes(20)
     body = struct.pack("<bBH", 5, 14, len(channels)) + channels
     body += struct.pack("<3fHIdffHI", 0.9, 1.2, 0.0, 0, week, offset_s, 0.1, 46.0, 18, 0)
+    # Any field of the group by name.
     return group(3, body, tow_s, **more)  # type: ignore[arg-type]
 
 
@@ -49,6 +50,7 @@ def pps(status: int = 2) -> bytes:
 def nav(tow_s: float = TOW_S, alignment: int = 0, latitude: float = 48.0, **more: object) -> bytes:
     body = struct.pack("<3d3f4d8fB", latitude, 11.0, 1500.0, 60.0, 5.0, -1.0, 1.5, -2.5, 359.0, 0.0,
                        4.7, 60.2, *[0.0] * 6, alignment)  # fmt: skip
+    # Any field of the group by name.
     return group(1, body, tow_s, **more)  # type: ignore[arg-type]
 
 
@@ -57,6 +59,7 @@ def performance() -> bytes:
 
 
 def event(pulse: int, tow_s: float = TOW_S, number: int = 5, **more: object) -> bytes:
+    # Any field of the group by name.
     return group(number, struct.pack("<I", pulse), tow_s, **more)  # type: ignore[arg-type]
 
 

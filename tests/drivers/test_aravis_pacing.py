@@ -120,12 +120,14 @@ def settings(**more: object) -> Any:
 
 def test_a_step_of_the_head_rounds_the_pause_up() -> None:
     head = FewFeatures(GevSCPD=(0, 10**9, 7000))
+    # Only the used features of a camera exist.
     written, refusals = write_pacing(head, settings(stream_rate_mbps=100.0), 1462, 10**9)  # type: ignore[arg-type]
     assert (written, refusals) == ({"GevSCPD": 126_000}, [])
 
 
 def test_a_head_without_a_pause_is_limited_by_its_throughput() -> None:
     head = FewFeatures(DeviceLinkThroughputLimit=(1000, 10**9, 900))
+    # Only the used features of a camera exist.
     written, refusals = write_pacing(head, settings(stream_rate_mbps=100.0), 1462, 10**9)  # type: ignore[arg-type]
     held = written["DeviceLinkThroughputLimit"]
     assert refusals == []
@@ -136,6 +138,7 @@ def test_a_head_without_a_pause_is_limited_by_its_throughput() -> None:
 def test_a_head_in_the_mode_of_bytes_per_second_is_limited_by_them() -> None:
     head = FewFeatures(GevSCPD=(0, 10**9, 1), StreamBytesPerSecond=(1_000_000, 124_000_000, 1))
     head.held["BandwidthControlMode"] = "StreamBytesPerSecond"
+    # Only the used features of a camera exist.
     written, refusals = write_pacing(head, settings(stream_rate_mbps=100.0), 1462, 10**9)  # type: ignore[arg-type]
     assert (written, refusals) == ({"StreamBytesPerSecond": 12_500_000}, [])
 
@@ -143,6 +146,7 @@ def test_a_head_in_the_mode_of_bytes_per_second_is_limited_by_them() -> None:
 def test_a_head_that_cannot_be_paced_is_refused_with_the_action() -> None:
     head = FewFeatures()
     asked = settings(stream_rate_mbps=100.0, transfer_delay_us=5.0)
+    # Only the used features of a camera exist.
     _, refusals = write_pacing(head, asked, 1462, 10**9)  # type: ignore[arg-type]
     assert len(refusals) == 2
     assert "connect it to an interface of its own" in refusals[0]
@@ -151,6 +155,7 @@ def test_a_head_that_cannot_be_paced_is_refused_with_the_action() -> None:
 
 def test_a_pause_beyond_the_heads_bounds_is_refused() -> None:
     head = FewFeatures(GevSCPD=(0, 1000, 1))
+    # Only the used features of a camera exist.
     _, (refusal,) = write_pacing(head, settings(stream_rate_mbps=1.0), 1462, 10**9)  # type: ignore[arg-type]
     assert refusal.startswith("stream_rate_mbps = 1 is refused")
 
@@ -158,4 +163,5 @@ def test_a_pause_beyond_the_heads_bounds_is_refused() -> None:
 def test_a_pause_left_by_an_earlier_controller_is_reported() -> None:
     head = FewFeatures(GevSCPD=(0, 10**9, 1))
     head.held["GevSCPD"] = 5000
+    # Only the used features of a camera exist.
     assert write_pacing(head, settings(), 1462, 10**9) == ({"GevSCPD": 5000}, [])  # type: ignore[arg-type]

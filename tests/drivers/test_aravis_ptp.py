@@ -204,6 +204,7 @@ def test_a_head_without_ptp_is_refused_with_the_setting() -> None:
         def kind(self, name: str) -> None:
             return None
 
+    # Only the used features of a camera exist.
     features = PtpFeatures(NoFeatures())  # type: ignore[arg-type]
     assert "set ptp = false" in features.enable()
     reading = features.read("SU00", 5)

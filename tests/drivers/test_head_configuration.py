@@ -134,6 +134,7 @@ def test_features_are_written_in_addition() -> None:
     ],
 )
 def test_what_is_missing_is_named(settings: dict[str, object], expected: str) -> None:
+    # Settings by name, as a configuration has them.
     with pytest.raises(DeviceError) as refusal, camera(**settings) as (_, driver, _memory):  # type: ignore[arg-type]
         driver.bind()
     assert expected in str(refusal.value)

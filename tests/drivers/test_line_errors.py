@@ -95,6 +95,7 @@ def test_bytes_that_were_read_too_late_are_counted_and_reported(kernel: Kernel) 
 
     start_ns = clock.now_ns
     port = FakePort(clock, talk)
+    # A fake port has a descriptor for this test.
     port.fileno = lambda: 7  # type: ignore[attr-defined]
     device = _echo_device(clock, port)
     recorder = _run_until(device, clock, 6)

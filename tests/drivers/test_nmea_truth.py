@@ -46,6 +46,7 @@ def gst(tenths: int) -> str:
 
 
 def decode(*bodies: str, **settings: float) -> list[NavSample]:
+    # Settings by name, as a configuration has them.
     decoder = NmeaDecoder("gnss", **settings)  # type: ignore[arg-type]
     stream = b"".join(map(sentence, bodies))
     return [s for s in decoder.feed(stream, 0) if isinstance(s, NavSample)]

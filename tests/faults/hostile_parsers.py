@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import binascii
-import functools
 import random
 import socket
 import struct
 import sys
-import zlib
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -24,19 +21,17 @@ from drivers.receivers.message_decoder import MessageDecoder
 from drivers.receivers.nmea.decoder import NmeaDecoder
 from drivers.receivers.novatel.decoder import NovatelDecoder
 from drivers.receivers.sbg.decoder import SbgDecoder
-from drivers.receivers.sbg.framing import crc as sbg_crc
 from drivers.receivers.septentrio.decoder import SbfDecoder
 from drivers.receivers.ublox.decoder import UbxDecoder
 from drivers.receivers.vectornav.decoder import VectornavDecoder
 from drivers.receivers.xsens.decoder import XsensDecoder
 from drivers.thermometers.ascii_line.thermometer import AsciiLineThermometer
-from drivers.thermometers.modbus_rtu.frames import crc16, find_reply
+from drivers.thermometers.modbus_rtu.frames import find_reply
 from drivers.triggers.pulse_bus import PulseBusTrigger
 from sim_hw.gige.control import ControlChannel, HeadActions
 from sim_hw.gige.registers import FrameSize, HeadIdentity, RegisterMemory
 from sim_hw.receivers.emulated_receiver import EmulatedReceiver, ReceiverState
 from sim_hw.receivers.mavlink_autopilot import MavlinkAutopilot
-from sim_hw.receivers.mavlink_messages import by_number, x25
 from sim_hw.receivers.nmea_receiver import NmeaReceiver
 from sim_hw.receivers.novatel_receiver import NovatelReceiver
 from sim_hw.receivers.sbg_receiver import SbgReceiver
@@ -45,6 +40,18 @@ from sim_hw.receivers.ublox_receiver import UbloxReceiver
 from sim_hw.receivers.vectornav_receiver import VectornavReceiver
 from sim_hw.world.world_clock import WorldClock
 from tests.drivers.fakes import FakeClock
+from tests.faults.resealed_messages import (
+    reseal_applanix,
+    reseal_mavlink,
+    reseal_modbus,
+    reseal_nmea,
+    reseal_novatel,
+    reseal_sbf,
+    reseal_sbg,
+    reseal_ubx,
+    reseal_vectornav,
+    reseal_xsens,
+)
 
 GPS_NS = 1_447_400_000_000_000_000
 STATE = ReceiverState(48.1, 11.5, 3395.0, (60.0, 3.0, 0.1), 1.0, -2.0, 33.0)
@@ -116,83 +123,6 @@ class Mutator:
 
 
 # Seals
-
-
-def reseal_ubx(message: bytearray) -> bytes:
-    a = b = 0
-    message[:2] = b"\xb5\x62"
-    message[4:6] = struct.pack("<H", max(len(message) - 8, 0))
-    for byte in message[2:-2]:
-        a = (a + byte) & 0xFF
-        b = (b + a) & 0xFF
-    message[-2:] = bytes((a, b))
-    return bytes(message)
-
-
-def reseal_nmea(message: bytearray) -> bytes:
-    body = bytes(byte for byte in message[1:-5] if 32 <= byte < 127 and byte not in b"$*!")
-    checksum = functools.reduce(lambda a, b: a ^ b, body, 0)
-    return b"$%b*%02X\r\n" % (body, checksum)
-
-
-def reseal_novatel(message: bytearray) -> bytes:
-    message[:3] = b"\xaa\x44\x12"
-    message[3] = 28
-    message[8:10] = struct.pack("<H", max(len(message) - 32, 0))
-    crc = zlib.crc32(bytes(message[:-4]), 0xFFFFFFFF) ^ 0xFFFFFFFF
-    message[-4:] = struct.pack("<I", crc)
-    return bytes(message)
-
-
-def reseal_sbf(message: bytearray) -> bytes:
-    message[:2] = b"$@"
-    message[6:8] = struct.pack("<H", len(message))
-    message[2:4] = struct.pack("<H", binascii.crc_hqx(bytes(message[4:]), 0))
-    return bytes(message)
-
-
-def reseal_sbg(message: bytearray) -> bytes:
-    message[:2] = b"\xff\x5a"
-    message[4:6] = struct.pack("<H", max(len(message) - 9, 0))
-    message[-3:] = struct.pack("<HB", sbg_crc(bytes(message[2:-3])), 0x33)
-    return bytes(message)
-
-
-def reseal_vectornav(message: bytearray) -> bytes:
-    message[:1] = b"\xfa"
-    message[-2:] = struct.pack(">H", binascii.crc_hqx(bytes(message[1:-2]), 0))
-    return bytes(message)
-
-
-def reseal_xsens(message: bytearray) -> bytes:
-    message[:2] = b"\xfa\xff"
-    message[3] = min(max(len(message) - 5, 0), 254)
-    message[-1] = -sum(message[1:-1]) & 0xFF
-    return bytes(message)
-
-
-def reseal_applanix(message: bytearray) -> bytes:
-    del message[len(message) // 4 * 4 :]
-    message[:4], message[-4:] = b"$GRP", b"\0\0$#"
-    message[6:8] = struct.pack("<H", len(message) - 8)
-    words = struct.unpack(f"<{len(message) // 2}H", message)
-    message[-4:-2] = struct.pack("<H", -sum(words) & 0xFFFF)
-    return bytes(message)
-
-
-def reseal_mavlink(message: bytearray) -> bytes:
-    message[0], message[2] = 0xFD, 0
-    message[1] = max(len(message) - 12, 0) & 0xFF
-    definition = by_number().get(int.from_bytes(message[7:10], "little"))
-    seed = definition.crc_extra if definition is not None else 0
-    crc = x25(bytes((seed,)), x25(bytes(message[1:-2])))
-    message[-2:] = struct.pack("<H", crc)
-    return bytes(message)
-
-
-def reseal_modbus(message: bytearray) -> bytes:
-    message[-2:] = struct.pack("<H", crc16(bytes(message[:-2])))
-    return bytes(message)
 
 
 # Parsers

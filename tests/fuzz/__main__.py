@@ -25,7 +25,8 @@ from pathlib import Path
 
 from tests.fuzz import corpus
 from tests.fuzz.progress import Piece, begun, piece_of, until_quiet
-from tests.fuzz.targets import INPUT_MAX_S, INPUT_MAX_SIZE, TARGETS
+from tests.fuzz.target import INPUT_MAX_S, INPUT_MAX_SIZE
+from tests.fuzz.targets import TARGETS
 
 CRASH_STATUS = 77
 

@@ -15,7 +15,8 @@ import pytest
 from drivers.base.extras import MissingExtraError, missing_module
 from tests.fuzz import corpus
 from tests.fuzz.__main__ import mutations
-from tests.fuzz.targets import INPUT_MAX_NBYTES, INPUT_MAX_S, TARGETS, Target
+from tests.fuzz.target import INPUT_MAX_NBYTES, INPUT_MAX_S, Target
+from tests.fuzz.targets import TARGETS
 
 MUTATIONS = 100
 SOAK_SECONDS = float(os.environ.get("SYNTOPIC_FUZZ_SECONDS", "60"))

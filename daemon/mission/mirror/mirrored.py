@@ -325,6 +325,7 @@ class MirroredStorage:
             if not self._history or set(self._history[-1].disks) != set(ids):
                 self._history = next_generation(self._history, ids, self._first_missing)
             history = self._history
+            # mypy infers no type for the default of a parameter of a lambda.
             self._on_all_disks(lambda copy, h=history: write_generations(copy.mission.path, h))  # type: ignore[misc]
             self._is_recorded, self._is_due = True, False
 

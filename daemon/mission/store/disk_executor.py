@@ -78,6 +78,7 @@ class DiskExecutor:
             if self._is_abandoned:
                 future.set_exception(DroppedError(self.disk))
                 return future
+            # One queue holds futures of any result.
             self._queue.append((work, future))  # type: ignore[arg-type]
             self._pending += 1
             self._changed.notify()

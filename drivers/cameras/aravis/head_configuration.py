@@ -398,6 +398,7 @@ class HeadConfiguration:
             self._try(
                 f"{key} = {value!r}",
                 "the head accepts no action commands",
+                # mypy infers no type for the default of a parameter of a lambda.
                 lambda name=name, value=value: features.write_only(name, value),  # type: ignore[misc]
             )
 

@@ -11,7 +11,7 @@ send it.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -285,7 +285,7 @@ class Epoch:
         count = number_or_none(text)
         self.satellites = self.satellites if count is None else int(count)
 
-    def _heights(self, values: Fields, units: Fields = ()) -> None:  # type: ignore[assignment]
+    def _heights(self, values: Fields, units: Iterable[str] = ()) -> None:
         if any(unit not in ("M", "") for unit in units):
             raise ValueError("a height that is not in metres")
         height, undulation = (number_or_none(text) for text in values)

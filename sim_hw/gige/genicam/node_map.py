@@ -9,7 +9,7 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Protocol
+from typing import Literal, Protocol
 
 from sim_hw import SimulatorError
 from sim_hw.gige.genicam.description_file import Description, Node
@@ -309,7 +309,7 @@ class NodeMap:
 
     def _write_register(self, node: Node, value: Number | str) -> None:
         address, length = self.address(node.name), self.length(node.name)
-        order = "big" if is_big_endian(node) else "little"
+        order: Literal["big", "little"] = "big" if is_big_endian(node) else "little"
         if isinstance(value, str):
             data = value.encode("utf-8")[: length - 1].ljust(length, b"\0")
         elif node.kind == "FloatReg":
@@ -317,9 +317,9 @@ class NodeMap:
         elif node.kind in INTEGER_REGISTERS:
             shift, bits = bit_field(node, length)
             mask = (1 << bits) - 1 << shift
-            old = int.from_bytes(self._port.read(address, length), order)  # type: ignore[arg-type]
+            old = int.from_bytes(self._port.read(address, length), order)
             new = old & ~mask | int(value) << shift & mask
-            data = new.to_bytes(length, order)  # type: ignore[arg-type]
+            data = new.to_bytes(length, order)
         else:
             raise NodeError(f"{node.name} takes no number")
         self._port.write(address, data)

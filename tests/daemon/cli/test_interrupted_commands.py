@@ -191,6 +191,7 @@ def test_an_interrupted_command_leaves_complete_files_and_states_how_to_continue
 def test_every_command_has_a_sentence_of_its_own() -> None:
     import typer.main
 
+    # typer declares a command, and a group it is.
     commands = typer.main.get_command(cli.app).commands  # type: ignore[attr-defined]
     missing = [name for name in commands if name not in interrupt_messages.SENTENCES]
     assert missing == []

@@ -155,6 +155,7 @@ def test_the_system_library_has_its_own_command(
         def require_version(name: str, _version: str) -> None:
             raise ValueError(f"Namespace {name} not available")
 
+    # A module is replaced by an object that fails on import.
     monkeypatch.setitem(sys.modules, "gi", _NoTypelib())  # type: ignore[arg-type]
     monkeypatch.setattr("drivers.base.extras._is_there", lambda _module: True)
     with pytest.raises(MissingExtraError, match=r"Namespace Aravis not available.*apt install"):

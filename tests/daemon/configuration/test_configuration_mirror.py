@@ -66,17 +66,21 @@ def mission_of(tmp_path: Path, mirror: Path | None) -> Configuration:
 
 def test_check_cautions_where_both_lie_on_one_file_system(tmp_path: Path) -> None:
     (tmp_path / "b").mkdir()
+    # `storage` reads no rig here.
     found = list(storage(mission_of(tmp_path, tmp_path / "b"), None))  # type: ignore[arg-type]
     assert [result.outcome for result in found] == [CheckOutcome.PASS] * 3
     assert found[2].sentence.startswith("caution:") and "same file system" in found[2].sentence
+    # `storage` reads no rig here.
     assert len(list(storage(mission_of(tmp_path, None), None))) == 1  # type: ignore[arg-type]
 
 
 def test_one_disk_of_two_is_enough_for_a_flight_and_the_other_is_named(tmp_path: Path) -> None:
+    # `storage` reads no rig here.
     found = list(storage(mission_of(tmp_path, tmp_path / "b"), None))  # type: ignore[arg-type]
     assert found[1].outcome is CheckOutcome.FAIL and not found[1].is_blocking
     assert "mission.mirror" in found[1].sentence and not (tmp_path / "b").exists()
     (tmp_path / "a").rmdir()
     (tmp_path / "a").write_text("no folder")
+    # `storage` reads no rig here.
     found = list(storage(mission_of(tmp_path, tmp_path / "b"), None))  # type: ignore[arg-type]
     assert found[0].is_blocking and "mission.root" in found[0].sentence

@@ -29,6 +29,7 @@ def head(number: int = 1, **changes: object) -> HeadDescription:
             "height_px": 800,
         },
     )
+    # Any field of a head by name.
     return replace(found, **changes)  # type: ignore[arg-type]
 
 

@@ -174,6 +174,7 @@ def test_where_both_disks_wait_none_is_accused(flown: MirroredFlight) -> None:
             stack.enter_context(stalling(root))
         flown.storage.note_products(1, {}, None)
         for copy in flown.storage._copies:
+            # mypy infers no type for the default of a parameter of a lambda.
             copy.executor.submit(lambda root=copy.disk.root: list(root.iterdir()))  # type: ignore[misc]
         end_s = time.monotonic() + 3 * STALL_S
         while time.monotonic() < end_s:

@@ -32,6 +32,7 @@ INFINITE = json.loads("1e999")
 def read(kind: Any, value: Any) -> Any:
     namespace = {"__pydantic_config__": ConfigDict(extra="forbid")}
     record = make_dataclass("Record", [("key", kind)], namespace=namespace)
+    # The class is made at run time.
     return read_record(record, {"key": value}, "x.json").key  # type: ignore[attr-defined]
 
 

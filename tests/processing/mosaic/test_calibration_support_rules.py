@@ -63,6 +63,7 @@ def validity_of(**found: object) -> Validity:
         "several_displaced": False,
         "relative": (),
     }
+    # Any figure by name.
     return Validity(**(nothing | found))  # type: ignore[arg-type]
 
 

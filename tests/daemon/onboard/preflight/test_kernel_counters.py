@@ -78,6 +78,7 @@ def test_a_flood_is_found_as_drops_of_a_socket_and_as_load_of_interrupts() -> No
 
 
 def counters(mono_ns: int, **more: object) -> KernelCounters:
+    # Any counter by name.
     return KernelCounters(mono_ns, **more)  # type: ignore[arg-type]
 
 

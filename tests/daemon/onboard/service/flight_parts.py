@@ -144,6 +144,7 @@ class Planted:
     def frames(self, cone: str, **known: object) -> None:
         """The frames of a head."""
         reported = {"syntopic": 1, "head_serial": f"SN-{cone}", "pixel_format": "Mono12", **known}
+        # Any value of a frame by name.
         height, width = known.get("shape", (HEIGHT_PX, WIDTH_PX))  # type: ignore[misc]
         path = self.folder / "frames" / "000001" / f"SU{cone}.tif"
         path.parent.mkdir(parents=True, exist_ok=True)

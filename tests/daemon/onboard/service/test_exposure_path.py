@@ -44,6 +44,7 @@ def planted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Planted
     monkeypatch.setattr(service, "PING_S", 60.0)  # what runs once a second runs once
     yield made
     sys.setprofile(None)
+    # typeshed does not know that None ends profiling.
     threading.setprofile(None)  # type: ignore[arg-type]
 
 

@@ -36,6 +36,7 @@ def test_a_refusal_is_taken_in_before_the_end_of_its_process(
     async def begin() -> None:
         made = Supervisor(received.append, received.append)
         made.spawn("worker", "tests.daemon.onboard.service.test_supervisor:refusing", (), {})
+        # The children are typed by their protocol, which has no thread.
         made._children["worker"].thread.join(10)  # type: ignore[attr-defined]
         made.send("worker", Stop())  # the loop has not run: nothing was read yet
 
