@@ -16,7 +16,7 @@ def test_the_counters_of_a_device_are_read_when_its_kind_is_expanded(tmp_path: P
     service.emit({"event": "bound", "kind": "head", "device": "SU09", "found": {}})
     service.emit({"event": "device", "device": "SU09", "name": "opened", "mono_ns": "1"})
     service.emit({"event": "counters", "devices": {"SU09": {"frames": 7, "packets_missing": 0}}})
-    heads = "document.querySelector('#devices details[data-kind=heads]')"
+    heads = "document.querySelector('#devices details[data-kind=head]')"
     shown = f"{heads}?.querySelector('li[data-device=SU09] .counters')?.textContent"
     with Browser(tmp_path / "profile") as browser:
         browser.open(service.address)

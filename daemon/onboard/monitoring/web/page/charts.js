@@ -1,6 +1,7 @@
 // Charts over the flight: sigma0, dC measured and estimated, time sigma, temperatures.
 
 import { flight } from "./telemetry.js";
+import { t } from "./i18n.js";
 
 const charts = {};
 const STROKES = ["#2a7fd4", "#d4572a", "#2a9a5b", "#8a5bd0", "#b58900"];
@@ -41,7 +42,7 @@ function chart(id, title, unit, range, series) {
       show: series.length > 1 || range === atLeastHalfKelvin, live: false,
       markers: { dash: (_, k) => series[k - 1]?.[2] ? (series[k - 1][2][0] < 4 ? "dotted" : "dashed") : "solid" },
     },
-    series: [{ label: "exposure" }, ...series.map(([label, stroke, dash]) => ({
+    series: [{ label: t("charts.exposure") }, ...series.map(([label, stroke, dash]) => ({
       label, stroke, dash, width: 2, spanGaps: false, points: { size: 4 },
     }))],
   }, [[], ...series.map(() => [])], container);
@@ -53,8 +54,8 @@ export function drawCharts() {
   if (!charts.sigma0) {
     if (!history.length) return;
     charts.sigma0 = chart("chart-sigma0", "σ0", "px", fromZero, [["σ0", STROKES[0]]]);
-    charts.dc = chart("chart-dc", "dC", "K", atLeastHalfKelvin, [["measured", STROKES[1]], ["estimated", STROKES[3], [6, 4]]]);
-    charts.time = chart("chart-time", "time σ", "µs", fromZero, [["time σ", STROKES[2]]]);
+    charts.dc = chart("chart-dc", "dC", "K", atLeastHalfKelvin, [[t("charts.measured"), STROKES[1]], [t("charts.estimated"), STROKES[3], [6, 4]]]);
+    charts.time = chart("chart-time", t("charts.time_sigma"), "µs", fromZero, [[t("charts.time_sigma"), STROKES[2]]]);
   }
   const numbers = history.map((one) => one.number);
   const of = (key, factor = 1) => history.map((one) => one[key] == null ? null : one[key] * factor);
@@ -75,7 +76,7 @@ function drawTemperatures(history, numbers) {
   }
   if (charts.temperature?.probes !== key) {
     charts.temperature?.destroy();
-    charts.temperature = chart("chart-temperature", "temperatures", "°C", atLeastHalfKelvin, probes.map((probe, k) =>
+    charts.temperature = chart("chart-temperature", t("temperatures.title"), "°C", atLeastHalfKelvin, probes.map((probe, k) =>
       [probe, STROKES[k % STROKES.length], DASHES[Math.floor(k / STROKES.length) % DASHES.length]]));
     charts.temperature.probes = key;
   }

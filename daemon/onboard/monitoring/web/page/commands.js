@@ -1,17 +1,21 @@
 // Commands: sent with an access token; the answer is shown as one sentence.
 
 import { flight } from "./telemetry.js";
+import { serverText, t } from "./i18n.js";
 
 const answer = document.getElementById("answer");
+const ANSWER_MS = 15000;
+const CONFIRMED = new Set(["land", "new-mission", "release-disk", "accept-disk"]);
+let clearing = null;
 
-// The text entered in a dialog; empty if it is cancelled.
+// The value with which a dialog is closed: the text of its field, "use" without one, empty if it is cancelled.
 export function openDialog(dialogId, fieldId) {
   const dialog = document.getElementById(dialogId);
-  const field = document.getElementById(fieldId);
+  const field = fieldId && document.getElementById(fieldId);
   return new Promise((resolve) => {
-    field.value = "";
+    if (field) field.value = "";
     dialog.returnValue = "";
-    dialog.addEventListener("close", () => resolve(dialog.returnValue === "use" ? field.value.trim() : ""),
+    dialog.addEventListener("close", () => resolve(dialog.returnValue !== "use" ? "" : field ? field.value.trim() : "use"),
       { once: true });
     dialog.showModal();
   });
@@ -30,56 +34,61 @@ function requestReason(refusal) {
   return openDialog("ask-override", "reason");
 }
 
-function showAnswer(sentence, refused) {
+export function showAnswer(sentence, isRefused) {
   answer.textContent = sentence;
-  answer.classList.toggle("refused", refused);
+  answer.classList.toggle("refused", isRefused);
+  clearTimeout(clearing);
+  // A refusal stays until the next command.
+  if (!isRefused) clearing = setTimeout(() => { answer.textContent = ""; }, ANSWER_MS);
 }
 
-export async function command(name, body = {}) {
+// Send a request that requires a token; ask for the token if there is none. Null if there is no answer.
+export async function post(address, body = {}) {
   let token = sessionStorage.getItem("token");
   if (!token) {
     token = await requestToken();
-    if (!token) return false;
+    if (!token) return null;
   }
-  let response;
-  let result;
   try {
-    response = await fetch(`/api/v1/commands/${name}`, {
+    const response = await fetch(address, {
       method: "POST",
       headers: { "Authorization": `Bearer ${token}`, "Content-Type": "application/json" },
       body: JSON.stringify(body),
     });
-    result = await response.json();
+    const result = await response.json();
+    if (response.status === 401) sessionStorage.removeItem("token");
+    else sessionStorage.setItem("token", token);
+    return { response, result };
   } catch {
-    showAnswer("No connection to the camera. The command may not have arrived; check the state.", true);
-    return false;
+    showAnswer(t("command.no_connection"), true);
+    return null;
   }
-  if (response.status === 401) sessionStorage.removeItem("token");
-  else sessionStorage.setItem("token", token);
+}
+
+export async function command(name, body = {}) {
+  const sent = await post(`/api/v1/commands/${name}`, body);
+  if (!sent) return false;
+  const { response, result } = sent;
   if (response.ok) {
-    showAnswer(`Done: ${result.sentence}`, false);
+    showAnswer(t("command.done", { sentence: serverText(result) }), false);
     return true;
   }
-  showAnswer(`${result.title}: ${result.detail}`, true);
+  showAnswer(`${result.title}: ${serverText({ ...result, sentence: result.detail })}`, true);
   if (response.status !== 409 || !result.detail.includes("override")) return false;
-  const why = await requestReason(result.detail);
-  return why ? command(name, { ...body, override: true, reason: why }) : false;
+  const reason = await requestReason(result.detail);
+  return reason ? command(name, { ...body, override: true, reason }) : false;
 }
 
-const CONFIRMATIONS = {
-  land: "Land: exposures stop and the service ends. Continue?",
-  "new-mission": "New mission: the current mission is closed and a new one starts. Continue?",
-  "release-disk": "Release disk: exposures are stored on the other disk only. Continue?",
-  "accept-disk": "Accept disk: this mission is copied to the disk that is mounted now. Continue?",
-};
+export async function confirmed(name) {
+  const set = (id, code) => { document.getElementById(id).textContent = t(code); };
+  set("confirm-title", `command.${name}`);
+  set("confirm-text", `confirm.${name}`);
+  set("confirm-do", `command.${name}`);
+  return Boolean(await openDialog("ask-confirm"));
+}
 
 // Send a command, after confirmation if it is destructive.
-export function confirmCommand(name, body = {}) {
-  if (!CONFIRMATIONS[name] || confirm(CONFIRMATIONS[name])) command(name, body);
-}
-
-for (const button of document.querySelectorAll("[data-command]")) {
-  button.addEventListener("click", () => {
-    confirmCommand(button.dataset.command);
-  });
+export async function confirmCommand(name, body = {}) {
+  if (CONFIRMED.has(name) && !await confirmed(name)) return false;
+  return command(name, body);
 }

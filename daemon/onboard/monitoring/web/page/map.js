@@ -93,7 +93,7 @@ export function drawGaps(segments) {
   }
 }
 
-export function drawMap(choose) {
+function drawMap(choose) {
   track.setLatLngs(flight.track.map((point) => point.at));
   const position = flight.brief?.status?.position;
   if (position?.latitude_deg != null) {
@@ -137,4 +137,15 @@ function frame() {
     map.fitBounds(bounds, { padding: [20, 20], maxZoom: 17, animate: false });
   } else if (isSomewhere) map.setView(marker.getLatLng(), 14, { animate: false });
   isProgrammatic = false;
+}
+
+export function start(root, feed) {
+  feed.subscribe((record, isFirstRecord) => {
+    if (isFirstRecord || !record || record.exposures || record.track) drawMap(feed.select);
+  });
+  feed.key("f", "map.follow", () => follow.click());
+  new ResizeObserver(() => {
+    map.invalidateSize();
+    frame();
+  }).observe(root);
 }

@@ -5,7 +5,6 @@ import { flight } from "./telemetry.js";
 import { drawGaps, drawPlan } from "./map.js";
 
 const REFRESH_MS = 3000;
-const section = document.getElementById("reflights");
 const coverageText = document.getElementById("coverage");
 const rows = document.getElementById("segments");
 let mission = null;
@@ -51,17 +50,20 @@ async function updateAdvice() {
 }
 
 // Fetch the plan once per mission. Fetch the coverage after new exposures, at most every REFRESH_MS.
-export async function followPlan(hasNewExposures) {
+async function followPlan(hasNewExposures) {
   const current = flight.brief?.mission?.id || null;
   if (current !== mission) {
     mission = current;
     const plan = current && await fetchJson("/api/v1/plan");
     hasPlan = Boolean(plan?.lines);
-    section.hidden = !hasPlan;
     drawPlan(plan);
     if (hasPlan) updateAdvice();
     return;
   }
   if (!hasPlan || !hasNewExposures || timer) return;
   timer = setTimeout(() => { timer = null; updateAdvice(); }, Math.max(0, requestedMs + REFRESH_MS - Date.now()));
+}
+
+export function start(_root, feed) {
+  feed.subscribe((record) => followPlan(Boolean(record?.exposures)));
 }

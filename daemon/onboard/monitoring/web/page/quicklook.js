@@ -23,7 +23,7 @@ function place() {
 }
 
 function fit() {
-  if (!image.naturalWidth) return;
+  if (!image.naturalWidth || !viewport.clientWidth) return;
   view.scale = Math.min(viewport.clientWidth / image.naturalWidth, viewport.clientHeight / image.naturalHeight);
   view.x = (viewport.clientWidth - image.naturalWidth * view.scale) / 2;
   view.y = (viewport.clientHeight - image.naturalHeight * view.scale) / 2;
@@ -96,7 +96,7 @@ function showFigures(one) {
   }
 }
 
-export async function showImage(number) {
+async function showImage(number) {
   const one = flight.exposures.get(number);
   if (!one) return;
   showFigures(one);
@@ -140,7 +140,7 @@ export async function showImage(number) {
   image.src = URL.createObjectURL(picture);
 }
 
-export function clearImage() {
+function clearImage() {
   showPlaceholder("no image yet");
   numberLabel.textContent = "";
   figuresList.replaceChildren();
@@ -158,7 +158,7 @@ function showPlaceholder(why) {
   listOverlaps(null, null);
 }
 
-export function prepareImage(redraw) {
+function prepareImage(redraw) {
   document.getElementById("zoom-in").addEventListener("click", () => zoom(1.5));
   document.getElementById("zoom-out").addEventListener("click", () => zoom(1 / 1.5));
   document.getElementById("zoom-fit").addEventListener("click", fit);
@@ -208,5 +208,17 @@ export function prepareImage(redraw) {
   for (const end of ["pointerup", "pointercancel"]) {
     viewport.addEventListener(end, (event) => fingers.delete(event.pointerId));
   }
-  addEventListener("resize", fit);
+  new ResizeObserver(fit).observe(viewport);
+}
+
+export function start(_root, feed) {
+  const follow = document.getElementById("follow");
+  const draw = () => feed.selected == null ? clearImage() : showImage(feed.selected);
+  prepareImage(draw);
+  follow.addEventListener("click", () => feed.follow(!feed.isFollowing));
+  feed.subscribe((record) => { if (record && feed.selected != null) showImage(feed.selected); });
+  feed.onSelect(() => {
+    follow.setAttribute("aria-pressed", String(feed.isFollowing));
+    draw();
+  });
 }

@@ -1,0 +1,195 @@
+// Alarms: faults of the service and alarms of the page, by severity; acknowledged, shelved, silenced.
+
+import { by, button, element, redraw } from "./dom.js";
+import { knows, locale, serverText, t } from "./i18n.js";
+import { clock, span } from "./format.js";
+import { setBadge } from "./tabs.js";
+import { isSoundOn, setSound, soundFor, unlockSound } from "./alarm_sound.js";
+
+const MARKS = { warning: "✖", caution: "▲", info: "ℹ" };
+const RANK = { warning: 0, caution: 1, info: 2 };
+const SHELVE_MINUTES = [5, 15, 60];
+const STORE = "shelved";
+
+// Id of a shelved alarm, and until when, in ms of the wall clock. Kept over a reload of the page.
+const shelved = new Map(readShelved());
+const silenced = new Set();
+
+function readShelved() {
+  try {
+    return JSON.parse(sessionStorage.getItem(STORE)) || [];
+  } catch {
+    return [];
+  }
+}
+
+function shelve(alarm, minutes) {
+  if (minutes) shelved.set(alarm.id, Date.now() + 60e3 * minutes);
+  else shelved.delete(alarm.id);
+  sessionStorage.setItem(STORE, JSON.stringify([...shelved]));
+}
+
+function dropExpired() {
+  for (const [id, untilMs] of shelved) if (untilMs <= Date.now()) shelve({ id }, 0);
+}
+
+const secondsSince = (nowNs, thenNs) => nowNs == null || thenNs == null ? null : (Number(nowNs) - Number(thenNs)) * 1e-9;
+
+function ofFault(fault, nowNs) {
+  return {
+    id: fault.id, code: fault.code || "", severity: fault.severity || "warning", device: fault.device, isService: true,
+    isActive: fault.stands, isAcknowledged: fault.acknowledged, by: fault.acknowledged_by || "", count: fault.count,
+    isPrevious: fault.previous, detail: serverText(fault), ageS: secondsSince(nowNs, fault.raised_mono_ns),
+    clearedS: secondsSince(nowNs, fault.cleared_mono_ns), untilMs: shelved.get(fault.id) ?? null, aircraft: fault.aircraft || "",
+  };
+}
+
+function ofPage(alarm) {
+  return {
+    id: `page ${alarm.code}`, code: alarm.code, severity: alarm.severity, device: "", isService: false, isActive: true,
+    isAcknowledged: alarm.isAcknowledged, by: "", count: 1, isPrevious: false, detail: t(`alarm.${alarm.code}.text`, alarm.params),
+    ageS: (Date.now() - alarm.sinceMs) / 1000, clearedS: null, untilMs: shelved.get(`page ${alarm.code}`) ?? null, aircraft: "",
+  };
+}
+
+// All alarms: the active before the cleared, the severe before the mild, shelved ones last.
+export function listAlarms(feed) {
+  const brief = feed.flight.brief;
+  const nowNs = brief?.status?.mono_ns;
+  const all = [...(brief?.faults || []).map((one) => ofFault(one, nowNs)), ...[...feed.pageAlarms.values()].map(ofPage)];
+  const rank = (one) => [one.untilMs ? 1 : 0, one.isActive ? 0 : 1, one.isAcknowledged ? 1 : 0, RANK[one.severity] ?? 0];
+  return all.map((one) => [rank(one), one])
+    .sort(([a], [b]) => a[0] - b[0] || a[1] - b[1] || a[2] - b[2] || a[3] - b[3]).map(([, one]) => one);
+}
+
+const titleOf = (alarm) => {
+  const name = knows(`alarm.${alarm.code}`) ? t(`alarm.${alarm.code}`) : "";
+  const where = [alarm.aircraft, alarm.device].filter(Boolean).join(" ");
+  return [name, where].filter(Boolean).join(": ") || alarm.id;
+};
+
+function stateText(alarm) {
+  const parts = [];
+  if (alarm.isActive && alarm.ageS != null) parts.push(t("alarm.since", { span: agoText(alarm.ageS) }));
+  if (!alarm.isActive && !alarm.isPrevious) {
+    parts.push(alarm.clearedS == null ? t("alarm.cause_gone") : t("alarm.cause_gone_since", { span: agoText(alarm.clearedS) }));
+  }
+  if (alarm.count > 1) parts.push(t("alarm.count", { n: alarm.count }));
+  if (alarm.isAcknowledged) parts.push(alarm.by ? t("alarm.acknowledged_by", { name: alarm.by }) : t("alarm.acknowledged"));
+  if (alarm.untilMs) parts.push(t("alarm.shelved_until", { time: clock(new Date(alarm.untilMs)) }));
+  return parts.join(" · ");
+}
+
+const agoText = (s) => s < 60 ? `${Math.max(0, Math.floor(s))} s` : span(s);
+
+function labelOf(alarm) {
+  if (alarm.isPrevious) return `▲ ${t("alarm.previous")}`;
+  if (!alarm.isActive) return `● ${t("alarm.cleared")}`;
+  return `${MARKS[alarm.severity]} ${t(`severity.${alarm.severity}`)}`;
+}
+
+function acknowledge(alarm, feed) {
+  if (alarm.isService) return feed.acknowledge(alarm.id);
+  const own = feed.pageAlarms.get(alarm.code);
+  if (own) own.isAcknowledged = true;
+  return feed.refresh();
+}
+
+function shelfButtons(alarm, feed) {
+  if (alarm.untilMs) {
+    return [button(t("alarm.unshelve"), () => { shelve(alarm, 0); feed.refresh(); })];
+  }
+  if (!alarm.isActive) return [];
+  return SHELVE_MINUTES.map((minutes) => button(t("alarm.shelve", { minutes }), () => { shelve(alarm, minutes); feed.refresh(); },
+    { className: "shelve" }));
+}
+
+function item(alarm, feed) {
+  const created = element("li", { className: `${alarm.isActive ? "active" : "cleared"} ${alarm.severity}`, dataset: { fault: alarm.id } },
+    element("div", {}, element("strong", { textContent: `${labelOf(alarm)} · ${titleOf(alarm)}` }),
+      element("span", { className: "about", textContent: stateText(alarm) })),
+    element("div", { lang: alarm.isService ? "en" : locale, textContent: alarm.detail }));
+  if (locale !== "en" && knows(`alarm.${alarm.code}.action`)) {
+    created.append(element("div", { textContent: t(`alarm.${alarm.code}.action`) }));
+  }
+  const buttons = shelfButtons(alarm, feed);
+  if (!alarm.isAcknowledged) {
+    buttons.unshift(button(t("alarm.acknowledge"), () => acknowledge(alarm, feed), { className: "acknowledge" }));
+  }
+  if (buttons.length) created.append(element("div", { className: "buttons" }, ...buttons));
+  return created;
+}
+
+// What changes every second is left out of the key; it is drawn with the next change or every ten seconds.
+function keyOf(alarms) {
+  const tens = Math.floor(Date.now() / 10e3);
+  return JSON.stringify([tens, alarms.map((one) => ({ ...one, ageS: 0, clearedS: one.clearedS == null ? null : 0 }))]);
+}
+
+function drawList(alarms, feed) {
+  const focused = document.activeElement?.closest?.("#faults li")?.dataset.fault;
+  const style = document.activeElement?.className;
+  redraw(by("faults"), keyOf(alarms), () => alarms.length ? alarms.map((one) => item(one, feed))
+    : [element("li", { className: "none", textContent: t("alarm.none") })]);
+  if (focused && !by("faults").contains(document.activeElement)) {
+    const same = [...by("faults").children].find((one) => one.dataset.fault === focused);
+    (same?.querySelector(style ? `.${style.split(" ")[0]}` : "button") || same?.querySelector("button"))?.focus();
+  }
+}
+
+function drawBar(alarms, feed) {
+  const bar = by("alarm-bar");
+  const due = alarms.filter((one) => !one.untilMs && (one.isActive || !one.isAcknowledged) && !(one.isPrevious && one.isAcknowledged));
+  const [first] = due;
+  bar.hidden = !first;
+  if (!first) return;
+  const isSounding = soundingOf(alarms).length > 0;
+  redraw(bar, JSON.stringify([first.id, first.severity, first.isActive, first.isAcknowledged, first.detail, due.length, isSounding]), () => {
+    bar.className = first.isActive ? first.severity : "info";
+    const what = button("", () => feed.showTab("alarms"), { className: "what" });
+    what.append(element("strong", { textContent: `${labelOf(first)} · ${titleOf(first)}` }),
+      element("span", { textContent: first.isActive ? first.detail : stateText(first) }));
+    const further = due.length > 1 ? button(t("alarm.further", { n: due.length - 1 }), () => feed.showTab("alarms"), { className: "further" }) : null;
+    const silence = isSounding ? button(t("alarm.silence"), () => silenceAll(feed), { id: "silence" }) : null;
+    const seen = first.isAcknowledged ? null
+      : button(t("alarm.acknowledge"), () => acknowledge(first, feed), { className: "acknowledge" });
+    return [what, further, silence, seen].filter(Boolean);
+  });
+}
+
+function soundingOf(alarms) {
+  return alarms.filter((one) => one.isActive && !one.isAcknowledged && !one.untilMs && one.severity !== "info"
+    && !silenced.has(`${one.id} ${one.count}`));
+}
+
+// Silence what sounds now. A new or repeated alarm sounds again.
+function silenceAll(feed) {
+  for (const one of listAlarms(feed)) silenced.add(`${one.id} ${one.count}`);
+  feed.refresh();
+  draw(feed);
+}
+
+function draw(feed) {
+  dropExpired();
+  const alarms = listAlarms(feed);
+  drawList(alarms, feed);
+  drawBar(alarms, feed);
+  setBadge("alarms", alarms.filter((one) => one.isActive && !one.untilMs).length);
+  soundFor(soundingOf(alarms).map((one) => one.severity));
+}
+
+export function start(_root, feed) {
+  const sound = button("", () => { setSound(!isSoundOn()); showSound(); }, { id: "sound" });
+  const showSound = () => {
+    sound.textContent = t(isSoundOn() ? "alarm.sound_on" : "alarm.sound_off");
+    sound.setAttribute("aria-pressed", String(isSoundOn()));
+  };
+  showSound();
+  by("alarm-tools").replaceChildren(sound,
+    button(t("alarm.test"), () => { unlockSound(); soundFor(["caution"], true); }),
+    button(t("alarm.silence"), () => silenceAll(feed)));
+  feed.key("s", "alarm.silence", () => silenceAll(feed));
+  feed.subscribe(() => draw(feed));
+  feed.drawAlarms = () => draw(feed);
+  setInterval(() => draw(feed), 5000);
+}

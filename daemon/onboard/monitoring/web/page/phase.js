@@ -1,0 +1,59 @@
+// The phase, and the one large button that leads to the next phase.
+
+import { by, element } from "./dom.js";
+import { t } from "./i18n.js";
+
+const PHASE_CLASS = { flying: "good", armed: "good", fault: "warning", idle: "caution" };
+const NEXT = { ready: "arm", armed: "start", flying: "stop" };
+
+// The next command, and a second one where the phase has two ways on.
+function commandsOf(brief) {
+  const hasFlown = (brief.status?.ledger?.triggers?.triggers ?? 0) > 0;
+  return { next: NEXT[brief.phase] ?? null, second: brief.phase === "armed" && hasFlown ? "land" : null };
+}
+
+function setButton(button, name) {
+  button.hidden = !name && button.id === "phase-second";
+  button.disabled = !name;
+  button.classList.toggle("stop", name === "stop");
+  button.classList.toggle("destructive", name === "land");
+  if (button.dataset.next === (name ?? "")) return;
+  button.dataset.next = name ?? "";
+  if (name) button.textContent = t(`command.${name}`);
+}
+
+export function start(_root, feed) {
+  const [next, second] = [by("phase-button"), by("phase-second")];
+  for (const one of [next, second]) {
+    one.addEventListener("click", () => one.dataset.next && feed.command(one.dataset.next));
+  }
+  for (const one of document.querySelectorAll("[data-command]")) {
+    one.addEventListener("click", () => {
+      by("commands").close();
+      feed.command(one.dataset.command);
+    });
+  }
+  by("open-commands").addEventListener("click", () => by("commands").showModal());
+  feed.key("k", "command.more", () => by("commands").showModal());
+  next.textContent = t("phase.waiting");
+  feed.subscribe(() => {
+    const { brief } = feed.flight;
+    const chip = by("phase");
+    const missing = brief.status?.missing || [];
+    const isBlocked = brief.phase === "ready" && missing.length > 0;
+    chip.textContent = t(`phase.${isBlocked ? "not_ready" : brief.phase}`);
+    chip.className = `chip ${isBlocked ? "caution" : PHASE_CLASS[brief.phase] || ""}`;
+    const commands = commandsOf(brief);
+    setButton(next, commands.next);
+    setButton(second, commands.second);
+    if (!commands.next) next.textContent = t(brief.phase === "landed" ? "phase.landed" : "phase.waiting");
+    by("simulated").hidden = !brief.simulated;
+    by("aircraft").textContent = brief.mission.rig || "";
+    document.title = `${brief.simulated ? `${t("page.simulated")} · ` : ""}${brief.mission.rig || ""} · Syntopic`;
+    by("recovery").replaceChildren(...(brief.mission.recovery || []).map((one) =>
+      element("li", { textContent: t("page.recovered", { what: one }) })));
+    const shown = brief.phase === "ready" || brief.phase === "armed" ? missing : [];
+    by("missing").replaceChildren(...shown.map((one) => element("li", { textContent: `▲ ${one}` })));
+    document.querySelector(".missing-title").hidden = !shown.length;
+  });
+}

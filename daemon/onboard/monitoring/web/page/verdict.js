@@ -1,0 +1,73 @@
+// The verdict of the last exposure, with its findings; and the table of exposures.
+
+import { by, element } from "./dom.js";
+import { knows, t } from "./i18n.js";
+import { number, sigma } from "./format.js";
+import { lastWhere } from "./feed.js";
+
+export const MARKS = { good: "●", usable: "▲", refly: "■", lost: "✖" };
+const SEVERITY_ORDER = { refly: 0, usable: 1, good: 2 };
+const ROWS_SHOWN = 300;
+
+export const verdictText = (word) => knows(`verdict.${word}`) ? t(`verdict.${word}`) : knows(`step.${word}`) ? t(`step.${word}`) : word;
+
+// The sentence of the service, after the translated name of its flag.
+function findingText(finding) {
+  const name = knows(`flag.${finding.flag}`) ? `${t(`flag.${finding.flag}`)}: ` : "";
+  return `${MARKS[finding.verdict] || ""} ${name}${finding.sentence}`;
+}
+
+function drawVerdict() {
+  const latest = lastWhere((one) => one.verdict || one.step === "lost");
+  const word = latest ? latest.verdict || "lost" : "waiting";
+  const container = by("verdict");
+  const which = latest ? t("verdict.exposure", { number: latest.number }) : "";
+  const key = `${which} ${word}`;
+  if (container.dataset.shown === key) return;
+  container.dataset.shown = key;
+  container.className = `verdict ${word}`;
+  container.querySelector(".mark").textContent = MARKS[word] || "·";
+  container.querySelector(".word").textContent = verdictText(word);
+  container.querySelector(".which").textContent = which;
+  const lost = { verdict: "lost", sentence: latest?.sentence || t("verdict.lost_text") };
+  const findings = (word === "lost" ? [lost] : [...(latest?.findings || [])])
+    .sort((a, b) => SEVERITY_ORDER[a.verdict] - SEVERITY_ORDER[b.verdict]);
+  by("findings").replaceChildren(...findings.map((finding) =>
+    element("li", { textContent: findingText(finding), className: finding.verdict })));
+}
+
+function row(one, feed) {
+  const figures = one.figures || {};
+  const word = one.verdict || one.step;
+  const cells = [
+    [element("button", { type: "button", textContent: one.number })],
+    [`${MARKS[word] || ""} ${verdictText(word)}`, one.verdict || (one.step === "lost" ? "lost" : "")],
+    [one.line || ""],
+    [one.frames == null ? "" : `${one.frames}`],
+    [one.mark_sigma_ns == null ? "" : sigma(one.mark_sigma_ns)],
+    [figures.sigma0_px == null ? "" : number(figures.sigma0_px, 3)],
+    [figures.tie_points_pp === undefined ? "" : `${figures.tie_points_pp}+${figures.tie_points_pc ?? 0}`],
+    [figures.dc_k == null ? "" : number(figures.dc_k, 1)],
+    [figures.displaced_sensor || ""],
+  ];
+  const created = element("tr", {}, ...cells.map(([content, style]) => element("td", { className: style || "" }, content)));
+  created.addEventListener("click", () => feed.select(one.number));
+  created.setAttribute("aria-selected", String(one.number === feed.selected));
+  return created;
+}
+
+function drawRows(feed) {
+  const newest = [...feed.flight.exposures.values()].sort((a, b) => b.number - a.number).slice(0, ROWS_SHOWN);
+  const focused = document.activeElement?.closest?.("#rows") ? document.activeElement.textContent : null;
+  by("rows").replaceChildren(...newest.map((one) => row(one, feed)));
+  if (focused) [...by("rows").querySelectorAll("button")].find((one) => one.textContent === focused)?.focus();
+}
+
+export function start(_root, feed) {
+  by("verdict").querySelector(".word").textContent = t("verdict.waiting");
+  feed.subscribe((record, isFirstRecord) => {
+    drawVerdict();
+    if (isFirstRecord || !record || record.exposures) drawRows(feed);
+  });
+  feed.onSelect(() => drawRows(feed));
+}
