@@ -1,4 +1,4 @@
-// The pages beside the map. On a phone they cover it.
+// The pages next to the map. On a phone they cover it.
 
 import { by, element } from "./dom.js";
 import { t } from "./i18n.js";
