@@ -31,21 +31,6 @@ UNITS: Final[Mapping[Kind, tuple[str, float]]] = {
 }
 """What a parameter is printed in, and how many of it make one of the internal unit (mm, rad, 1)."""
 
-MEANING: Final[Mapping[Kind, str]] = {
-    "shift-x": "the CCD is displaced to the right of where the stitching put it",
-    "shift-y": "the CCD is displaced in flight direction from where the stitching put it",
-    "rotation": "the CCD is rotated in the image plane about its centre",
-    "scale": "the CCD's scale differs from the calibration: its mount is warmer, or it is deeper",
-    "affinity": "x and y of the CCD have different scales: it is tilted out of the focal plane, "
-    "seen off axis",
-    "shear": "the CCD's rows and columns are not square to each other: the same tilt, seen in the "
-    "other diagonal",
-    "perspective-x": "the cone's layer converges to the right: its pointing about the flight axis "
-    "was not completely removed",
-    "perspective-y": "the cone's layer converges in flight direction: its pointing about the cross "
-    "axis was not completely removed",
-}
-
 
 @dataclass(frozen=True)
 class Part:

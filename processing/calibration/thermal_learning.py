@@ -278,44 +278,6 @@ def observability(rig: Rig) -> tuple[Observability, ...]:
     return tuple(result)
 
 
-def state_json(state: ThermalState) -> dict[str, Any]:
-    """The state as JSON-ready data; reading it back gives the same numbers, bit by bit.
-
-    Args:
-        state: to be written.
-
-    Returns:
-        What `state_from_json` reads.
-    """
-    return {
-        "rig": state.rig,
-        "calibration_id": state.calibration_id,
-        "places": {name: _normal_json(n) for name, n in state.places.items()},
-        "scales": {name: _normal_json(n) for name, n in state.scales.items()},
-    }
-
-
-def state_from_json(content: Mapping[str, Any]) -> ThermalState:
-    """Read what `state_json` wrote.
-
-    Args:
-        content: parsed JSON.
-
-    Returns:
-        The state.
-
-    Raises:
-        KeyError: a key is missing.
-        ValueError: a number is none, or matrix and vector do not fit.
-    """
-    return ThermalState(
-        str(content["rig"]),
-        str(content["calibration_id"]),
-        {name: _normal_from(n) for name, n in content["places"].items()},
-        {name: _normal_from(n) for name, n in content["scales"].items()},
-    )
-
-
 def _empty(size: int) -> NormalEquations:
     return NormalEquations(np.zeros((2 * size, 2 * size)), np.zeros(2 * size))
 
@@ -459,29 +421,3 @@ def _field_radius_px(rig: Rig, cone: Cone) -> float:
     image = rig.virtual_image
     assert image is not None
     return reach / cone.lens.f_mm * image.f_mm / image.pitch_mm
-
-
-def _normal_json(normal: NormalEquations) -> dict[str, Any]:
-    return {
-        "information": normal.information.tolist(),
-        "vector": normal.vector.tolist(),
-        "squares": normal.squares,
-        "exposures": normal.exposures,
-        "dc_k": [normal.lowest_dc_k, normal.highest_dc_k] if normal.exposures else [],
-    }
-
-
-def _normal_from(content: Mapping[str, Any]) -> NormalEquations:
-    lowest, highest = content["dc_k"] or (math.inf, -math.inf)
-    vector = np.array(content["vector"], np.float64)
-    information = np.array(content["information"], np.float64)
-    if information.shape != (len(vector), len(vector)):
-        raise ValueError(f"information is {information.shape} for {len(vector)} unknowns")
-    return NormalEquations(
-        information,
-        vector,
-        float(content["squares"]),
-        int(content["exposures"]),
-        float(lowest),
-        float(highest),
-    )

@@ -34,7 +34,6 @@ from processing.rig import Sensor
 
 Array = NDArray[Any]
 
-LEVEL1_NO_DATA: Final = 0
 LEVEL1_FLOOR: Final = 2
 LEVEL1_CEILING: Final = 65534
 SATURATED_BIT: Final = 1

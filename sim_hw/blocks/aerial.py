@@ -228,15 +228,6 @@ def small_plan(frame: ImageFormat = ULTRACAM_L, rig: str = "ultracam-l") -> Aeri
     )
 
 
-def frame_of(rig: Rig) -> ImageFormat:
-    """The stitched image of a rig."""
-    image = rig.virtual_image
-    if image is None:
-        raise ValueError(f"rig {rig.name} has no stitched image")
-    half = image.pitch_mm / 2.0
-    return ImageFormat(image.width_px * half, image.height_px * half, image.f_mm, image.pitch_mm)
-
-
 def ccd_pattern(rig: Rig, seed: int, size_mm: float) -> CcdDistortionPattern:
     """Every PAN CCD but the master cone's first off by `size_mm` or so at its edges."""
     random = random_stream(seed, "ccd pattern")

@@ -225,13 +225,6 @@ class Channel(Generic[T]):
                     return []
             return [*self._sent(message, now_ns, topic, what), *released]
 
-    def overdue(self, now_ns: int) -> list[Delivery[T]]:
-        """Reordered messages that nothing has followed; ask now and then."""
-        with self._lock:
-            due = [Delivery(now_ns, message) for _, message in self._reordered]
-            self._reordered.clear()
-            return due
-
     def _sent(self, message: T, now_ns: int, topic: str, what: str) -> list[Delivery[T]]:
         # Here `silent` suppresses some topics; a silent device does not get here.
         if self._take("silent", now_ns, topic, what) is not None:

@@ -13,8 +13,6 @@ from dataclasses import dataclass
 PORT = 3956
 KEY = 0x42
 HEADER_LENGTH = 8
-PACKET_MAX = 576
-"""No GVCP packet is longer, IP and UDP headers included; ours never exceed it."""
 READ_MAX = 536
 ACK_REQUIRED = 0x01
 ALLOW_BROADCAST_ACK = 0x10

@@ -9,10 +9,10 @@ import socket
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from sim_hw.devices.ascii_probe import AsciiProbe
-from sim_hw.devices.device_loop import ByteFilter, LineDevice
+from sim_hw.devices.device_loop import LineDevice
 from sim_hw.devices.modbus_probe import ModbusProbe
 from sim_hw.devices.network_line import UdpLine
 from sim_hw.devices.pseudo_terminal import PseudoTerminal
@@ -42,21 +42,6 @@ RECEIVERS = (*_ON_A_SERIAL_LINE, "mavlink")
 PROBES = tuple(PROBE_BAUDRATES)
 
 Reading = Callable[[], float | None]
-
-
-class StrobedDevice(Protocol):
-    """A device on a line that receives the strobes."""
-
-    wire: ByteFilter
-
-    @property
-    def port(self) -> str: ...
-
-    def mark(self, gps_ns: int) -> None: ...
-
-    def start(self) -> None: ...
-
-    def close(self) -> None: ...
 
 
 @dataclass(frozen=True)

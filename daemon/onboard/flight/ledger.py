@@ -259,12 +259,6 @@ class Ledger:
         """Exposures without a final state, ascending."""
         return sorted(n for n, e in self._entries.items() if e.status.state is ExposureState.OPEN)
 
-    def unsealed_numbers(self) -> list[int]:
-        """Exposures whose record is not final, ascending."""
-        return sorted(
-            n for n, e in self._entries.items() if e.status.storage is not StorageState.SEALED
-        )
-
     def imbalances(
         self, delivered: Mapping[str, int] | None = None, *, has_landed: bool = False
     ) -> list[str]:

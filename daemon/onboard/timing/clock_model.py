@@ -138,15 +138,6 @@ class ClockModel:
         self._since_gate += 1
         return True
 
-    def withdraw(self, key: Hashable) -> None:
-        """Forget the pair of that key, if it is still there."""
-        retained = [pair for pair in self._pairs if pair.key != key]
-        if len(retained) < len(self._pairs):
-            self._pairs = retained
-            self._fit = self._gate = None
-        self._rejected = [pair for pair in self._rejected if pair.key != key]
-        self._recent = deque((pair for pair in self._recent if pair.key != key), RECENT_PAIRS)
-
     def clear(self) -> None:
         """Forget everything."""
         self._pairs.clear()

@@ -115,9 +115,6 @@ class _PulseLateness:
         while len(self._residuals) > RESIDUALS_MAX:
             del self._residuals[next(iter(self._residuals))]
 
-    def withdraw(self, key: Hashable) -> None:
-        self._residuals.pop(key, None)
-
     def clear(self) -> None:
         self._residuals.clear()
 
@@ -229,11 +226,6 @@ class GpsClock:
         self._pulses_since_mark = 0
         self._awaits_mark = True
 
-    def mark_withdrawn(self, key: Hashable) -> None:
-        """A mark was another pulse's after all."""
-        self._marks.withdraw(key)
-        self._lateness.withdraw(key)
-
     def restart(self) -> None:
         """Forget everything: the receiver's time has stepped. Edges remain, nameless."""
         self._marks.clear()
@@ -305,11 +297,6 @@ class GpsClock:
         else:
             estimate, own_ns = self._marks.at(mono_ns), 0.0
         return 0 if estimate is None else round(math.hypot(estimate.sigma_ns, own_ns))
-
-    def lateness_of(self, gps_ns: int, mono_ns: int) -> int | None:
-        """How long after `gps_ns` the host instant was; None before anything is known."""
-        estimate = self.gps_at(mono_ns)
-        return None if estimate is None else estimate.gps_ns - gps_ns
 
     def events(self, mono_ns: int) -> list[ClockEvent]:
         """Events since the last call."""

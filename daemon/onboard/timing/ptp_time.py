@@ -178,11 +178,6 @@ class PtpTime:
         sigma_ns = math.ceil(max(SIGMA_MIN_NS, math.hypot(spread_ns, common_ns)))
         return PtpInstant(gps_ns_of_tai(tai_ns), sigma_ns)
 
-    def fault_of(self, head: str, mono_ns: int) -> str:
-        """The name of the fault for which a head's PTP time is not used; empty if there is none."""
-        state = self._heads.get(head)
-        return "" if state is None else self._fault_of(state, mono_ns)
-
     def events(self, mono_ns: int) -> list[ClockEvent]:
         """Events since the last call."""
         for head, state in self._heads.items():

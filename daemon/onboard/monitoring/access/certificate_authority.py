@@ -32,8 +32,8 @@ from drivers.base.extras import require
 AUTHORITY_CERTIFICATE, AUTHORITY_KEY = "authority.pem", "authority.key"
 SERVER_CERTIFICATE, SERVER_KEY = "server.pem", "server.key"
 AUTHORITY_DAYS = 3650
-SERVER_DAYS, SERVER_DAYS_MAX = 397, 825
-"""Above the second, tablets of Apple refuse a server certificate (support article 103769)."""
+SERVER_DAYS = 397
+"""Above 825, tablets of Apple refuse a server certificate (support article 103769)."""
 OPENSSL_TIMEOUT_S = 60.0
 NAMES_MAX = 64
 _NAME = re.compile(r"(?=.{1,253}\Z)[a-z0-9]([a-z0-9\-]{0,62})(\.[a-z0-9]([a-z0-9\-]{0,62}))*")

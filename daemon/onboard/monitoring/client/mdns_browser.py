@@ -18,7 +18,6 @@ BROWSE_S: Final = 3.0
 QUERY_TIMEOUT_S: Final = 1.0
 QUERY_TOTAL_S: Final = 6.0
 SERVICES_MAX: Final = 32
-KEYS_MAX: Final = 32
 TEXT_MAX: Final = 40
 
 

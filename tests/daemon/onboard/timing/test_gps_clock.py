@@ -153,18 +153,6 @@ def test_a_message_that_was_held_up_moves_nothing_and_one_from_the_future_is_no_
     assert "receiver-stepped" in [event.name for event in clock.events(18 * NS)]
 
 
-def test_a_mark_taken_back_leaves_the_clock_as_if_it_had_never_been() -> None:
-    with_it, without = GpsClock(), GpsClock()
-    for clock in (with_it, without):
-        for number in range(5):
-            mono_ns = number * 2 * NS
-            clock.mark_matched(OFFSET_NS + mono_ns, mono_ns, 50_000, key=number)
-    with_it.mark_matched(OFFSET_NS + 10 * NS + 90_000, 10 * NS, 50_000, key="wrong")
-    assert with_it.gps_at(12 * NS) != without.gps_at(12 * NS)
-    with_it.mark_withdrawn("wrong")
-    assert with_it.gps_at(12 * NS) == without.gps_at(12 * NS)
-
-
 def test_all_pulses_late_alike_are_seen_through_by_edges_and_marks() -> None:
     rng = random.Random(11)
     clock = GpsClock()

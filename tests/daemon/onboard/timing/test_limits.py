@@ -63,8 +63,6 @@ def test_messages_alone_leave_350_ms_plus_minus_700_over_the_root_of_12() -> Non
     assert (estimate.coasting_ns, estimate.in_holdover) == (0, False)
     assert clock.sigma_of(0, "messages") == 202_072_594
     assert clock.sigma_of(0, "pps") == clock.sigma_of(0, "marks") == 0
-    assert clock.lateness_of(GPS_NS, 0) == 290 * MS
-    assert GpsClock().lateness_of(GPS_NS, 0) is None
 
 
 @pytest.mark.parametrize(
@@ -103,8 +101,7 @@ def test_lateness_weighs_what_is_seen_against_what_is_stated() -> None:
     lateness.add("a", 100.0, 10.0)
     # One reading of sigma 10 against a prior of sigma 30: a share of 0.9.
     assert lateness.estimate(30.0, 10.0) == pytest.approx((90.0, math.sqrt(190.0)))
-    lateness.withdraw("a")
-    lateness.withdraw("b")
+    lateness.clear()
     assert lateness.estimate(3.0, 4.0) == (0.0, 5.0)
 
 

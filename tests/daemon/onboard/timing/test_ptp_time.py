@@ -206,4 +206,3 @@ def test_heads_that_contradict_each_other_give_no_time() -> None:
 
 def test_a_head_that_was_never_asked_has_no_time() -> None:
     assert PtpTime().at("SU00", TAI_NS, 0) is None
-    assert PtpTime().fault_of("SU00", 0) == ""
