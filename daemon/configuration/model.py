@@ -123,6 +123,10 @@ class PlanSection(_ConfigurationSection):
     """Plan with the lines: GeoJSON, KML or QGroundControl's .plan."""
     corridor_m: float | None = Field(default=None, gt=0)
     """Maximum distance from a line; default: a quarter of the image's width."""
+    across_tolerance_m: float | None = Field(default=None, gt=0)
+    """Distance from a line that raises an alarm; default: what the overlap tolerance permits."""
+    height_tolerance_m: float | None = Field(default=None, gt=0)
+    """Deviation from the planned height that raises an alarm; default: from overlap and GSD."""
     ground_height_m: float = 0.0
     """Mean height of the ground above the ellipsoid."""
     height_above_ground_m: float = Field(default=1000.0, gt=0)

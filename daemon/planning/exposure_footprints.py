@@ -10,6 +10,12 @@ from typing import Any
 from daemon.configuration.model import MountSection, PlanSection
 from daemon.mission.exposure import Exposure
 from daemon.mission.layout import Mission
+from daemon.mission.operator_decisions import (
+    OperatorDecision,
+    manual_verdicts,
+    read_decisions,
+    summary_of,
+)
 from daemon.orientation.exterior_orientation import mount_of, sealed_exposures
 from daemon.orientation.footprints import footprint_corners
 from daemon.planning.image_counts import ExposureFootprint
@@ -27,14 +33,33 @@ NO_FOOTPRINT = "its footprint is not known, since position or attitude are missi
 def exposure_footprints(mission: Mission, specification: Specification) -> list[ExposureFootprint]:
     """Every exposure that is sealed, with its footprint on level ground and its valid area.
 
-    One without position or attitude sees nothing that is known: its footprint is empty.
+    One without position or attitude sees nothing that is known: its footprint is empty. A manual
+    verdict replaces the computed one.
+
+    Raises:
+        RecordError: `operator-decisions.json` is damaged.
     """
     rig = load_rig(mission.rig_path)
     mount, plan = mount_of(mission)
+    manual = manual_verdicts(read_decisions(mission.path))
     return [
-        _footprint_of(exposure, _quality(mission, exposure.number), rig, mount, plan, specification)
+        _footprint_of(
+            exposure,
+            _quality(mission, exposure.number),
+            rig,
+            mount,
+            plan,
+            specification,
+            manual.get(exposure.number),
+        )
         for exposure in sealed_exposures(mission).results.values()
     ]
+
+
+def rejection_of(manual: Mapping[str, Any]) -> str:
+    """Why a rejected exposure does not count."""
+    reason = f": {manual['reason']}" if manual.get("reason") else ""
+    return f"rejected by {manual.get('by')}{reason}"
 
 
 def without_valid_area(mission: Mission) -> int:
@@ -71,8 +96,9 @@ def _footprint_of(
     mount: MountSection,
     plan: PlanSection,
     specification: Specification,
+    manual: OperatorDecision | None = None,
 ) -> ExposureFootprint:
-    why = "; ".join(_exclusion_reasons(exposure, quality, specification))
+    why = "; ".join(_exclusion_reasons(exposure, quality, specification, manual))
     there = exposure.navigation
     corners = None if there is None else footprint_corners(rig, mount, there, plan.ground_height_m)
     if there is None or there.height_m is None or corners is None:
@@ -93,10 +119,18 @@ def _footprint_of(
 
 
 def _exclusion_reasons(
-    exposure: Exposure, quality: Mapping[str, Any], specification: Specification
+    exposure: Exposure,
+    quality: Mapping[str, Any],
+    specification: Specification,
+    manual: OperatorDecision | None = None,
 ) -> Iterator[str]:
     if exposure.state == "lost":
         yield "lost"
+    if manual is not None:
+        # The decision of a person replaces what is computed; pixels that are missing stay missing.
+        if manual.kind == "reject":
+            yield rejection_of(summary_of(manual))
+        return
     if quality.get("verdict") == "refly":
         grave = [f["flag"] for f in quality.get("findings", []) if f.get("verdict") == "refly"]
         # Coverage is counted here; an image next to a gap counts as any other.

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from daemon.planning.model import LocalPlane, Plan, PlannedLine, Point
@@ -23,6 +23,8 @@ LATE_SHARE = 0.25
 """A place passed by less than this share of the distance is exposed late, else left out."""
 
 MIN_SPEED_MPS = 1.0
+FLOWN_SHARE = 0.5
+"""A line of which less than this share was passed is not flown."""
 
 
 @dataclass(frozen=True)
@@ -52,22 +54,95 @@ class PlanTrigger:
         distance_m: between two exposures, for lines that do not say so themselves.
         corridor_m: how far from a line, across track, it is still flown.
         min_interval_ns: the camera's own; never faster than that.
+        flown: ids of lines that were flown before a restart.
+
+    A retake is a short line on top of a planned one. While it is not flown, the planned line below
+    it, if that is flown, causes no exposures.
     """
 
     def __init__(
-        self, plan: Plan, *, distance_m: float, corridor_m: float, min_interval_ns: int
+        self,
+        plan: Plan,
+        *,
+        distance_m: float,
+        corridor_m: float,
+        min_interval_ns: int,
+        flown: Iterable[str] = (),
     ) -> None:
         self.plan = plan
         self._distance_m = distance_m
         self._corridor_m = corridor_m
         self._min_interval_ns = min_interval_ns
         self._plane = LocalPlane(plan.lines[0].start)
-        self._ends = [
-            (self._plane.flat(line.start), self._plane.flat(line.end)) for line in plan.lines
-        ]
+        self._ends = [self._ends_of(line) for line in plan.lines]
+        self._retakes: list[tuple[PlannedLine, str]] = []
+        self._flown = set(flown)
+        self._resting: set[tuple[str, bool]] = set()
+        """Planned lines below a retake that was just flown, until they are left."""
+        self._entered_m = 0.0
         self._pass: tuple[str, bool] | None = None
         self._next = 0
         self._known: tuple[NavSample | None, LinePosition | None] = (None, None)
+
+    @property
+    def distance_m(self) -> float:
+        """Distance between two exposures on lines that do not state it."""
+        return self._distance_m
+
+    @property
+    def corridor_m(self) -> float:
+        """Distance from a line, across track, within which it is flown."""
+        return self._corridor_m
+
+    @property
+    def flown(self) -> frozenset[str]:
+        """Ids of lines and retakes that are flown."""
+        return frozenset(self._flown)
+
+    @property
+    def retakes(self) -> tuple[PlannedLine, ...]:
+        """Retakes in the order in which they were requested."""
+        return tuple(line for line, _ in self._retakes)
+
+    def add_retake(self, retake: PlannedLine, of: str) -> None:
+        """Add a line to be flown again.
+
+        Args:
+            retake: the segment, with an id of its own.
+            of: id of the planned line that it belongs to.
+        """
+        self._retakes.append((retake, of))
+        self._ends.insert(len(self._retakes) - 1, self._ends_of(retake))
+        self._known = (None, None)
+
+    def advance(self, now_ns: int, nav: NavSample | None) -> LinePosition | None:
+        """The line that is flown or lies straight ahead; lines behind are noted as flown."""
+        here = self.on_line(nav)
+        if here is not None and here.speed_mps >= MIN_SPEED_MPS:
+            self._follow(here, now_ns)
+        return here
+
+    def upcoming(self, after: str | None = None) -> Sequence[PlannedLine]:
+        """Lines that are not flown, pending retakes first, then in the order of the plan.
+
+        Args:
+            after: id of the line that is flown now; it is left out, and the planned lines begin
+                behind it.
+        """
+        ids = [line.id for line in self.plan.lines]
+        first = ids.index(after) + 1 if after in ids else 0
+        planned = (*self.plan.lines[first:], *self.plan.lines[:first])
+        return [
+            line
+            for line in (*self.retakes, *planned)
+            if line.id not in self._flown and line.id != after
+        ]
+
+    def places_of(self, line: PlannedLine, *, is_reversed: bool) -> Sequence[float]:
+        """Planned exposures along a line in flight direction, m."""
+        (x0, y0), (x1, y1) = self._ends_of(line)
+        length_m = math.hypot(x1 - x0, y1 - y0)
+        return places_m(line, length_m, self._distance_m, is_reversed=is_reversed)
 
     def due(self, now_ns: int, last_fired_ns: int | None, nav: NavSample | None) -> int | None:
         """Host time of the next exposure; None while no line is flown, or it has been."""
@@ -118,7 +193,8 @@ class PlanTrigger:
         at = self._plane.flat(Point(*nav.position))
         found = [
             self._on(line, ends, at, (east, north), nav.mono_ns)
-            for line, ends in zip(self.plan.lines, self._ends, strict=True)
+            for line, ends in zip((*self.retakes, *self.plan.lines), self._ends, strict=True)
+            if not self._is_done(line)
         ]
         near = [
             one
@@ -128,7 +204,24 @@ class PlanTrigger:
             and one.speed_mps >= speed_mps * math.cos(COURSE_TOLERANCE_RAD)
             and one.along_m <= one.length_m + self._step_m(self._places_m(one))
         ]
-        return min(near, key=_distance_key, default=None)
+        self._resting &= {(one.line.id, one.is_reversed) for one in near}
+        waiting = {of for retake, of in self._retakes if retake.id not in self._flown}
+        candidates = [
+            one
+            for one in near
+            if not (one.line.id in waiting and one.line.id in self._flown)
+            and (one.line.id, one.is_reversed) not in self._resting
+        ]
+        return min(candidates, key=_distance_key, default=None)
+
+    def _is_done(self, line: PlannedLine) -> bool:
+        """Whether a retake is flown and left; the pass that flies it is completed first."""
+        is_current = self._pass is not None and self._pass[0] == line.id
+        is_retake = any(line.id == retake.id for retake, _ in self._retakes)
+        return is_retake and line.id in self._flown and not is_current
+
+    def _ends_of(self, line: PlannedLine) -> tuple[tuple[float, float], tuple[float, float]]:
+        return self._plane.flat(line.start), self._plane.flat(line.end)
 
     def _on(
         self,
@@ -160,12 +253,20 @@ class PlanTrigger:
         """The places of the line that is flown; those that were missed are left behind."""
         places, along_m = self._places_m(here), here.along_at_m(now_ns)
         step_m = self._step_m(places)
-        is_again = self._next > 0 and along_m < places[self._next - 1] - step_m
-        if is_again or self._pass != (here.line.id, here.is_reversed):
+        is_same = self._pass == (here.line.id, here.is_reversed)
+        if not is_same or (self._next > 0 and along_m < places[self._next - 1] - step_m):
             self._pass, self._next = (here.line.id, here.is_reversed), 0
+            self._entered_m = along_m
         late_m = LATE_SHARE * step_m
         while self._next < len(places) and along_m > places[self._next] + late_m:
             self._next += 1
+        passed_m = min(along_m, here.length_m) - max(self._entered_m, 0.0)
+        if along_m >= places[-1] and passed_m >= FLOWN_SHARE * here.length_m:
+            self._flown.add(here.line.id)
+            resting = {
+                of for retake, of in self._retakes if retake.id == here.line.id
+            } & self._flown
+            self._resting |= {(of, here.is_reversed) for of in resting}
         return places
 
     def _places_m(self, here: LinePosition) -> Sequence[float]:

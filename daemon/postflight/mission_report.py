@@ -17,6 +17,7 @@ from daemon import DaemonError
 from daemon.mission.exposure import Exposure, to_json
 from daemon.mission.exposure_batch import ExposureFailure, cause_of, for_each_exposure
 from daemon.mission.layout import Mission
+from daemon.mission.operator_decisions import manual_verdicts, read_decisions
 from daemon.mission.store.durable import make_directories, replace_file
 from daemon.mission.store.level0_folder import read_sealed
 from daemon.mission.store.level2 import read_report
@@ -69,6 +70,9 @@ def write_report(
     folder = Mission.open(mission)
     read = for_each_exposure(folder.numbers(), lambda number: _exposure(folder, number))
     exposures = [exposure for exposure, _ in read.results.values()]
+    manual = manual_verdicts(read_decisions(mission))
+    for exposure in exposures:
+        exposure["manual"] = manual.get(exposure["number"])
     failures = [*read.failures, *(one for _, found in read.results.values() for one in found)]
     displacements = (
         flight_displacements(mission) if out is not None else write_displacements(mission)

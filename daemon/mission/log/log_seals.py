@@ -15,13 +15,14 @@ from pydantic import BaseModel
 from daemon.mission.canonical_json import RecordError, parse_record, plain_name
 from daemon.mission.layout import Mission
 from daemon.mission.log.flight_log import logs_of
+from daemon.mission.operator_decisions import DECISIONS_FILE
 from daemon.mission.record_types import Count, read_record
 from daemon.mission.store import durable
 from daemon.mission.store.level0_folder import hash_file
 from daemon.mission.verification.chain_file import ChainFile, LogSeal
 
 SEALS_FILE = "seals.json"
-CHANGING_FILES = ("overrides.json",)
+CHANGING_FILES = ("overrides.json", DECISIONS_FILE)
 """Files that a running service may still replace; the closing line has their hashes."""
 
 

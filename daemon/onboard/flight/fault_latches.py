@@ -94,6 +94,8 @@ class FaultLatches:
                 self.clear_fault(fault)
         elif kind in ("disk-joined", "disk-released"):
             self.clear_fault(f"disk {event.get('disk')}")
+        elif kind == "deviation" and not event.get("fault"):
+            self.clear_fault("deviation")
         elif kind in _FAULT_OF_EVENT:
             fault, device = _FAULT_OF_EVENT[kind]
             self.raise_fault(fault, sentence, device, sequence=sequence)
@@ -206,6 +208,8 @@ _FAULT_OF_EVENT: Mapping[object, tuple[str, str]] = {
     "not-written": ("disk", "disk"),
     "power": ("power", "power"),
     "override": ("override", "service"),
+    "deviation": ("deviation", "guidance"),
+    "decisions": ("decisions", "service"),
 }
 """Faults and their device, by the event that raises them."""
 _KEYS = ("id", "device", "sentence", "count")

@@ -95,6 +95,11 @@ class Flight:
         self._next_number = first_number
 
     @property
+    def last_number(self) -> int:
+        """Number of the last ordered exposure; 0 before the first."""
+        return self._next_number - 1
+
+    @property
     def open_numbers(self) -> tuple[int, ...]:
         """Exposures that are not sealed or given up yet."""
         return tuple(self._open)

@@ -17,6 +17,7 @@ from typing import Any
 from daemon import DaemonError
 from daemon.mission.canonical_json import RecordError
 from daemon.mission.layout import Mission
+from daemon.mission.operator_decisions import read_decisions
 from daemon.onboard.monitoring.flight_state import FlightState
 from daemon.onboard.service.monitoring_link import summary
 from daemon.orientation.exterior_orientation import sealed_exposure
@@ -37,6 +38,8 @@ async def backfill_exposures(state: FlightState, path: Path, on_batch: Callable[
             for sealed, report in part:
                 state.add_sealed(sealed, report)
             on_batch()
+        state.add_decisions(await asyncio.to_thread(read_decisions, path))
+        on_batch()
     except (OSError, DaemonError) as error:
         _log.error("earlier exposures of %s could not be loaded: %s", path, error)
 

@@ -18,7 +18,7 @@ from daemon.configuration.model import PlanSection
 from daemon.mission.layout import Mission
 from daemon.onboard.monitoring.flight_state import FlightState
 from daemon.orientation.exterior_orientation import mount_of
-from daemon.planning.exposure_footprints import NO_FOOTPRINT, area_and_cause
+from daemon.planning.exposure_footprints import NO_FOOTPRINT, area_and_cause, rejection_of
 from daemon.planning.image_counts import ExposureFootprint
 from daemon.planning.image_size import image_on_ground_m
 from daemon.planning.model import LocalPlane, Plan, PlannedLine, Point
@@ -93,7 +93,32 @@ class Coverage:
             "name": plan.name,
             "lines": [_line_json(line, self._context) for line in plan.lines],
             "specification": vars(plan.specification),
+            "retakes": self._state.retakes(),
         }
+
+    def station_m(self, number: int) -> tuple[str, float] | None:
+        """The planned line of an exposure and its station on it, m from the start.
+
+        Args:
+            number: the exposure.
+
+        Returns:
+            Id of the line that it was made for, or else of the nearest one; None without a plan or
+            without a position.
+        """
+        self.update()
+        exposure = self._state.exposure(number)
+        if self._context is None or exposure is None:
+            return None
+        place = exposure.get("place") or {}
+        if place.get("latitude_deg") is None or place.get("longitude_deg") is None:
+            return None
+        at = Point(place["latitude_deg"], place["longitude_deg"])
+        lines = self._context.plan.lines
+        own = [line for line in lines if line.id == exposure.get("line")]
+        stations = [(line.id, *_station_of(line, at)) for line in own or lines]
+        nearest = min(stations, key=lambda one: abs(one[2]))
+        return nearest[0], nearest[1]
 
     def advice_task(self) -> Callable[[], ReflightPlan] | None:
         """The computation of remaining and repeated segments; it may run in any thread."""
@@ -162,6 +187,15 @@ class Coverage:
     def distance_m(self) -> float:
         """Distance between two exposures for the required overlap."""
         return self._context.base_m if self._context else 0.0
+
+
+def _station_of(line: PlannedLine, place: Point) -> tuple[float, float]:
+    """Distance along a line and to the right of it, m."""
+    plane = LocalPlane(line.start)
+    east, north = plane.flat(line.end)
+    length_m = math.hypot(east, north) or 1.0
+    x, y = plane.flat(place)
+    return (x * east + y * north) / length_m, (x * north - y * east) / length_m
 
 
 def advice_json(advice: ReflightPlan, coverage: Coverage) -> dict[str, Any]:
@@ -251,6 +285,9 @@ def _exclusion_reason(one: Mapping[str, Any]) -> str:
     """The reason why an exposure is excluded; empty if it counts."""
     if one.get("state") == "lost":
         return "lost"
+    manual = one.get("manual")
+    if manual:
+        return rejection_of(manual) if manual.get("kind") == "reject" else ""
     if one.get("verdict") != "refly":
         return ""
     grave = [f["flag"] for f in one.get("findings", []) if f.get("verdict") == "refly"]

@@ -7,9 +7,10 @@ events when it is full. The `status` event corrects the essential state once a s
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
+from daemon.mission.operator_decisions import OperatorDecision, manual_verdicts, summary_of
 from daemon.onboard.flight.fault_latches import (
     DELIVERING,
     FIXED,
@@ -85,9 +86,17 @@ class FlightState:
         self._events: deque[Json] = deque(maxlen=EVENTS_MAX)
         self._history: deque[Json] = deque(maxlen=HISTORY_MAX)
         self._track: deque[Json] = deque(maxlen=HISTORY_MAX)
+        self._retakes: list[Json] = []
+        self.guidance: Mapping[str, Any] = {}
+        """The last guidance; it has no sequence, since the next one replaces it."""
+        self.guidance_count = 0
 
     def apply(self, event: Mapping[str, Any]) -> None:
         """Apply one event of the service; an unknown kind is only listed."""
+        if event.get("event") == "guidance":
+            self.guidance = {key: value for key, value in event.items() if key != "event"}
+            self.guidance_count += 1
+            return
         self.sequence += 1
         kind = str(event.get("event", ""))
         self._latches.apply(event, sequence=self.sequence)
@@ -109,6 +118,7 @@ class FlightState:
             "faults": self.faults(),
             "last_number": max(self._exposures, default=None),
             "verdicts": self._verdict_counts(),
+            **({"retakes": len(self._retakes)} if self._retakes else {}),
         }
 
     def changed(self, part: str, after: int) -> list[Json]:
@@ -158,6 +168,18 @@ class FlightState:
     def exposure(self, number: int) -> Json | None:
         return self._exposures.get(number)
 
+    def retakes(self) -> list[Json]:
+        """Lines that were added to be flown again."""
+        return list(self._retakes)
+
+    def add_decisions(self, decisions: Sequence[OperatorDecision]) -> None:
+        """Add the manual verdicts of an earlier run; received events take precedence."""
+        for number, decision in manual_verdicts(decisions).items():
+            record = self._exposures.get(number)
+            if record is not None and "manual" not in record:
+                self.sequence += 1
+                record |= {"sequence": self.sequence, "manual": summary_of(decision)}
+
     def acknowledge(self, fault: str) -> bool:
         """Acknowledge a fault. A cleared one leaves the list; an active one stays."""
         self.sequence += 1
@@ -182,6 +204,7 @@ class FlightState:
             key: event.get(key) for key in ("id", "path", "resumed", "rig", "simulated", "recovery")
         }
         self._phase = "idle"
+        self._retakes.clear()
 
     def _on_bound(self, event: Mapping[str, Any]) -> None:
         device = self._device(str(event.get("device")))
@@ -290,6 +313,13 @@ class FlightState:
             about = {"number": number, "piece": piece, "pieces": len(found.pieces)}
             self._pieces.append({"sequence": self.sequence, **about, "data": data})
 
+    def _on_manual_verdict(self, event: Mapping[str, Any]) -> None:
+        self._exposure(event)["manual"] = event.get("manual")
+
+    def _on_retake(self, event: Mapping[str, Any]) -> None:
+        keys = ("line", "of", "number", "by", "at", "places_m")
+        self._retakes.append({key: event.get(key) for key in keys})
+
     def _on_not_processed(self, event: Mapping[str, Any]) -> None:
         record = self._exposure(event)
         record |= {"step": "not processed", "sentence": event.get("sentence")}
@@ -364,6 +394,8 @@ _HANDLERS: Mapping[str, Callable[[FlightState, Mapping[str, Any]], None]] = {
     "judged": FlightState._on_verdict,
     "processed": FlightState._on_processed,
     "not-processed": FlightState._on_not_processed,
+    "manual-verdict": FlightState._on_manual_verdict,
+    "retake": FlightState._on_retake,
     "not-written": FlightState._on_not_written,
     "lost": FlightState._on_lost,
     "ended": FlightState._on_ended,

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from fastapi import FastAPI, HTTPException, Response
+from fastapi import FastAPI, HTTPException, Path, Response
 from fastapi.params import Depends
 
 from daemon.onboard.monitoring.coverage import Coverage, advice_json
@@ -17,6 +17,7 @@ KINDS = {
     "fly-again.kml": "application/vnd.google-earth.kml+xml",
     "fly-again.waypoints": "text/plain",
 }
+Number = Annotated[int, Path(ge=1, lt=10**9, description="of the exposure")]
 NO_PLAN = "this mission is flown without a plan ([plan] file)"
 
 
@@ -27,6 +28,14 @@ def add_plan(app: FastAPI, coverage: Coverage, watcher: Depends) -> None:
     async def plan() -> dict[str, Any]:
         """Planned lines and the specification; an empty object without a plan."""
         return coverage.plan_json() or {}
+
+    @app.get("/api/v1/plan/stations/{number}", dependencies=[watcher], tags=["plan"])
+    async def station(number: Number) -> dict[str, Any]:
+        """The planned line of an exposure and its station on it, for a retake."""
+        found = coverage.station_m(number)
+        if found is None:
+            raise HTTPException(404, f"exposure {number} has no place on a planned line")
+        return {"number": number, "line": found[0], "at_m": round(found[1], 1)}
 
     @app.get("/api/v1/advice", dependencies=[watcher], tags=["plan"])
     async def advice() -> dict[str, Any]:

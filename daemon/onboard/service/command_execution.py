@@ -9,7 +9,9 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol, TypeGuard
 
+from daemon import DaemonError
 from daemon.mission.log.log_records import AUDIT_TOPIC, Message, lenient_json_bytes
+from daemon.mission.operator_decisions import DecisionKind
 from daemon.onboard.flight.arming import MissingPrerequisite
 from daemon.onboard.service.command_rules import violation
 from daemon.onboard.service.message_dispatcher import Handlers
@@ -58,6 +60,25 @@ class DiskCommands(Protocol):
     def accept(self, label: str) -> str | None: ...
 
 
+class DecisionCommands(Protocol):
+    """Decisions of operators; `daemon.onboard.service.operator_journal.OperatorJournal`."""
+
+    def decide(
+        self, kind: DecisionKind, number: int | None, reason: str, by: str, role: str
+    ) -> str | None: ...
+    def retake(
+        self,
+        line: str,
+        from_m: float,
+        to_m: float,
+        *,
+        number: int | None,
+        reason: str,
+        by: str,
+        role: str,
+    ) -> str: ...
+
+
 class CommandTarget(Protocol):
     """The service commands act on."""
 
@@ -71,6 +92,8 @@ class CommandTarget(Protocol):
     def exposure(self) -> ExposureCommands: ...
     @property
     def mirror(self) -> DiskCommands: ...
+    @property
+    def journal(self) -> DecisionCommands: ...
     def acknowledge(self, fault: str) -> bool: ...
     def land(self, *, new_mission: bool = False) -> None: ...
 
@@ -308,6 +331,48 @@ def _accept_disk(command: ServiceCommand, flight: CommandTarget) -> Answer:
     return _accepted(command, f"the disk mounted as {label} is synchronized and then used")
 
 
+def _reject(command: ServiceCommand, flight: CommandTarget) -> Answer:
+    return _decide("reject", "rejected; it is to be flown again", command, flight)
+
+
+def _accept(command: ServiceCommand, flight: CommandTarget) -> Answer:
+    return _decide("accept", "accepted; the computed verdict stays recorded", command, flight)
+
+
+def _withdraw(command: ServiceCommand, flight: CommandTarget) -> Answer:
+    return _decide("withdraw", "has its computed verdict again", command, flight)
+
+
+def _decide(
+    kind: DecisionKind, result: str, command: ServiceCommand, flight: CommandTarget
+) -> Answer:
+    number, reason = command.arguments.get("number"), str(command.arguments.get("reason", ""))
+    refusal = flight.journal.decide(kind, number, reason, command.by, command.role)
+    if refusal is not None:
+        return _rejected(command, refusal)
+    return _accepted(command, f"exposure {number} {result}")
+
+
+def _retake(command: ServiceCommand, flight: CommandTarget) -> Answer:
+    given = command.arguments
+    line, from_m, to_m = given.get("line"), given.get("from_m"), given.get("to_m")
+    if not line or from_m is None or to_m is None:
+        return _rejected(command, "retake needs line, from_m and to_m, metres from its start")
+    try:
+        added = flight.journal.retake(
+            str(line),
+            float(from_m),
+            float(to_m),
+            number=given.get("number"),
+            reason=str(given.get("reason", "")),
+            by=command.by,
+            role=command.role,
+        )
+    except DaemonError as error:
+        return _rejected(command, str(error))
+    return _accepted(command, f"line {added} is added to the lines to fly")
+
+
 def _arm_or_reject(command: ServiceCommand, flight: CommandTarget) -> Answer | None:
     """Arm; return the refusal if a prerequisite is missing and not overridden."""
     if flight.line.is_flown:
@@ -351,6 +416,10 @@ _COMMANDS: Mapping[str, Callable[[ServiceCommand, CommandTarget], Answer]] = {
     "acknowledge": _acknowledge,
     "new-mission": _new_mission,
     "exposure": _exposure,
+    "reject": _reject,
+    "accept": _accept,
+    "withdraw": _withdraw,
+    "retake": _retake,
     "release-disk": _release_disk,
     "accept-disk": _accept_disk,
 }

@@ -27,6 +27,10 @@ COMMAND_ROLES: Final[Mapping[str, Role]] = {
     "exposure": "operator",
     "acknowledge": "operator",
     "land": "operator",
+    "reject": "operator",
+    "accept": "operator",
+    "withdraw": "operator",
+    "retake": "operator",
     "new-mission": "administrator",
     "release-disk": "administrator",
     "accept-disk": "administrator",
@@ -41,9 +45,21 @@ class CommandBody(BaseModel):
 
     fault: str | None = Field(default=None, max_length=200, description="which, for acknowledge")
     override: bool = Field(default=False, description="start although something is missing")
-    reason: str | None = Field(default=None, max_length=200, description="why, for override")
+    reason: str | None = Field(
+        default=None, max_length=200, description="for override, reject, accept, retake"
+    )
     disk: Literal["root", "mirror"] | None = Field(
         default=None, description="for release-disk and accept-disk"
+    )
+    number: int | None = Field(
+        default=None, ge=1, lt=10**9, description="exposure, for reject, accept, withdraw, retake"
+    )
+    line: str | None = Field(default=None, max_length=200, description="planned line, for retake")
+    from_m: float | None = Field(
+        default=None, ge=-1e6, le=1e6, description="first station on the line, for retake"
+    )
+    to_m: float | None = Field(
+        default=None, ge=-1e6, le=1e6, description="last station on the line, for retake"
     )
     interval_s: float | None = Field(default=None, gt=0, le=3600, description="for interval")
     count: int = Field(default=0, ge=0, le=10**6, description="for interval; 0: until stopped")

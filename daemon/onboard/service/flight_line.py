@@ -22,8 +22,10 @@ from daemon.onboard.flight.trigger_policies import (
 )
 from daemon.orientation.navigation import ARRIVAL_LATENCY_MAX_NS
 from daemon.planning.image_size import image_on_ground_m
+from daemon.planning.model import LocalPlane, PlannedLine
 from daemon.planning.plan_readers import read_plan
-from daemon.planning.steering import PlanTrigger
+from daemon.planning.retakes import RetakeError, retake_line
+from daemon.planning.steering import FLOWN_SHARE, PlanTrigger, places_m
 from drivers.contract import NavSample
 from processing.rig import Rig
 
@@ -56,6 +58,7 @@ class FlightLine:
         mission: a folder on the disk that exposures go to.
         flown: exposures that were made before.
         plan: flight plan to be steered by, where there is one.
+        flown_lines: number of exposures made before, by the id of their line.
     """
 
     def __init__(
@@ -68,6 +71,7 @@ class FlightLine:
         *,
         plan: Path | None = None,
         free_bytes: Callable[[Path], int] = durable.free_bytes,
+        flown_lines: Mapping[str, int] | None = None,
     ) -> None:
         self._configuration = configuration
         self._rig = rig
@@ -78,7 +82,7 @@ class FlightLine:
         self.guard = DiskSpaceMonitor(configuration.limits, exposure_nbytes, mission, free_bytes)
         self._last_ns: int | None = None
         self._exposure_ns = exposure_times_ns(configuration, rig)
-        self._steering = _steering(configuration, rig, plan)
+        self._steering = _steering(configuration, rig, plan, flown_lines or {})
         self._policy = _policy(configuration, rig)
         if configuration.trigger.mode == "plan" and self._steering is not None:
             self._policy = self._steering
@@ -142,11 +146,44 @@ class FlightLine:
 
     def wait_s(self, now_ns: int) -> float:
         """How long to wait before asking again; 0 where an exposure is due."""
-        due_ns = self._policy.due(now_ns, self._last_ns, self._position())
+        due_ns = self._policy.due(now_ns, self._last_ns, self.position())
         remaining_s = PREDICTION_INTERVAL_S if due_ns is None else (due_ns - now_ns) / NS
         return max(0.0, min(PREDICTION_INTERVAL_S, remaining_s))
 
-    def _position(self) -> NavSample | None:
+    @property
+    def steering(self) -> PlanTrigger | None:
+        """The lines of the plan; None without a plan."""
+        return self._steering
+
+    def add_retake(self, line_id: str, from_m: float, to_m: float) -> PlannedLine:
+        """Add a segment of a planned line that is to be flown again.
+
+        Args:
+            line_id: the planned line.
+            from_m: first station, m from the start of the line.
+            to_m: last station, m.
+
+        Returns:
+            The added line.
+
+        Raises:
+            RetakeError: there is no plan, or the segment is not on a line of it.
+        """
+        steering = self._steering
+        if steering is None:
+            raise RetakeError("this mission is flown without a plan; configure [plan] file")
+        retake = retake_line(
+            steering.plan,
+            line_id,
+            from_m,
+            to_m,
+            distance_m=steering.distance_m,
+            taken=[one.id for one in steering.retakes],
+        )
+        steering.add_retake(retake, of=line_id)
+        return retake
+
+    def position(self) -> NavSample | None:
         """The last position, under the host's time of its own instant.
 
         It arrives 10 to 700 ms later, which would be as much way flown at every exposure. How
@@ -170,7 +207,7 @@ class FlightLine:
 
     def order(self, now_ns: int) -> Order:
         """An exposure that is due: ordered now."""
-        nav = self._position()
+        nav = self.position()
         speed_mps = self._configuration.plan.ground_speed_mps
         if nav is not None and nav.velocity_ned_mps is not None:
             flown_mps = math.hypot(*nav.velocity_ned_mps[:2])
@@ -197,18 +234,31 @@ class FlightLine:
         return self._flight.order(now_ns, line.id, line.strip or line.id)
 
 
-def _steering(configuration: Configuration, rig: Rig, path: Path | None) -> PlanTrigger | None:
-    """The flight plan of a file, where there is one."""
+def _steering(
+    configuration: Configuration, rig: Rig, path: Path | None, exposed: Mapping[str, int]
+) -> PlanTrigger | None:
+    """The flight plan of a file, where there is one.
+
+    A line counts as flown before where at least half of its exposures were made.
+    """
     if path is None:
         return None
     plan, section = read_plan(path), configuration.plan
     along_m, across_m = image_on_ground_m(rig, section.height_above_ground_m)
     by_overlap_m = along_m * (1.0 - plan.specification.forward_overlap)
+    distance_m = configuration.trigger.distance_m or by_overlap_m
+    flown = []
+    for line in plan.lines:
+        length_m = math.hypot(*LocalPlane(line.start).flat(line.end))
+        planned = len(places_m(line, length_m, distance_m)) if length_m else 1
+        if exposed.get(line.id, 0) >= FLOWN_SHARE * planned:
+            flown.append(line.id)
     return PlanTrigger(
         plan,
-        distance_m=configuration.trigger.distance_m or by_overlap_m,
+        distance_m=distance_m,
         corridor_m=section.corridor_m or CORRIDOR_SHARE * across_m,
         min_interval_ns=round(rig.frame_interval_s * NS),
+        flown=flown,
     )
 
 

@@ -15,6 +15,7 @@ from typing import Any
 
 from daemon.mission.exposure import Exposure, TemperatureRecord, navigation_to_json
 from daemon.onboard.flight.fault_latches import DELIVERING, FIXED, SEARCHING, UNAVAILABLE
+from daemon.onboard.service.guidance_feed import GuidanceFeed
 from daemon.onboard.service.messages import Answer, ServiceEvent
 from daemon.onboard.service.startup import ProcessPlan
 from daemon.onboard.service.supervisor import PAGE, Supervisor
@@ -69,6 +70,11 @@ class MonitoringLink:
         while self._backlog and self._try_send(self._backlog[0]):
             self._backlog.popleft()
 
+    def emit_latest(self, event: Mapping[str, Any]) -> None:
+        """Send an event that the next one replaces; it is dropped where others wait."""
+        if self._plan is not None and not self._backlog:
+            self._try_send(ServiceEvent(event))
+
     def _try_send(self, message: ServiceEvent) -> bool:
         try:
             return self._supervisor.try_send(NAME, message)
@@ -114,6 +120,7 @@ def status_event(
     missing: Sequence[str],
     disks: Sequence[Mapping[str, Any]] = (),
     absent: Sequence[str] = (),
+    guidance: GuidanceFeed | None = None,
 ) -> dict[str, Any]:
     """The state of the flight that is sent every second, as plain JSON types.
 
@@ -123,6 +130,7 @@ def status_event(
         missing: the missing prerequisites, with their actions.
         disks: those of a mirrored mission.
         absent: absent devices and data, as text.
+        guidance: lines and deviations of a flight with a plan.
     """
     now_ns = time.monotonic_ns()
     where = None
@@ -154,7 +162,14 @@ def status_event(
         "missing": list(missing),
         **({"disks": [dict(disk) for disk in disks]} if disks else {}),
         "absent": list(absent),
+        **_guidance_status(guidance),
     }
+
+
+def _guidance_status(guidance: GuidanceFeed | None) -> dict[str, Any]:
+    if guidance is None:
+        return {}
+    return {"lines": guidance.lines, "deviations": guidance.deviations}
 
 
 def present_temperatures_c(

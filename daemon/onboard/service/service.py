@@ -11,6 +11,7 @@ import asyncio
 import signal
 import time
 import traceback
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
@@ -18,6 +19,7 @@ from typing import Any
 
 from daemon.configuration.model import Configuration
 from daemon.mission.layout import Mission
+from daemon.mission.operator_decisions import DECISIONS_FILE
 from daemon.mission.verification import recovery
 from daemon.onboard.capture.device_states import DeviceStates
 from daemon.onboard.capture.devices import bound_problem
@@ -43,6 +45,8 @@ from daemon.onboard.preflight.preparation import Preparation
 from daemon.onboard.service.command_execution import CommandHandlers
 from daemon.onboard.service.exposure_sequence import ExposureSequence
 from daemon.onboard.service.flight_line import FlightLine, Order
+from daemon.onboard.service.guidance_feed import PERIOD_S as GUIDANCE_PERIOD_S
+from daemon.onboard.service.guidance_feed import GuidanceFeed
 from daemon.onboard.service.message_dispatcher import MessageDispatcher
 from daemon.onboard.service.messages import (
     AppendToLog,
@@ -54,6 +58,7 @@ from daemon.onboard.service.messages import (
 from daemon.onboard.service.monitoring_link import NAME as WATCH
 from daemon.onboard.service.monitoring_link import MonitoringLink, status_event
 from daemon.onboard.service.notify import Notifier
+from daemon.onboard.service.operator_journal import OperatorJournal
 from daemon.onboard.service.startup import (
     capture_process,
     frame_rings,
@@ -101,6 +106,8 @@ class Service:
         self.stopping = asyncio.Event()
         self.changed = asyncio.Event()
         self.continues = False
+        self._note_verdict: Events = lambda _: None
+        self.guidance: GuidanceFeed | None = None
         self.mission_lock = ExitStack()
         self.preparation = Preparation(configuration, rig, config_path, self._event, self._fail)
         self.dispatcher = MessageDispatcher()
@@ -129,6 +136,7 @@ class Service:
             tasks = [
                 loop.create_task(self._run_sequence()),
                 loop.create_task(self._monitor_processes()),
+                loop.create_task(self._guide()),
                 loop.create_task(self._fly()),
             ]
             for task in tasks:
@@ -194,7 +202,18 @@ class Service:
         self.line = FlightLine(
             self.configuration, self.rig, self.flight, mission.path, flown,
             plan=mission.plan_path, free_bytes=self.mirror.free_bytes,
+            flown_lines=Counter(one.line_id for one in report.finalized),
         )  # fmt: skip
+        self.journal = OperatorJournal(
+            mission.path, self.line, self._save_decisions, self._event,
+            lambda: self.flight.last_number,
+        )  # fmt: skip
+        self._note_verdict = self.journal.note
+        if (steering := self.line.steering) is not None:
+            self.guidance = GuidanceFeed(
+                steering, self.configuration.plan, self.rig, self.line.position,
+                self.monitoring.emit_latest, self._event,
+            )  # fmt: skip
         self.exposure = ExposureController(
             self.configuration, self.rig, self.flight, send, self._event
         )
@@ -268,6 +287,9 @@ class Service:
         if problem is not None:
             self._fail(problem)
 
+    def _save_decisions(self, content: bytes) -> None:
+        self.mirror.save_now(f"{self.mission.id}/{DECISIONS_FILE}", content)
+
     # In flight
 
     async def _run_sequence(self) -> None:
@@ -278,6 +300,12 @@ class Service:
                 self.line.set_exposure_times(self.exposure.times_ns)
             wait_s = PING_S if next_ns is None else (next_ns - time.monotonic_ns()) * 1e-9
             await self._wait(min(max(wait_s, WAIT_MIN_S), PING_S))
+
+    async def _guide(self) -> None:
+        """Send guidance for every navigation sample."""
+        while self.guidance is not None:
+            self.guidance.step()
+            await asyncio.sleep(GUIDANCE_PERIOD_S)
 
     async def _monitor_processes(self) -> None:
         while True:
@@ -349,6 +377,7 @@ class Service:
             missing=list(map(str, self.preflight.missing_prerequisites())),
             disks=self.mirror.status,
             absent=self.absent() if self.is_ready else (),
+            guidance=self.guidance,
         )
 
     def _follow_phase(self) -> None:
@@ -452,6 +481,7 @@ class Service:
     def _event(self, event: str, **content: Any) -> None:
         message = {"event": event, "mono_ns": str(time.monotonic_ns()), **content}
         self.latches.apply(message)
+        self._note_verdict(message)
         self.events(message)
         self.monitoring.emit(message)
 

@@ -9,14 +9,28 @@ from typing import Any
 import pytest
 
 from daemon.mission.exposure import Exposure, NavigationRecord
+from daemon.mission.operator_decisions import OperatorDecision
 from daemon.planning.exposure_footprints import _exclusion_reasons
 from daemon.planning.model import Specification
 
 SPECIFICATION = Specification(tilt_deg=5.0, crab_deg=10.0, time_sigma_ns=1e6)
 
 
-def objections(quality: Mapping[str, Any], **changes: Any) -> list[str]:
-    return list(_exclusion_reasons(Exposure(number=1, **changes), quality, SPECIFICATION))
+def objections(
+    quality: Mapping[str, Any], manual: OperatorDecision | None = None, **changes: Any
+) -> list[str]:
+    return list(_exclusion_reasons(Exposure(number=1, **changes), quality, SPECIFICATION, manual))
+
+
+def test_a_manual_verdict_replaces_the_computed_one_but_not_the_loss() -> None:
+    about = ("anna", "operator", "2026-05-01T10:00:00Z", 1)
+    rejected = OperatorDecision("reject", *about, reason="haze")
+    accepted = OperatorDecision("accept", *about, reason="seen")
+    computed = {"verdict": "refly", "figures": {"tilt_deg": 9.0}}
+    assert objections({}, rejected) == ["rejected by anna: haze"]
+    assert objections(computed, accepted) == []
+    assert objections(computed) == ["refly (quality)", "tilted by 9.0 deg"]
+    assert objections(computed, accepted, state="lost") == ["lost"]
 
 
 @pytest.mark.parametrize(

@@ -253,3 +253,12 @@ def test_of_lines_that_overlap_the_one_that_is_flown_goes_before_the_one_ahead()
         assert here is not None and here.line.id == "near"
         here = trigger(*lines).on_line(at(0.0, 700.0))
         assert here is not None and here.line.id == "ahead"
+
+
+def test_a_line_with_fewer_places_follows_one_with_more() -> None:
+    steering = trigger(line("long", 0.0), line("short", 0.0, 300.0))
+    flown(steering, [((0, -300), (0, 1300))])
+    short = PLANE.place(0.0, 400.0), PLANE.place(0.0, 600.0)
+    steering = trigger(line("long", 0.0), PlannedLine("short", *short))
+    steering.add_retake(PlannedLine("short R1", *short, at_m=(50.0,)), of="long")
+    assert len(flown(steering, [((0, 1300), (0, -300)), ((0, -300), (0, 1300))])) > 11

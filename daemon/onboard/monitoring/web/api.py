@@ -35,6 +35,7 @@ from daemon.onboard.monitoring.access.roles import COMMAND_ROLES, Principal, mis
 from daemon.onboard.monitoring.access.tokens import FailedAttempts, TokenHolder, Tokens
 from daemon.onboard.monitoring.coverage import Coverage
 from daemon.onboard.monitoring.flight_state import EXPOSURES_MAX, PARTS, PREVIEW_PARTS, FlightState
+from daemon.onboard.monitoring.guidance_routes import add_guidance
 from daemon.onboard.monitoring.metrics import exposition
 from daemon.onboard.monitoring.plan_routes import add_plan
 from daemon.onboard.monitoring.telemetry import MIN_BYTES_PER_S, Subscription, packed
@@ -110,6 +111,10 @@ CommandName = Literal[
     "interval",
     "distance",
     "land",
+    "reject",
+    "accept",
+    "withdraw",
+    "retake",
     "acknowledge",
     "new-mission",
     "exposure",
@@ -153,6 +158,7 @@ def create_app(
     _add_products(app, state, access)
     _add_commands(app, state, gateway, access)
     _add_telemetry(app, state, access)
+    add_guidance(app, state, access)
     add_plan(app, coverage or Coverage(state), Depends(access.watch))
     _add_page(app)
     return app
