@@ -471,9 +471,10 @@ def _print(result: Mapping[str, Any]) -> None:
     stats = result["pipeline"]
     if stats:
         console.print(
-            f"pipeline: {stats['processed']} exposures in {stats['seconds']:.0f} s, realtime_factor "
-            f"{stats['realtime_factor']:.2f}, {stats['behind']} deferred as processing behind, "
-            f"{stats['not_processed']} failed; {stats['pipeline_s']['median']:.2f} s each, "
+            f"pipeline: {stats['processed']} exposures in {stats['seconds']:.0f} s, "
+            f"realtime_factor {stats['realtime_factor']:.2f}, {stats['behind']} deferred as "
+            f"processing behind, {stats['not_processed']} failed; "
+            f"{stats['pipeline_s']['median']:.2f} s each, "
             f"{stats['trigger_to_products_s']['median']:.1f} s from trigger to products"
         )
     console.print(

@@ -187,7 +187,8 @@ def main() -> None:
     for m in misreadings:
         print(
             f"| {m.dc_k:g} | {m.off_k:g} | {m.exposures} | {m.misattributed:.1%} | {m.either:.1%} "
-            f"| {m.named:.1%} | {m.flights} | {m.flights_misattributed:.1%} | {m.flights_named:.1%} |"
+            f"| {m.named:.1%} | {m.flights} | {m.flights_misattributed:.1%} | "
+            f"{m.flights_named:.1%} |"
         )
 
 

@@ -379,7 +379,8 @@ class FastFlight:
         self.open_s.append((now_ns - self._ordered_ns[exposure.number]) / NS_PER_S)
 
     def _maintain_head(self, head: DiscreteEventHead, session: _Session, now_ns: int) -> None:
-        """What the driver of a head does between frames; see `drivers.cameras.aravis.aravis_head`."""
+        """What the driver of a head does between frames; see
+        `drivers.cameras.aravis.aravis_head`."""
         is_responding = head.is_responding(now_ns)
         if not session.is_open:
             if is_responding and now_ns >= session.next_try_ns:

@@ -225,7 +225,8 @@ def table(result: Mapping[str, Any]) -> str:
     for name, found in result["faults"].items():
         fault = FAULTS[name]
         lines.append(
-            f"| {fault.description} | `{fault.flag.name}` | {found['exposures']} | {found['missed']} |"
+            f"| {fault.description} | `{fault.flag.name}` | {found['exposures']} | "
+            f"{found['missed']} |"
         )
     return "\n".join(lines)
 

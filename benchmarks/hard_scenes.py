@@ -193,8 +193,8 @@ def table(outcomes: Collection[Outcome]) -> str:
         f"| `{o.scene}`: {SCENES[o.scene].description} | "
         f"![{o.scene}](../../images/hard-scenes/{o.scene}.jpg) | "
         f"{o.inner_rms_px:.3f} / {o.inner_max_px:.3f} | {o.absolute_rms_px:.3f} | "
-        f"{o.stated_px:.3f} | {o.fixed_rms_px:.3f} | {o.tie_points:,} ({o.tie_points_min_overlap}) | "
-        f"{_weak_sensors_text(o.weak_sensors)} | {o.verdict}{_flag_text(o)} |"
+        f"{o.stated_px:.3f} | {o.fixed_rms_px:.3f} | {o.tie_points:,} ({o.tie_points_min_overlap}) "
+        f"| {_weak_sensors_text(o.weak_sensors)} | {o.verdict}{_flag_text(o)} |"
         for o in outcomes
     ]
     return "\n".join(lines)

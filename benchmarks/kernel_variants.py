@@ -1,7 +1,8 @@
 """Record the argument types that each kernel is compiled for, and the time that takes.
 
 `python -m benchmarks.kernel_variants` compiles into an empty cache and writes
-`processing/pipelines/kernel_variants.toml`. Run it after a kernel, or how it is called, has changed.
+`processing/pipelines/kernel_variants.toml`. Run it after a kernel, or how it is called, has
+changed.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Times of reading records and rig files: `python -m benchmarks.record_reading`.
 
-Prints the shortest CPU time of nine rounds for one record of 13 frames, one position of the flight log,
-and one rig file.
+Prints the shortest CPU time of nine rounds for one record of 13 frames, one position of the flight
+log, and one rig file.
 """
 
 from __future__ import annotations

@@ -170,8 +170,8 @@ class PpsEdge:
 
     The edge does not identify the second.
 
-    `mono_ns` is corrected for the known latency of the source; `sigma_ns` is its standard deviation.
-    `sequence` is the source's own count of edges.
+    `mono_ns` is corrected for the known latency of the source; `sigma_ns` is its standard
+    deviation. `sequence` is the source's own count of edges.
     """
 
     source: str
@@ -198,9 +198,9 @@ class ClockReading:
 class PtpReading:
     """What a device reports of its clock's synchronisation by PTP (IEEE 1588).
 
-    `status` is the state of its port as GenICam names it: "Slave", "Master", "Listening" and others.
-    `offset_ns` is its clock less its master's, None if it was not read. `grandmaster` is the
-    identity of the grandmaster, of its master if it reports no grandmaster, or empty.
+    `status` is the state of its port as GenICam names it: "Slave", "Master", "Listening" and
+    others. `offset_ns` is its clock less its master's, None if it was not read. `grandmaster` is
+    the identity of the grandmaster, of its master if it reports no grandmaster, or empty.
     """
 
     device: str

@@ -1,8 +1,8 @@
 """`python -m tests.audit`: known vulnerabilities of what is in requirements.lock and in the page.
 
-Asks the advisory database of OSV in one request. If it is not available, that is printed in capitals
-and the exit status is 0, with `--required` 2; it is 1 where an advisory matches that nobody has
-looked at.
+Asks the advisory database of OSV in one request. If it is not available, that is printed in
+capitals and the exit status is 0, with `--required` 2; it is 1 where an advisory matches that
+nobody has looked at.
 
 Source: https://google.github.io/osv.dev/post-v1-querybatch/.
 """

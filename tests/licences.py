@@ -1,8 +1,8 @@
 """`python -m tests.licences`: the licence of everything in requirements.lock, and what may not be.
 
 Licences are those the installed packages state of themselves. `--write` writes
-docs/reference/contributing/licences.md; without it the exit status is 1 where a licence is on no list or the
-page is not current.
+docs/reference/contributing/licences.md; without it the exit status is 1 where a licence is on no
+list or the page is not current.
 """
 
 from __future__ import annotations
@@ -127,7 +127,8 @@ def page(found: Iterable[Package]) -> str:
     lines = [
         "# Licences",
         "",
-        "Reference. Syntopic is under Apache-2.0. The licences of the packages in requirements.lock,",
+        "Reference. Syntopic is under Apache-2.0. The licences of the packages in "
+        "requirements.lock,",
         "written by `python -m tests.licences --write` and checked by a test:",
         "",
         "## In the product",
@@ -140,7 +141,8 @@ def page(found: Iterable[Package]) -> str:
             if not p.is_tool
         ),
         "",
-        "Vendored with the page: Leaflet (BSD-2-Clause) and uPlot (MIT), with their licences next to",
+        "Vendored with the page: Leaflet (BSD-2-Clause) and uPlot (MIT), with their licences next "
+        "to",
         "them. Wheels carry libraries of their own whose licences are in the wheels: OpenBLAS and",
         "the GCC runtime in numpy and scipy, FFmpeg (LGPL) in opencv, GDAL and PROJ in rasterio",
         "and pyproj.",

@@ -22,7 +22,8 @@ def expected_reasons() -> dict[str, str]:
 
 
 def need_of(reason: str, expected: Mapping[str, str]) -> str | None:
-    """What the test needs that was skipped for this reason; None where the list has no such skip."""
+    """What the test needs that was skipped for this reason; None where the list has no such
+    skip."""
     for pattern, need in expected.items():
         if re.fullmatch(pattern, reason, re.DOTALL):
             return need

@@ -1,4 +1,4 @@
-"""Counts of the structure of one or more revisions: `python -m tests.structure HEAD [REVISION ...]`.
+"""Counts of the structure of revisions: `python -m tests.structure HEAD [REVISION ...]`.
 
 Words to avoid, entries of the packages' first level, small files, long signatures, classes of the
 same name, docstrings, lines. Of a revision what git holds is counted, not the work tree.

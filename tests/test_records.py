@@ -63,8 +63,8 @@ def test_a_record_becomes_tables_and_sentences_with_their_source() -> None:
     text = rendered("flags", Record.model_validate(VALID), ROOT / "docs" / "a" / "b.md")
     assert text == (
         "| a | b |\n| --- | --- |\n| 1 | |\n\nOne is 1.\n\n"
-        "Record [flags](../../benchmarks/records/flags.json): `python -m benchmarks.flags`; Intel Xeon, 2\n"
-        "cores; 2026-11-22.\n"
+        "Record [flags](../../benchmarks/records/flags.json): `python -m benchmarks.flags`; Intel "
+        "Xeon, 2\ncores; 2026-11-22.\n"
     )
 
 

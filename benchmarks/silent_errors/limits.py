@@ -41,7 +41,9 @@ LIMITS: Final[Mapping[str, Limit]] = {
     "sensor-rotated": Limit("a sensor of a cone of several rotated", "urad", {X: 500.0}),
     "slip": Limit("lines of a frame shifted by 1 to 4 px", "lines", _same_limit(STITCHED, 80.0)),
     "blur": Limit("a PAN head blurred", "px (sigma)", _same_limit(STITCHED, 1.0)),
-    "blur-region": Limit("a quarter of a PAN frame blurred", "px (sigma)", _same_limit(STITCHED, 1.5)),
+    "blur-region": Limit(
+        "a quarter of a PAN frame blurred", "px (sigma)", _same_limit(STITCHED, 1.5)
+    ),
     "blur-band": Limit("a colour head blurred", "px (sigma)", {X: 2.5, L: 1.5, DMC: 1.5}),
     "smear": Limit("a PAN head smeared along or across", "px", _same_limit(STITCHED, 4.0)),
     "gain-step": Limit("signal of a PAN frame from one line on", "%", _same_limit(EVERY, 8.0)),
@@ -57,12 +59,16 @@ LIMITS: Final[Mapping[str, Limit]] = {
     "block-offset-colour": Limit(
         "a block of a colour frame brighter", "DN", _same_limit(STITCHED, 160.0)
     ),
-    "clipping": Limit("pixels of a PAN head clipped below full scale", "%", _same_limit(STITCHED, 2.0)),
+    "clipping": Limit(
+        "pixels of a PAN head clipped below full scale", "%", _same_limit(STITCHED, 2.0)
+    ),
     "exposure-pan": Limit("exposure time of a PAN head", "%", _same_limit((X, DMC), 8.0)),
     "exposure-stated": Limit("exposure time stated of a PAN head", "%", _same_limit((X,), 8.0)),
     "exposure-colour": Limit("exposure time of a colour head, wrong in the record", "%", {}),
     "exposure-unknown": Limit(
-        "exposure time of a colour head halved and not in the record", "", _same_limit(STITCHED, 1.0)
+        "exposure time of a colour head halved and not in the record",
+        "",
+        _same_limit(STITCHED, 1.0),
     ),
     "probes-all": Limit("all probes alike", "K", {X: 2.0}),
     "probe-one": Limit("one probe of a PAN cone", "K", {X: 2.0, L: 8.0, DMC: 8.0}),

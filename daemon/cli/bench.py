@@ -16,8 +16,8 @@ from daemon.terminal.console import Console, light_table
 
 HELP = """Time the pipeline on one emulated exposure of a rig and compare it with other software.
 
-The exposure (dC 12 K, one sensor displaced) is rendered once by a separate process and cached. Timed
-in turn: the pipeline from Level-0 in memory to Level-2 on the disk, the fixed method, a copy
+The exposure (dC 12 K, one sensor displaced) is rendered once by a separate process and cached.
+Timed in turn: the pipeline from Level-0 in memory to Level-2 on the disk, the fixed method, a copy
 of the same bytes; then the pace with exposures side by side, as the service works (realtime_factor
 is the frame interval over the time per exposure); then a bare cv2.remap, and nona + enblend where
 they are installed (Debian packages hugin-tools, enblend). Geometry is compared with the truth.

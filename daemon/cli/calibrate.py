@@ -47,8 +47,8 @@ Examples: `syntopic calibrate thermal MISSION...`, `syntopic calibrate thermal A
 VALIDITY_HELP = """Detect displaced sensors and misreading probes, with time and amount.
 
 Combines the stitching of all exposures (`mosaic.json` of Level-2). The detection limit is a few
-hundredths of a pixel, lower than that of a single exposure. Writes `export/displacements.json` into the
-mission.
+hundredths of a pixel, lower than that of a single exposure. Writes `export/displacements.json` into
+the mission.
 
 Example: `syntopic calibrate validity MISSION`
 """

@@ -17,8 +17,8 @@ HELP = """Calibrate a complete rig in a 3D calibration field.
 
 Every CCD's shift, rotation, scale and perspective skew, every cone's radial and decentring
 distortion and its rotation against the master cone, by one bundle adjustment. Principal distance
-and point of the cones are fixed, and the first CCD of each cone is not rotated. The new folder holds
-a dated rig file that holds at the recorded temperatures, the covariance, a report and the
+and point of the cones are fixed, and the first CCD of each cone is not rotated. The new folder
+holds a dated rig file that holds at the recorded temperatures, the covariance, a report and the
 comparison with a previous calibration.
 
 Examples: `syntopic calibrate lab SERIES`, `syntopic calibrate lab SERIES --previous lab-2026-05-02`

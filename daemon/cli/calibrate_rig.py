@@ -14,7 +14,7 @@ from daemon.cli.calibration_output import publish_calibration
 from daemon.cli.options import AsJson, NewFolder
 from daemon.terminal.console import Console, light_table
 
-HELP = """Estimate the relative orientation of oblique heads to the nadir head, averaged over a block.
+HELP = """Estimate the relative orientation of oblique heads to the nadir head over a block.
 
 PROJECT is an adjustment project (docs/reference/formats.md) whose cameras are named like the rig's
 cones. The images of an exposure share a projection centre and have separate angles; or the exposure

@@ -70,8 +70,8 @@ def certificate(
         f'  tls_certificate = "{issued.certificate.absolute()}"',
         f'  tls_key = "{issued.key.absolute()}"',
         "",
-        f"{'New authority' if issued.is_new_authority else 'Authority'}: {issued.authority}; install "
-        "it on tablets and ground stations, and compare its SHA-256:",
+        f"{'New authority' if issued.is_new_authority else 'Authority'}: {issued.authority}; "
+        "install it on tablets and ground stations, and compare its SHA-256:",
         f"  {issued.fingerprint}",
         f"Keep {issued.authority.with_suffix('.key')} secret; it is needed only for renewals.",
     ]

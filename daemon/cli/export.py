@@ -14,7 +14,8 @@ from daemon.cli.options import AsJson
 from daemon.terminal.console import Console, light_table
 from drivers.base.extras import require
 
-ORIENTATION_HELP = """Compute the exterior orientation of every cone of every exposure, at mid-exposure.
+ORIENTATION_HELP = """Compute the exterior orientation of every cone at the middle of every
+exposure.
 
 The source is the navigation of the flight or a post-processed trajectory; each trajectory has its
 own folder. Writes CSV, PAT-B, angles for BINGO, footprints (GeoJSON) and STAC items.

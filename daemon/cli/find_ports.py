@@ -1,4 +1,4 @@
-"""`syntopic check --find`: detect protocols at the ports of this computer, with their configuration."""
+"""`syntopic check --find`: detect the protocols at the ports of this computer."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`syntopic init`: find heads and receivers, ask a few questions, write and check the configuration."""
+"""`syntopic init`: find heads and receivers, ask a few questions, write the files."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from daemon.onboard.preflight.check_results import CheckResult
     from drivers.detection.port_search import DetectionResult
 
-HELP = """Find heads and receivers, ask at most eight questions, and write rig.toml and service.toml.
+HELP = """Find heads and receivers, ask at most eight questions, write rig.toml and service.toml.
 
 Heads are found by GigE Vision and USB3 Vision discovery and as V4L2 devices. Receivers are
 recognized at serial ports and usual addresses by their messages. Focal length and pixel size
@@ -184,15 +184,16 @@ def _require_heads(
     problems = list(discovery.problems)
     if unit is None:
         problems += [
-            f"head {one.model} at {one.place} has no software trigger; give --trigger-unit HOST:PORT "
-            "(docs/reference/drivers/pulse-bus.md)"
+            f"head {one.model} at {one.place} has no software trigger; give --trigger-unit "
+            "HOST:PORT (docs/reference/drivers/pulse-bus.md)"
             for one in discovery.heads
             if not one.is_triggerable
         ]
     if not discovery.heads and not problems:
         problems.append(
-            "No head was found. Check power and cables, and that this computer has an address in the "
-            "network of the heads; give --head ADDRESS for a head that does not answer the discovery"
+            "No head was found. Check power and cables, and that this computer has an address in "
+            "the network of the heads; give --head ADDRESS for a head that does not answer the "
+            "discovery"
         )
     if not problems:
         return
@@ -220,8 +221,8 @@ def _receivers(console: Console, ports: Sequence[str]) -> list[DetectionResult]:
     for one in found:
         if one.detected is not None and one.detected.kind != "navigator":
             console.print(
-                f"{one.port} is no receiver and is left out; syntopic check --find {one.port} prints "
-                "its section.",
+                f"{one.port} is no receiver and is left out; syntopic check --find {one.port} "
+                "prints its section.",
                 style="yellow",
                 soft_wrap=True,
             )

@@ -40,7 +40,8 @@ def print_rig(console: Console, answers: Answers) -> None:
 
 
 def is_failed(results: Sequence[CheckResult]) -> bool:
-    """Whether an item of the check fails; one that is waiting does not, nor a strobe without cable."""
+    """Whether an item of the check fails; one that is waiting does not, nor a strobe without
+    cable."""
     return any(one.outcome.value == "fail" and not is_absent_mark(one) for one in results)
 
 

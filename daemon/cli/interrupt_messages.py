@@ -50,7 +50,8 @@ SENTENCES = {
     ),
     **dict.fromkeys(("bench", "rigs", "schema", "token list"), _NOTHING_WRITTEN),
     "certificate": (
-        f"every file is complete, and the service uses the certificate it had; {RETRY_HINT} to finish"
+        f"every file is complete, and the service uses the certificate it had; {RETRY_HINT} to "
+        "finish"
     ),
     "token": (
         "the token file is complete; run `syntopic token list` to see whether it was changed"

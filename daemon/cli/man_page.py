@@ -49,9 +49,10 @@ def man_page() -> str:
         r"\fICOMMAND\fP [\fIOPTIONS\fP] [\fIARGUMENTS\fP]",
         ".SH DESCRIPTION",
         *_paragraphs(
-            "Syntopic captures exposures with several heads, stitches them in flight, and evaluates "
-            "each image before the next trigger. With `--json` a command prints one JSON object; "
-            "`run` prints one for each event with `--json-lines`. Begin with `syntopic demo`."
+            "Syntopic captures exposures with several heads, stitches them in flight, and "
+            "evaluates each image before the next trigger. With `--json` a command prints one JSON "
+            "object; `run` prints one for each event with `--json-lines`. Begin with `syntopic "
+            "demo`."
         ),
         ".SH COMMANDS",
     ]

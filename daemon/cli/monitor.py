@@ -167,8 +167,8 @@ def _single_service(console: Console, token: str) -> str:
     console.print(_services_table(found))
     if token:
         raise MonitorError(
-            "a token is not sent to an address that was only announced, since any host can announce "
-            "one; give the address: syntopic monitor https://HOST:PORT"
+            "a token is not sent to an address that was only announced, since any host can "
+            "announce one; give the address: syntopic monitor https://HOST:PORT"
         )
     if len(found) >= SERVICES_MAX:
         raise MonitorError(f"{SERVICES_MAX} services or more announce themselves; give an address")

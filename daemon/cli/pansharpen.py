@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 
 HELP = """Compute Level-3 of a mission: pansharpened RGB and CIR in 16 and 8 bits.
 
-One tone curve serves all exposures that have Level-2, so that neighbouring images match; it is computed
-again from all of them in each run. Earlier images of an exposure are replaced.
+One tone curve serves all exposures that have Level-2, so that neighbouring images match; it is
+computed again from all of them in each run. Earlier images of an exposure are replaced.
 
 An exposure that cannot be pansharpened is listed at the end with its cause and excluded from the
 tone curve. The others are processed.

@@ -59,8 +59,8 @@ def reflights(
     notes = [level] if level else []
     if without := exposure_footprints.without_valid_area(folder):
         notes.append(
-            f"{without} of {len(taken)} exposures have no recorded valid area: they count completely, "
-            "except for heads that sent no image. Run syntopic process to compute it."
+            f"{without} of {len(taken)} exposures have no recorded valid area: they count "
+            "completely, except for heads that sent no image. Run syntopic process to compute it."
         )
     base_m = along_m * (1.0 - read.specification.forward_overlap)
     read_records = sealed_exposures(folder)
@@ -110,9 +110,9 @@ def reflights(
         planned = f"{advice.planned_m / 1000:.1f} km"
         if advice.segments:
             console.print(
-                f"{advice.covered_m / advice.planned_m:.1%} of {planned} is covered by {len(taken)} "
-                f"exposures; too few images see {advice.hole_m2 / 1e4:.2f} ha. The segments are in "
-                f"{out}"
+                f"{advice.covered_m / advice.planned_m:.1%} of {planned} is covered by "
+                f"{len(taken)} exposures; too few images see {advice.hole_m2 / 1e4:.2f} ha. The "
+                f"segments are in {out}"
             )
         else:
             console.print(f"All of {planned} is covered; nothing is to be flown again.")

@@ -29,11 +29,11 @@ if TYPE_CHECKING:
 HELP = """Triangulate the stitched PAN images of a mission, or the images of its heads.
 
 Direct georeferencing gives the initial orientation. Tie points are matched between all overlapping
-exposures, also of opposite and crossing lines. Control and check points come from two tables: where they
-are on the ground (--points) and where in the images (--measured). Writes an adjustment project with
-its report (image residuals in um, control and checks in m and px, systematic image residuals on a
-grid), `exterior.csv` with the adjusted orientations, and all the tables docs/reference/formats.md
-names.
+exposures, also of opposite and crossing lines. Control and check points come from two tables: where
+they are on the ground (--points) and where in the images (--measured). Writes an adjustment project
+with its report (image residuals in um, control and checks in m and px, systematic image residuals
+on a grid), `exterior.csv` with the adjusted orientations, and all the tables
+docs/reference/formats.md names.
 
 If the heads of a rig have diverging axes, heads with equal pixels and principal distance form a
 block (--head). Views of similar direction are matched, oblique ones by the plane of the ground.

@@ -193,7 +193,8 @@ def mirror_problems(
     if one == other or one in other.parents or other in one.parents:
         yield (
             ("mission", "mirror"),
-            f"is {mirror}, which is mission.root, in it or around it; give a folder on another disk",
+            f"is {mirror}, which is mission.root, in it or around it; give a folder on another "
+            "disk",
         )
     # One exposure is being written when a disk stalls; the others find room in memory meanwhile.
     bridged_s = (exposures_in_memory - 1) * rig.frame_interval_s

@@ -38,7 +38,7 @@ def discover(
     """Search for heads and describe them.
 
     Args:
-        wanted: addresses, names or paths of the heads to use, in their order; none takes all. A head
+        wanted: addresses, names or paths of the heads to use in order; none takes all. A head
             at an IP address need not answer the discovery.
         find_genicam: heads on networks and USB.
         find_video: capture nodes of the kernel.

@@ -33,8 +33,8 @@ def refuse_existing(folder: Path) -> None:
         names = " and ".join(path.name for path in there)
         raise ExistingConfigurationError(
             [
-                f"{folder.resolve()} has {names} already; nothing was changed. Give another folder, or "
-                "--replace to keep the old files under another name and write new ones"
+                f"{folder.resolve()} has {names} already; nothing was changed. Give another "
+                "folder, or --replace to keep the old files under another name and write new ones"
             ]
         )
 

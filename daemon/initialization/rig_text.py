@@ -29,8 +29,10 @@ def rig_text(answers: Answers, *, written_by: str) -> str:
     lines = [
         schema_line("rig"),
         f"# {answers.name}: {_summary(answers)}. Written by `{written_by}`.",
-        "# The rig is uncalibrated: there is no [calibration]. It flies, and every product states that it is",
-        "# uncalibrated. Values marked P are provisional: replace them, or calibrate the camera with its first",
+        "# The rig is uncalibrated: there is no [calibration]. It flies, and every product states "
+        "that it is",
+        "# uncalibrated. Values marked P are provisional: replace them, or calibrate the camera "
+        "with its first",
         "# flight. Every key: docs/reference/rig-file.md",
         "",
         "format = 1",

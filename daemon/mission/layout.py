@@ -130,8 +130,8 @@ class Mission:
             special_file := _first_special_file(path, checks_subfolders=checks_subfolders)
         ) is not None:
             raise MissionError(
-                f"{special_file}: is a link, a pipe or a device; a mission holds plain files and folders: "
-                "put what it leads to in its place"
+                f"{special_file}: is a link, a pipe or a device; a mission holds plain files and "
+                "folders: put what it leads to in its place"
             )
         return cls(path, path.resolve().name)
 

@@ -190,7 +190,7 @@ def _checked(path: Path, model: HeightModel) -> HeightModel:
     minimum, maximum = float(np.nanmin(heights)), float(np.nanmax(heights))
     if not (HEIGHT_LIMITS_M[0] <= minimum and maximum <= HEIGHT_LIMITS_M[1]):
         raise ElevationError(
-            f"{path}: heights from {minimum:g} to {maximum:g} m; the earth has none such: declare the "
-            "nodata value (gdal_edit.py -a_nodata)"
+            f"{path}: heights from {minimum:g} to {maximum:g} m; the earth has none such: declare "
+            "the nodata value (gdal_edit.py -a_nodata)"
         )
     return model

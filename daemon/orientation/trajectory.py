@@ -96,7 +96,8 @@ def flown_trajectory(mission: Mission, receiver: str | None = None) -> Trajector
     if receiver is None or receiver not in found:
         recorded = ", ".join(found) or "none at all"
         raise TrajectoryError(
-            f"{mission.log_dir}: no navigation of {receiver or 'any receiver'}; received: {recorded}"
+            f"{mission.log_dir}: no navigation of {receiver or 'any receiver'}; received: "
+            f"{recorded}"
         )
     return _of_samples("in-flight", found[receiver])
 

@@ -197,7 +197,13 @@ def scale_bar(plot: Axes, share: float, label: str) -> None:
     """A bar below the axes, as long as that share of their width, with its length."""
     plot.annotate(
         "", (0.0, -0.035), (share, -0.035), xycoords="axes fraction", textcoords="axes fraction",
-        arrowprops={"arrowstyle": "-", "color": VECTOR, "linewidth": 2.0, "shrinkA": 0, "shrinkB": 0},
+        arrowprops={
+            "arrowstyle": "-",
+            "color": VECTOR,
+            "linewidth": 2.0,
+            "shrinkA": 0,
+            "shrinkB": 0,
+        },
         annotation_clip=False,
     )  # fmt: skip
     plot.text(share + 0.012, -0.035, label, va="center", transform=plot.transAxes)

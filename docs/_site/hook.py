@@ -23,7 +23,8 @@ SCRIPTS: Final = {"assets/iframe-worker.js": "vendor/iframe-worker.js"}
 
 _LINK: Final = re.compile(r"(!?)\[((?:[^\]\\]|\\.)*)\]\(([^)\s]+)\)")
 _OPTIONS: Final = re.compile(r"^(```\w+) [^\n]+$", re.MULTILINE)
-"""Options of a block for tests/documents/test_document_examples.py, which Markdown does not know."""
+"""Options of a block for tests/documents/test_document_examples.py, which Markdown does not
+know."""
 _NAMED: Final = re.compile(r"(?<![\w/\[.`])(?<!\]\()docs/([\w/-]+\.md)((?:#[\w-]+)?)")
 
 

@@ -52,7 +52,8 @@ def rig_file() -> str:
         "",
         "Reference: every table and key of a rig file, with type, unit, default and range.",
         "",
-        "[Formats](formats.md#rig-files) states what is checked between keys. `[defaults.lens]` and",
+        "[Formats](formats.md#rig-files) states what is checked between keys. `[defaults.lens]` "
+        "and",
         "`[defaults.sensor]` hold values for all lenses and sensors that have none of their own.",
         "",
     ]

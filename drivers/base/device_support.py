@@ -1,7 +1,8 @@
-"""Devices that people own, by driver, and the proof of each: `python -m drivers.base.device_support`.
+"""Devices that people own, by driver, and the proof of each.
 
-The command prints the table of docs/reference/devices.md. `syntopic check` states the proofs of the
-devices that are configured. What a driver does is on its page in docs/reference/drivers.
+`python -m drivers.base.device_support` prints the table of docs/reference/devices.md. `syntopic
+check` states the proofs of the devices that are configured. What a driver does is on its page in
+docs/reference/drivers.
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ class ProofKind(enum.Enum):
     PEER = "another program"
     """A program that we did not write reads or writes the same messages."""
     DESCRIPTION = "the maker's description"
-    """A description of the real device in a standard form, such as GenICam, or the kernel's header."""
+    """A description of the real device in a standard form, such as GenICam, or the kernel's
+    header."""
     EXAMPLE = "the manual's example"
     """A worked example that the manual prints, byte by byte."""
     MANUAL = "the manual only"
@@ -55,7 +57,8 @@ _RECORDING, _PEER, _DESCRIPTION, _EXAMPLE, _MANUAL = ProofKind
 
 SUPPORT: Final = (
     DriverSupport(
-        "navigator", "ublox", "u-blox M8, M9, F9 and X20, and boards with them (ArduSimple, SparkFun, Emlid)",
+        "navigator", "ublox",
+        "u-blox M8, M9, F9 and X20, and boards with them (ArduSimple, SparkFun, Emlid)",
         (
             Proof("navigation", _RECORDING, "gpsd's NEO-M8L, ZED-F9R and M8T"),
             Proof("event marks", _PEER, "pyubx2"),
@@ -106,7 +109,11 @@ SUPPORT: Final = (
     DriverSupport(
         "navigator", "xsens", "Xsens (Movella) MTi-G-710, MTi-670, MTi-680",
         (
-            Proof("navigation, attitude, time", _RECORDING, "Einride's MTi-G-710, read by xsens-go"),
+            Proof(
+                "navigation, attitude, time",
+                _RECORDING,
+                "Einride's MTi-G-710, read by xsens-go",
+            ),
             Proof("event marks", _MANUAL, "MT0101P"),
         ),
     ),
@@ -142,7 +149,8 @@ SUPPORT: Final = (
         (Proof("files", _MANUAL, "the kernel's hwmon ABI"),),
     ),
     DriverSupport(
-        "head", "aravis", "GigE Vision and USB3 Vision cameras (Basler, FLIR, Allied Vision, Lucid, JAI, ...)",
+        "head", "aravis",
+        "GigE Vision and USB3 Vision cameras (Basler, FLIR, Allied Vision, Lucid, JAI, ...)",
         (
             Proof("names and order of settings", _DESCRIPTION, "62 cameras' GenICam descriptions"),
             Proof("stream and control", _PEER, "Aravis 0.8.26"),
@@ -157,7 +165,8 @@ SUPPORT: Final = (
         (Proof("TIFF", _PEER, "tifffile"),),
     ),
     DriverSupport(
-        "trigger", "pulse-bus", "trigger units with the protocol of docs/reference/drivers/pulse-bus.md",
+        "trigger", "pulse-bus",
+        "trigger units with the protocol of docs/reference/drivers/pulse-bus.md",
         (Proof("protocol", _MANUAL, "our own page of the protocol"),),
     ),
     DriverSupport(

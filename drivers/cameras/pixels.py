@@ -41,7 +41,8 @@ class Packing(enum.Enum):
     MIPI_12 = "12P"
     """MIPI RAW12: 2 bytes with the upper bits of 2 pixels, then one with their lowest 4 bits."""
     MIPI_14 = "14P"
-    """MIPI RAW14: 4 bytes with the upper bits of 4 pixels, then 3 with their lowest 6 bits, each."""
+    """MIPI RAW14: 4 bytes with the upper bits of 4 pixels, then 3 with their lowest 6 bits,
+    each."""
 
 
 @dataclass(frozen=True)

@@ -106,6 +106,6 @@ class FixMonitor:
         self._is_searching = True
         self._emitter.emit(
             "searching",
-            f"The receiver {self._receiver} is {fix_description(fix, satellites)}. Wait; its antenna "
-            "needs a clear view of the sky.",
+            f"The receiver {self._receiver} is {fix_description(fix, satellites)}. Wait; its "
+            "antenna needs a clear view of the sky.",
         )

@@ -44,8 +44,8 @@ class Framer(Protocol):
 class MessageDecoder:
     """Bytes in, records out, no I/O and no clock. Nothing that is fed raises.
 
-    A protocol converts a complete message in `on_message`. `decode_errors` lists the exceptions that
-    mean an invalid message, and `bad_counter` is the name of their counter.
+    A protocol converts a complete message in `on_message`. `decode_errors` lists the exceptions
+    that mean an invalid message, and `bad_counter` is the name of their counter.
     """
 
     decode_errors: tuple[type[Exception], ...] = (ValueError,)

@@ -16,10 +16,10 @@ SizeOf = Callable[[bytes, int], int | None]
 class MessageFramer:
     """Cuts whole, checksummed messages out of a stream.
 
-    `starts` are the bytes a message can begin with, `fits` checks whether a complete message's checksum
-    is right. A damaged message costs itself only: the search goes on behind its first byte, and a
-    candidate that holds another whole message is given up at once rather than waited for.
-    `size_of` bounds what is ever kept.
+    `starts` are the bytes a message can begin with, `fits` checks whether a complete message's
+    checksum is right. A damaged message costs itself only: the search goes on behind its first
+    byte, and a candidate that holds another whole message is given up at once rather than waited
+    for. `size_of` bounds what is ever kept.
     """
 
     def __init__(self, starts: bytes, size_of: SizeOf, fits: Callable[[bytes], bool]) -> None:

@@ -1,7 +1,7 @@
 """Interior orientation: measured image coordinates to ideal ones, and derivatives.
 
-Heier et al. (2002), eq. 5.1, in two interpretations (`CameraModel.model`), plus the additional terms
-(docs/explanation/mathematics/bundle.md#camera-model).
+Heier et al. (2002), eq. 5.1, in two interpretations (`CameraModel.model`), plus the additional
+terms (docs/explanation/mathematics/bundle.md#camera-model).
 The correction is added to what was measured: ideal = measured + delta(measured).
 """
 

@@ -1,8 +1,8 @@
 """Data snooping: which observations an adjustment contradicts, of every kind, and which fit again.
 
 An observation is tested by its residual over the residual's own standard deviation. The coordinates
-of an image point are left out together, those of control points, GNSS positions and attitudes one by
-one. Several are left out in one round: those that no neighbour surpasses.
+of an image point are left out together, those of control points, GNSS positions and attitudes one
+by one. Several are left out in one round: those that no neighbour surpasses.
 """
 
 from __future__ import annotations

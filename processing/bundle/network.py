@@ -43,9 +43,9 @@ class NetworkError(ProcessingError, ValueError):
 class CameraModel:
     """The interior orientation of one camera.
 
-    `model` selects how the ten act on measured coordinates (`camera_model`): `australis` is eq. 5.1 of
-    Heier et al. (2002) about the given principal point; `centred` applies affinity and shear first
-    and the polynomials about the estimated principal point, as most close-range programs do.
+    `model` selects how the ten act on measured coordinates (`camera_model`): `australis` is eq. 5.1
+    of Heier et al. (2002) about the given principal point; `centred` applies affinity and shear
+    first and the polynomials about the estimated principal point, as most close-range programs do.
 
     `interior` holds starting values of the ten, (10,); `free` names those to be estimated, `sigma`
     gives a priori standard deviations of any of them or of terms (pseudo-observations of the
@@ -151,8 +151,8 @@ class Gnss:
     """Antenna positions, (n, 3) m, of images' exposures.
 
     The antenna is at station + attitude * lever_m, plus the line's shift and drift.
-    `line` (n,) indexes `lines`, -1 is none; drift is linear in `time_s` (n,). `drift` selects what is
-    estimated for every line: nothing, a shift, or a shift and a drift.
+    `line` (n,) indexes `lines`, -1 is none; drift is linear in `time_s` (n,). `drift` selects what
+    is estimated for every line: nothing, a shift, or a shift and a drift.
     """
 
     station: Indices

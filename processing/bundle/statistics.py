@@ -177,7 +177,8 @@ def groups_of(
 
         >>> rows = Equations(
         ...     np.zeros(2), sparse.csr_array((2, 1)), np.zeros((2, 3)), np.array([-1, -1]),
-        ...     np.full(2, 0.01), np.array([0, 0]), ("distance",), np.array([0, 1]), np.array([0, 0])
+        ...     np.full(2, 0.01), np.array([0, 0]), ("distance",), np.array([0, 1]),
+        ...     np.array([0, 0]),
         ... )
         >>> (group,) = groups_of(rows, np.array([0.5, -0.5]), np.array([0.5, 0.5]), {})
         >>> group.factor, group.rms, group.worst

@@ -1,7 +1,7 @@
 """Boresight, lever arm and time offset: inertial attitude and position against controlled images.
 
-Least squares of all exposures at once, with the whole covariance of the adjusted orientations. Parameters
-that the flight cannot separate keep their given values and are named, with a remedy.
+Least squares of all exposures at once, with the whole covariance of the adjusted orientations.
+Parameters that the flight cannot separate keep their given values and are named, with a remedy.
 
 Source: docs/explanation/mathematics/boresight.md#model; Jacobsen (2008), boresite calibration.
 """
@@ -58,7 +58,8 @@ class ImageOrientations:
 
 @dataclass(frozen=True)
 class InertialOrientations:
-    """Measurements of receiver and inertial unit at the same n mid-exposures, in the same object axes.
+    """Measurements of receiver and inertial unit at the same n mid-exposures, in the same object
+    axes.
 
     `position_m` (n, 3) of the antenna; `velocity_mps` (n, 3); `rotation` (n, 3, 3) object from
     inertial unit (forward, right, down); `rate_rad_per_s` (n, 3) about the unit's axes; sigmas (3,)
@@ -90,7 +91,8 @@ class ImuMounting:
 
 @dataclass(frozen=True)
 class InseparableParameters:
-    """Parameters that this flight does not separate: a sentence with the remedy, and their names."""
+    """Parameters that this flight does not separate: a sentence with the remedy, and their
+    names."""
 
     sentence: str
     parameters: tuple[str, ...]
@@ -103,8 +105,8 @@ class BoresightCalibration:
     `covariance` (10, 10) in the order of `PARAMETERS` (rad, m, s), within what is determined: held
     parameters and unseparated directions have none. `determined` (10,) marks the parameters that
     are completely determined. `basis` (10, r) are the determined directions, scaled by
-    `PARAMETER_SCALES`. Residuals are (n, 3): positions in m (object axes), attitudes in rad (rig's body axes).
-    `sigma0` has expected value one.
+    `PARAMETER_SCALES`. Residuals are (n, 3): positions in m (object axes), attitudes in rad (rig's
+    body axes). `sigma0` has expected value one.
     """
 
     mounting: ImuMounting

@@ -248,7 +248,8 @@ def _calibrated(
     # Scatter counts where the exposures' own statement does not explain it.
     ratio = np.diag(seen) / np.maximum(np.diag(own), 1e-30)
     beyond = ratio > chi2.ppf(1.0 - _SCATTER_ALPHA / 3.0, n - 1) / (n - 1)
-    # An aircraft rotates slowly: errors of neighbouring exposures are correlated and count for less.
+    # An aircraft rotates slowly: errors of neighbouring exposures are correlated and count for
+    # less.
     variance = np.where(beyond, np.diag(seen) * _autocorrelation_factor(corrections), np.diag(own))
     scale = np.sqrt(variance / np.maximum(np.diag(own), 1e-30))
     of_mean = own * np.outer(scale, scale) / n
@@ -350,7 +351,8 @@ def _mounting_correction(rig: Rig, cone: Cone, record: StitchRecord) -> tuple[Ar
 
 
 def _base_rotation(rig: Rig, cone: Cone, record: StitchRecord) -> Array:
-    """Apparent rotation by a base over even ground: seen from the right, all appears farther left."""
+    """Apparent rotation by a base over even ground: seen from the right, all appears farther
+    left."""
     right, forward = base_mm(rig, cone)
     if record.height_m is None:
         return np.zeros(3)

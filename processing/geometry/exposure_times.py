@@ -1,4 +1,5 @@
-"""Exposure times of frames: the common one of comparable frames, and factors that bring signals to it.
+"""Exposure times of frames: the common one of comparable frames, and factors that bring signals to
+it.
 
 Also names the frames whose exposure time is not known. The signal itself is scaled in
 `processing.radiometry.level1`.

@@ -8,7 +8,8 @@ has no singular attitude; angles are for files and display.
 Gimbal lock: where the middle angle is within 1e-7 rad of +-90 degrees, the angle applied first to
 the vector (kappa; kappa; roll) is 0. The matrix is then reproduced to 1e-7, elsewhere to rounding.
 
-Source: docs/explanation/mathematics/coordinates.md#rotation-matrix; scipy.spatial.transform.Rotation.
+Source: docs/explanation/mathematics/coordinates.md#rotation-matrix;
+scipy.spatial.transform.Rotation.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """One resampling from raw geometry to a target raster, fused with gain, seams and validity.
 
-Inverse mapping: each target pixel is fetched from the sensor position that the lattice gives for it.
-Which sensor serves which pixel is decided in `processing.image.seams`, the lattice comes from
+Inverse mapping: each target pixel is fetched from the sensor position that the lattice gives for
+it. Which sensor serves which pixel is decided in `processing.image.seams`, the lattice comes from
 `processing.image.lattice`.
 
 Words are Level-1 words (`processing.radiometry.level1`) on the way in; on the way out 0 is no data,

@@ -23,7 +23,8 @@ _AHEAD: Final = 2
 """Rows looked at between the one whose pixels are fetched and the one that is measured."""
 _MIN_LENGTH: Final = 34
 _MIN_SIGNAL: Final = 4.0
-"""Detail at two pixels' distance must exceed its noise so many times before sharpness is reported."""
+"""Detail at two pixels' distance must exceed its noise so many times before sharpness is
+reported."""
 
 
 def sharpness(

@@ -120,8 +120,8 @@ def match_block(
         for j in others:
             poses = ((station_m[k], rotation[k]), (station_m[j], rotation[j]))
             attempted, at = _matched_in(
-                here, _rectified(load(j), image, *poses, ground_m), image, rotation[j], station_m[j],
-                places, ground, known, settings,
+                here, _rectified(load(j), image, *poses, ground_m), image, rotation[j],
+                station_m[j], places, ground, known, settings,
             )  # fmt: skip
             tried[k, j] = attempted
             rows = np.flatnonzero(np.isfinite(at[:, 0]))

@@ -134,7 +134,8 @@ def check_content(
             ambiguous[name] += int(np.count_nonzero(wide.correlated & ~wide.distinct))
             other = search.pair[search.pair[0] == name]
             if other not in suspicious or len(suspicious) == len(attempted):
-                # The first frame lies where its neighbour shows the ground: it goes by what it is off.
+                # The first frame lies where its neighbour shows the ground: it goes by what it is
+                # off.
                 sign = -1.0 if name == search.pair[0] else 1.0
                 shifts[name] += list(sign * wide.differences_mm / image.pitch_mm)
     shifted, mismatched = {}, {}

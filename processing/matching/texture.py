@@ -14,7 +14,8 @@ from processing.radiometry.level1 import level1_counts_per_dn
 from processing.rig import Sensor
 
 TEXTURE_OVER_NOISE: Final = 3.0
-"""Mean square of the differences of pixels `PIXEL_SPACING_PX` apart over that of photons and read-out."""
+"""Mean square of the differences of pixels `PIXEL_SPACING_PX` apart over that of photons and
+read-out."""
 PIXEL_SPACING_PX: Final = 2
 
 

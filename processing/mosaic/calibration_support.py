@@ -2,7 +2,8 @@
 
 The free mosaic uses tie points alone. Over water, sand, snow or under a cloud there are too few,
 and their noise would bend the image. This module detects that, and computes the prior information
-of calibration, temperature and platform. The adjustment itself is in `processing.mosaic.free_mosaic`.
+of calibration, temperature and platform. The adjustment itself is in
+`processing.mosaic.free_mosaic`.
 
 Source: docs/explanation/mathematics/mosaicking.md#supported-mosaic.
 """

@@ -1,7 +1,8 @@
 """dC as the stitching sees it: how far sensors of one cone have moved apart, in sensor lengths.
 
-A second way to dC in addition to the probes, for cones of two or more CCDs, always with its standard
-deviation. What drift does is in `processing.geometry.drift`; nothing found here moves a pixel.
+A second way to dC in addition to the probes, for cones of two or more CCDs, always with its
+standard deviation. What drift does is in `processing.geometry.drift`; nothing found here moves a
+pixel.
 
 Source: docs/explanation/mathematics/drift.md#estimated-dc; Ladstädter et al. (2010), fig. 1,
 "estimation of dC from the stitching scales".

@@ -64,11 +64,11 @@ class FlightDisplacement:
     """A sensor that has been displaced since an exposure, (x right, y up), PAN px.
 
     "named": it is `sensor`, unless one of `alternatives`. "several": more than one sensor of the
-    cone moved, and which is not determinable; dx, dy are of the one that fits best. "relative": of two
-    sensors, `sensor` has moved against `alternatives[0]`, or that against this. "misread": the
-    probe of `probe_bias` reads wrong, by that on average (`sensor` is empty, dx and dy are of the one
-    that fits best); with the other kinds, `probe_bias` is a probe that explains it nearly as well,
-    None if none does.
+    cone moved, and which is not determinable; dx, dy are of the one that fits best. "relative": of
+    two sensors, `sensor` has moved against `alternatives[0]`, or that against this. "misread": the
+    probe of `probe_bias` reads wrong, by that on average (`sensor` is empty, dx and dy are of the
+    one that fits best); with the other kinds, `probe_bias` is a probe that explains it nearly as
+    well, None if none does.
     `since` is the first exposure with it, between `earliest` and `latest`; `from_start`
     is true where all of the flight has it. `sigma_px` is that of the length.
     """

@@ -81,8 +81,8 @@ class Mosaic:
     outliers included; `redundancy_numbers` (n, 2) likewise; `outliers` (n,) marks points not used.
     `sigma0` has no unit; `sigma0_px` is that of one coordinate difference of a P/P pair.
     `used` counts points per pair, `undetermined` names unknowns held at their start.
-    `pseudo_observations` is the number of directions held. `supported` is true where calibration and
-    platform are observations (`processing.mosaic.calibration_support`).
+    `pseudo_observations` is the number of directions held. `supported` is true where calibration
+    and platform are observations (`processing.mosaic.calibration_support`).
     """
 
     method: str

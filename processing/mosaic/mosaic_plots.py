@@ -430,7 +430,8 @@ def _text(
     rotation_attribute = f' transform="{more}"' if more else ""
     return (
         f'<text x="{x:.1f}" y="{y:.1f}" font-size="{size:g}" fill="{fill}" '
-        f'text-anchor="{anchor}" font-weight="{weight}"{rotation_attribute}>{escape(content)}</text>'
+        f'text-anchor="{anchor}" font-weight="{weight}"{rotation_attribute}>'
+        f"{escape(content)}</text>"
     )
 
 
@@ -451,7 +452,8 @@ def _rect(
     rotation_attribute = f' transform="{more}"' if more else ""
     return (
         f'<rect x="{x:.2f}" y="{y:.2f}" width="{width:.2f}" height="{height:.2f}" fill="{fill}" '
-        f'fill-opacity="{opacity:g}" stroke="{stroke}" stroke-width="{wide:g}"{dashed}{rotation_attribute}/>'
+        f'fill-opacity="{opacity:g}" stroke="{stroke}" stroke-width="{wide:g}"{dashed}'
+        f"{rotation_attribute}/>"
     )
 
 

@@ -73,8 +73,8 @@ class EstimatedMounting:
     the same against calibration, about the axes of the virtual image; the mean of all heads is
     zero. `usual_rad` is the standard deviation of an angle by calibration; `turn` the
     length of the correction in standard deviations of calibration and stitching. `shift_px` is how
-    far the head's middle went by it, (x right, y up), `reach_px` how far the point of the frame that
-    went farthest. `residual_px` is the
+    far the head's middle went by it, (x right, y up), `reach_px` how far the point of the frame
+    that went farthest. `residual_px` is the
     shift that an affine transformation still finds between this head's tie points and its
     neighbours', `affine` (2, 2) the rest of it, px per px, `points` their number.
     """

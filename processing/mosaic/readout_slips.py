@@ -41,8 +41,8 @@ class SlipSettings:
 
     A band holds at least two bins of `bin_points` tie points; the mean of their medians differs
     from the median of the rest of the frame by more than `limit` standard deviations of
-    independent points, and by more than `min_shift_px`. The second decides on ground where errors of
-    neighbouring points are correlated: relief, trees, clouds, vehicles
+    independent points, and by more than `min_shift_px`. The second decides on ground where errors
+    of neighbouring points are correlated: relief, trees, clouds, vehicles
     (docs/explanation/validity.md). All of a band moves: `min_share` of its points have its shift,
     of vehicles on a road fewer.
     """

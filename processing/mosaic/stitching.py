@@ -35,9 +35,9 @@ Method = Literal["free", "fixed", "pan-only"]
 class Stitching:
     """The mosaics of one exposure.
 
-    `tie_points` are those accepted. `equal_datum` has its datum over all master sensors, `free` over
-    those in place, both by tie points alone; `image` is what the image is made with: `free`, or
-    supported by calibration because of the sensors `weak`. `slips` are shifted bands of frames,
+    `tie_points` are those accepted. `equal_datum` has its datum over all master sensors, `free`
+    over those in place, both by tie points alone; `image` is what the image is made with: `free`,
+    or supported by calibration because of the sensors `weak`. `slips` are shifted bands of frames,
     whose tie points are not among those accepted. `validity` is None with the methods that are
     there to be compared with.
     """

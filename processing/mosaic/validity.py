@@ -111,8 +111,8 @@ class RelativeDisplacement:
 class Validity:
     """The verdict on one exposure.
 
-    `observability` states per cone what can be determined: a single displaced sensor is named, only a
-    relative displacement is seen, or nothing (one sensor: the layer transformation absorbs it).
+    `observability` states per cone what can be determined: a single displaced sensor is named, only
+    a relative displacement is seen, or nothing (one sensor: the layer transformation absorbs it).
     `consistent` is the global test of the master sensors. `displaced` is the named sensor, with
     `alternatives` that fit nearly as well; `several_displaced` is true where one sensor does not
     explain it all.

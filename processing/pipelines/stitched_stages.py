@@ -163,8 +163,8 @@ def figures_of(
 def misplaced_px(rig: Rig, content: ContentCheck) -> float:
     """How far the farthest frame lies from where points are sought; zero where all are there.
 
-    Where others of the frames that lie elsewhere were not found, or most of the PAN frames were not,
-    they lie beyond the wide search: that far at least.
+    Where others of the frames that lie elsewhere were not found, or most of the PAN frames were
+    not, they lie beyond the wide search: that far at least.
 
     Args:
         rig: the camera.

@@ -102,9 +102,9 @@ def word_format_findings(figures: QualityFigures) -> list[Finding]:
         Finding(
             Flag.FRAME_CORRUPT,
             Verdict.REFLY,
-            f"The words of {sensors} are {word_format}, not as in the rig file: set the pixel format "
-            "of the head, or `bits` and `justified` in the rig file. The pixels stored are good; "
-            "process them again with the right rig file.",
+            f"The words of {sensors} are {word_format}, not as in the rig file: set the pixel "
+            "format of the head, or `bits` and `justified` in the rig file. The pixels stored are "
+            "good; process them again with the right rig file.",
         )
     ]
 
@@ -189,8 +189,8 @@ def _clipping(clipping: ClippingFigures, t: Thresholds) -> list[Finding]:
         Finding(
             Flag.OVEREXPOSED,
             Verdict.USABLE,
-            f"Head {', '.join(clipping.clipped_sensors)} gives no signal above {level_dn} DN, below "
-            f"full scale: {share:.1%} of the pixels of {clipping.clipped_sensor} lie at "
+            f"Head {', '.join(clipping.clipped_sensors)} gives no signal above {level_dn} DN, "
+            f"below full scale: {share:.1%} of the pixels of {clipping.clipped_sensor} lie at "
             "that value, and what is brighter is lost. Check gain, bits and lookup table of the "
             "head.",
             share,

@@ -60,8 +60,8 @@ def stitching_findings(
         )
         if saturated_fraction > t.saturated_overlap_fraction:
             sentence = (
-                f"Few tie points in {where} because it is saturated: {saturated_fraction:.0%} of the "
-                "places where points are sought hold saturated pixels. Shorten the exposure."
+                f"Few tie points in {where} because it is saturated: {saturated_fraction:.0%} of "
+                "the places where points are sought hold saturated pixels. Shorten the exposure."
             )
         findings.append(
             Finding(
@@ -79,8 +79,8 @@ def stitching_findings(
             Finding(
                 Flag.TIE_POINTS,
                 Verdict.USABLE,
-                f"Too little detail to place {supported}: calibration and temperature help to place "
-                "them. Look at the quick look; fly again if there should have been detail.",
+                f"Too little detail to place {supported}: calibration and temperature help to "
+                "place them. Look at the quick look; fly again if there should have been detail.",
                 figures.of(PrecisionFigures).stitched_sigma_worst_px,
             )
         )
@@ -127,15 +127,15 @@ def _displaced(figures: QualityFigures, t: Thresholds) -> list[Finding]:
         if displacement.displaced_several:
             sentence = (
                 "More than one sensor of the master cone sits off its calibrated place, and which "
-                "ones cannot be determined: the image fits together, but its place in the camera is "
-                "uncertain. Go on, and have the camera calibrated."
+                "ones cannot be determined: the image fits together, but its place in the camera "
+                "is uncertain. Go on, and have the camera calibrated."
             )
         elif misread:
             others = f" or {alternatives}" if alternatives else ""
             sentence = (
                 f"Either sensor {displaced}{others} sits {size:.2f} px off its calibrated place or "
-                f"{misread}; the stitching cannot separate them. The image fits together. Go on, check "
-                "the probe after landing, and have the camera calibrated."
+                f"{misread}; the stitching cannot separate them. The image fits together. Go on, "
+                "check the probe after landing, and have the camera calibrated."
             )
         elif alternatives:
             sentence = (

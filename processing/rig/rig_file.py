@@ -130,7 +130,7 @@ class RigFile(_Table):
     frame_interval_s: Positive
     """Shortest time between two exposures."""
     master_cone: ConeName | None = None
-    """Cone whose layer is the virtual image plane, or from which angles count; empty: a virtual camera."""
+    """Cone of the virtual image plane, or from which angles count; empty: a virtual camera."""
     colour_master_cone: ConeName | None = None
     """Cone that the other colours are registered to."""
     reference_cone: Text

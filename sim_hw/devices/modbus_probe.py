@@ -33,8 +33,9 @@ class ModbusProbe(LineDevice):
 
     Register `first_register + i` is channel i in signed 0.1 degC, 0x7FFF where the channel gives
     None: an open sensor. With `float_word_order` each channel has two registers with a 32-bit float
-    in degC, not a number for an open sensor; "little" sends the lower half first. Registers are read
-    by the `functions`, 3 and 4. Requests for other slaves, and damaged ones, are met with silence.
+    in degC, not a number for an open sensor; "little" sends the lower half first. Registers are
+    read by the `functions`, 3 and 4. Requests for other slaves, and damaged ones, are met with
+    silence.
     """
 
     def __init__(

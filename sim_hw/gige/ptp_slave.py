@@ -42,7 +42,8 @@ class MasterData:
     grandmaster: int
     parent: bytes
     rank: tuple[int, int, int, int, int, int, int]
-    """Priority, class, accuracy, variance, second priority, identity, steps: the smaller is better."""
+    """Priority, class, accuracy, variance, second priority, identity, steps: the smaller is
+    better."""
     utc_offset_s: int
     is_ptp_timescale: bool
 

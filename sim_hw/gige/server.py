@@ -165,7 +165,8 @@ class ControlServer:
             self.counts["send_errors"] += 1
 
     def _destination(self, packet: bytes, peer: tuple[str, int]) -> tuple[str, int]:
-        """Where an answer goes: to the asker, or to all where it allows that from another subnet."""
+        """Where an answer goes: to the asker, or to all where it allows that from another
+        subnet."""
         if self._network is None or not self._interface or not packet[1] & ALLOW_BROADCAST_ACK:
             return peer
         is_near = ipaddress.IPv4Address(peer[0]) in self._network()

@@ -1,4 +1,4 @@
-"""`python -m sim_hw.laboratory.calibration_field RIG`: a rig in front of an emulated 3D calibration field.
+"""A rig in front of an emulated field of targets: `python -m sim_hw.laboratory.calibration_field`.
 
 Some hundred bright targets, surveyed with errors; the rig images them from many positions,
 turned and tilted. Frames hold discs with photon and read noise. The truth: every sensor displaced,

@@ -1,4 +1,4 @@
-"""`python -m sim_hw.laboratory.sphere RIG --out DIR`: heads in front of an emulated integrating sphere.
+"""Heads in front of an emulated integrating sphere: `python -m sim_hw.laboratory.sphere RIG`.
 
 Writes dark and flat series as a laboratory would take them (frames and `series.json`), and apart
 from them, in `truth/`, what the sensors really are. The frames come from the sensor model of

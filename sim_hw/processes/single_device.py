@@ -1,4 +1,4 @@
-"""`python -m sim_hw.processes.single_device KIND --at WHERE`: one emulated device in a process of its own.
+"""One emulated device in its own process: `python -m sim_hw.processes.single_device KIND`.
 
 For trying a driver, or a fault, without a rig. It moves straight north, is strobed once a second
 (unless `--no-strobe`), prints "ready" as a JSON line, and ends with a signal or with its parent.

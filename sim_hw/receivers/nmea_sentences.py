@@ -110,7 +110,8 @@ def gst(gps_ns: int, horizontal_m: float, vertical_m: float, leap_seconds: int) 
     """GST: standard deviations of north, east and height; the error ellipse is a circle."""
     axis = horizontal_m / math.sqrt(2.0)
     return nmea(
-        f"GNGST,{_clock(broken_down_utc(gps_ns, leap_seconds))},{axis:.3f},{axis:.3f},{axis:.3f},0.0,"
+        f"GNGST,{_clock(broken_down_utc(gps_ns, leap_seconds))},"
+        f"{axis:.3f},{axis:.3f},{axis:.3f},0.0,"
         f"{axis:.3f},{axis:.3f},{vertical_m:.3f}"
     )
 

@@ -18,7 +18,8 @@ UTC_TIME, EKF_EULER, EKF_QUAT, EKF_NAV, GPS1_POS, EVENT_A = 2, 6, 7, 8, 14, 24
 CLOCK_FREE_RUNNING, CLOCK_STEERING, CLOCK_VALID = 1, 2, 3
 UTC_INVALID, UTC_NO_LEAP_SECONDS, UTC_VALID = 0, 1, 2
 NOMINAL_SOLUTION = 4 | 1 << 4 | 1 << 5 | 1 << 6 | 1 << 7 | 1 << 10 | 1 << 11
-"""Mode "position", attitude, heading, velocity and position valid, GNSS velocity and position used."""
+"""Mode "position", attitude, heading, velocity and position valid, GNSS velocity and position
+used."""
 RTK_INTEGER = 7 << 6
 _US_PER_WRAP = 1 << 32
 

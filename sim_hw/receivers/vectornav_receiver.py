@@ -14,7 +14,8 @@ MEASUREMENT_PERIOD_NS = 2_500_000
 
 
 class VectornavReceiver(EmulatedReceiver):
-    """Navigation every epoch; time, time since the edge and count of edges for every rising edge."""
+    """Navigation every epoch; time, time since the edge and count of edges for every rising
+    edge."""
 
     time_status = vectornav.ALL_TIMES_OK
 

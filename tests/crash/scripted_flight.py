@@ -1,4 +1,6 @@
-"""The flight whose writes are recorded: `python -m tests.crash.scripted_flight ROOT ACKS EXPOSURES FORGETS`.
+"""The flight whose writes are recorded.
+
+`python -m tests.crash.scripted_flight ROOT ACKS EXPOSURES FORGETS` flies it.
 
 The real writer process, recovery and products over a camera of tiny heads, in two lives: the first
 ends as by `kill -9` with an exposure stored and not sealed, the second begins with recovery and

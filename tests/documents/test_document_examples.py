@@ -142,11 +142,15 @@ class Session:
         assert done.returncode in allowed, f"{block.text}\nended with {done.returncode}:\n{printed}"
 
     def start(self, block: Block) -> None:
-        """Start a block in a terminal of its own and wait for the text it prints when it is ready."""
+        """Start a block in a terminal of its own and wait for the text it prints when it is
+        ready."""
         log = self._folder / f"terminal-{len(self._terminals)}.log"
         with log.open("wb") as output:
             process = subprocess.Popen(
-                [*self._inside, "env", "--default-signal=INT", "bash", "-euo", "pipefail", "-c", block.text],
+                [
+                    *(*self._inside, "env", "--default-signal=INT"),
+                    *("bash", "-euo", "pipefail", "-c", block.text),
+                ],
                 cwd=self._folder, env=self._environment, stdin=subprocess.DEVNULL,
                 stdout=output, stderr=subprocess.STDOUT, start_new_session=True,
             )  # fmt: skip

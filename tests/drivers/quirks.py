@@ -1,9 +1,9 @@
 """Quirks of libraries, kernels and devices in drivers: `python -m tests.drivers.quirks`.
 
-A comment that begins with `# Quirk:` states the behaviour and what the driver does about it. It ends
-with `Upstream:` and a reference: an issue or pull request as owner/repository#number, `manual:` with
-a document and its clause, or `no report known (date)`. This module writes their table,
-docs/reference/drivers/quirks.md.
+A comment that begins with `# Quirk:` states the behaviour and what the driver does about it. It
+ends with `Upstream:` and a reference: an issue or pull request as owner/repository#number,
+`manual:` with a document and its clause, or `no report known (date)`. This module writes their
+table, docs/reference/drivers/quirks.md.
 """
 
 from __future__ import annotations

@@ -30,7 +30,8 @@ values of another program (binning, mirroring, a test pattern, another trigger).
 same in all three. `tests/drivers/test_real_descriptions.py` asserts it, and compares the pixels of
 one triggered frame.
 
-A description proves names and the order of writing. It does not prove the behaviour of the hardware.
+A description proves names and the order of writing. It does not prove the behaviour of the
+hardware.
 
 | description | outcome | frame | chunks | clock | what is missing |
 |---|---|---|---|---|---|

@@ -60,7 +60,8 @@ MARKS_WITHIN_NS = {
 }
 """The resolution of each protocol: NMEA and the time stamps of SBG resolve microseconds."""
 PLACE_WITHIN_M = {
-    "ublox": 0.02, "novatel": 1e-3, "septentrio": 1e-3, "nmea": 0.06, "sbg": 1e-3, "vectornav": 1e-3,
+    "ublox": 0.02, "novatel": 1e-3, "septentrio": 1e-3, "nmea": 0.06, "sbg": 1e-3,
+    "vectornav": 1e-3,
 }  # fmt: skip
 
 

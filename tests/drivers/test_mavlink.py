@@ -81,8 +81,8 @@ class Bus:
 
     def feedback(self, time_us: int, number: int, *, flags: int = 0) -> bytes:
         return self.pack_message(dialect.MAVLink_camera_feedback_message(
-            time_us, 1, 2, number, 475_000_000, 85_000_000, 952.5, 500.0, 0.0, 0.0, 10.0, 0.0, flags,
-            number,
+            time_us, 1, 2, number, 475_000_000, 85_000_000, 952.5, 500.0, 0.0, 0.0, 10.0, 0.0,
+            flags, number,
         ))  # fmt: skip
 
     def trigger(self, time_us: int, number: int) -> bytes:

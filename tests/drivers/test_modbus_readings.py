@@ -1,4 +1,5 @@
-"""Modbus registers as temperatures: holding registers, floats in both word orders, and wrong ones."""
+"""Modbus registers as temperatures: holding registers, floats in both word orders, and wrong
+ones."""
 
 from __future__ import annotations
 

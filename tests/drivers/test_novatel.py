@@ -211,8 +211,10 @@ TEXT = {
     "MARK1PVA": f"{WEEK},360018.25,47.5,8.5,1000.0,60.0,3.0,1.0,1.5,-2.0,359.0,INS_SOLUTION_GOOD",
 }
 NOT_READ = {"INSPVAX": (21, 22), "BESTPOS": (6, 10, *range(15, 21)), "BESTVEL": (7,)}
-ENUMERATED_FIELDS = {"BESTPOS": (0, 1), "BESTVEL": (0, 1), "INSPVAX": (0, 1), "TIME": (0, 10), "INSPVA": (11,),
-         "MARK1TIME": (5,), "MARK1PVA": (11,)}  # fmt: skip
+ENUMERATED_FIELDS = {
+    "BESTPOS": (0, 1), "BESTVEL": (0, 1), "INSPVAX": (0, 1), "TIME": (0, 10), "INSPVA": (11,),
+    "MARK1TIME": (5,), "MARK1PVA": (11,),
+}  # fmt: skip
 
 
 @pytest.mark.trust

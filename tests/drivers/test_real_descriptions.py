@@ -50,7 +50,8 @@ ARMED_MIN = 50
 
 @pytest.fixture(autouse=True, scope="module")
 def fewer_collections() -> Iterator[None]:
-    """A description makes many small objects; looking for cycles in them takes a third of the time."""
+    """A description makes many small objects; looking for cycles in them takes a third of the
+    time."""
     before = gc.get_threshold()
     gc.set_threshold(100_000, *before[1:])
     yield

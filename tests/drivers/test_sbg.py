@@ -1,4 +1,5 @@
-"""sbgECom logs: time stamps tied to GPS time, events, and every way in which a clock is not valid."""
+"""sbgECom logs: time stamps tied to GPS time, events, and every way in which a clock is not
+valid."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Buffers of a kernel driver that lies about sizes: padded rows, short, long, with an error flag."""
+"""Buffers of a kernel driver that lies about sizes: padded rows, short, long, with an error
+flag."""
 
 from __future__ import annotations
 

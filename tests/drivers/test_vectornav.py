@@ -1,4 +1,5 @@
-"""VectorNav binary outputs: the manual's example, marks by their count, and times that are not valid."""
+"""VectorNav binary outputs: the manual's example, marks by their count, and times that are not
+valid."""
 
 from __future__ import annotations
 

@@ -118,7 +118,8 @@ def commit() -> str:
 
 
 def run_in(folder: Path, command: str, log: Path) -> Result:
-    """Run a shell command in the clone, in namespaces of its own; everything it prints is in `log`."""
+    """Run a shell command in the clone, in namespaces of its own; everything it prints is in
+    `log`."""
     variables = {name: value for name, value in os.environ.items() if PASSED_ON.match(name)}
     variables |= {
         "HOME": "/root",

@@ -1,4 +1,5 @@
-"""`bootstrap.sh` prints one line a step; of a step that fails, the end of its output and a remedy."""
+"""`bootstrap.sh` prints one line a step; of a step that fails, the end of its output and a
+remedy."""
 
 from __future__ import annotations
 

@@ -68,7 +68,7 @@ def main() -> None:
         type=Path,
         action="append",
         default=[],
-        help="a further kernel module that the tests may load, such as vimc.ko built for this kernel",
+        help="a further kernel module that the tests may load, such as vimc.ko for this kernel",
     )
     parser.add_argument("--command", help="a shell command to run instead of pytest")
     parser.add_argument("pytest", nargs="*", help="arguments for pytest, after --")

@@ -30,6 +30,7 @@ def test_memory_does_not_grow_over_two_hundred_exposures(tmp_path: Path, paralle
     subprocess.run([*command, "--dc", "12"], check=True, timeout=300, stdout=subprocess.DEVNULL)
     seen = held_mib(tmp_path, EXPOSURES, parallel)
     print(
-        f"PSS MiB: {seen[WARM_UP_EXPOSURES]:.1f} after {WARM_UP_EXPOSURES}, {seen[-1]:.1f} at the end"
+        f"PSS MiB: {seen[WARM_UP_EXPOSURES]:.1f} after {WARM_UP_EXPOSURES}, {seen[-1]:.1f} at the "
+        "end"
     )
     assert max(seen[-20:]) - max(seen[:WARM_UP_EXPOSURES]) < GROWTH_LIMIT_MIB

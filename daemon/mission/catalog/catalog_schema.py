@@ -13,7 +13,8 @@ from typing import Final
 SCHEMA_VERSION = 2
 
 DATABASE_ERRORS: Final = (sqlite3.Error, UnicodeDecodeError)
-"""What a damaged index raises. SQLite quotes damaged names in its messages, which need not be UTF-8."""
+"""What a damaged index raises. SQLite quotes damaged names in its messages, which need not be
+UTF-8."""
 
 _SCHEMA = """
 CREATE TABLE exposures (

@@ -368,8 +368,8 @@ class MirroredStorage:
             self._emit_event("disk-dropped", copy.disk, sentence)
         else:
             sentence = (
-                f"disk {copy.disk} is released ({reason}) and may be unmounted; storing goes on with "
-                f"{left}"
+                f"disk {copy.disk} is released ({reason}) and may be unmounted; storing goes on "
+                f"with {left}"
             )
             self._emit_event("disk-released", copy.disk, sentence)
 

@@ -25,7 +25,8 @@ _BUFFER_BYTES = 4 << 20
 
 
 def create_file(path: Path, parts: Sequence[bytes | memoryview], *, mode: int = 0o444) -> int:
-    """Like `durable.create_file`, without the page cache where the file is large and the disk allows.
+    """Like `durable.create_file`, without the page cache where the file is large and the disk
+    allows.
 
     Parts that lie in memory as they lie in the file, on a multiple of `BLOCK`, are never copied.
 

@@ -90,8 +90,8 @@ class DiskSpaceMonitor:
             "" if capacity.seconds is None else f", {capacity.seconds / 60:.0f} min at this rate"
         )
         return (
-            f"the disk is low: room for {capacity.exposures} exposures{time_left}; finish this line and "
-            f"change the disk, or free {self._path}"
+            f"the disk is low: room for {capacity.exposures} exposures{time_left}; finish this "
+            f"line and change the disk, or free {self._path}"
         )
 
     def _interval_s(self) -> float | None:

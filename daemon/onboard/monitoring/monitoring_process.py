@@ -65,7 +65,8 @@ RENEWAL_S = 5.0
 """Interval at which the certificate files are checked."""
 
 PING_S, PONG_TIMEOUT_S = 5.0, 10.0
-"""Interval and timeout of pings; the kernel may buffer minutes of telemetry for a stalled client."""
+"""Interval and timeout of pings; the kernel may buffer minutes of telemetry for a stalled
+client."""
 
 
 def main(link: PageConnection, settings: WatchSection, plan: PlanSection | None = None) -> None:

@@ -3,8 +3,8 @@
 The limits of the systemd unit hold for all processes of the service. The resource limits here hold
 for the process with network access. If it exceeds them, it ends and is started again; the flight
 continues. Landlock (landlock(7)) forbids it to start programs, to read or change processes of its
-user that are not its own (ptrace, /proc/PID/mem, process_vm_writev), and to send them signals. Files
-are not restricted here.
+user that are not its own (ptrace, /proc/PID/mem, process_vm_writev), and to send them signals.
+Files are not restricted here.
 """
 
 from __future__ import annotations

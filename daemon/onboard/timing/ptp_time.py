@@ -1,7 +1,7 @@
 """GPS time from the clocks of heads that PTP synchronises, and whether it may be used.
 
-PTP states that a head's clock follows its master, not that the master shows TAI. Therefore the clocks
-are used only after they agreed with the receiver, and no longer than they do.
+PTP states that a head's clock follows its master, not that the master shows TAI. Therefore the
+clocks are used only after they agreed with the receiver, and no longer than they do.
 
 Source: docs/explanation/mathematics/time.md#ptp; IEEE 1588-2008, section 7.2 and annex B.
 """
@@ -103,9 +103,10 @@ class PtpTime:
                     ClockEvent(
                         "ptp-grandmaster-changed",
                         True,
-                        f"the grandmaster of {reading.device} is {reading.grandmaster or 'unknown'} "
-                        f"and was {state.grandmaster}; its time is used again once it agrees with "
-                        "the receiver. Check why the former one left, and their priorities",
+                        f"the grandmaster of {reading.device} is "
+                        f"{reading.grandmaster or 'unknown'} and was {state.grandmaster}; its time "
+                        "is used again once it agrees with the receiver. Check why the former one "
+                        "left, and their priorities",
                     )
                 )
             state.grandmaster = reading.grandmaster

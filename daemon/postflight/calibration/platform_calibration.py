@@ -75,8 +75,8 @@ def read_missions(missions: Sequence[Path]) -> PlatformMissions:
         own = load_rig(mission.rig_path)
         if not own.is_calibrated:
             raise PlatformCalibrationError(
-                f"{mission.id} was flown with the uncalibrated rig {own.name}; angles need calibrated "
-                "lenses: calibrate the heads first, and process the mission again"
+                f"{mission.id} was flown with the uncalibrated rig {own.name}; angles need "
+                "calibrated lenses: calibrate the heads first, and process the mission again"
             )
         rig = rig or own
         if own != rig:
@@ -198,7 +198,8 @@ def _verdict(rig: Rig, cone: CalibratedConeMounting) -> str:
     return (
         f"cone {cone.cone}: turned by {np.linalg.norm(cone.correction_rad) * 1e6:.1f} urad "
         f"({shift_px(rig, cone.correction_rad):.2f} px), known to "
-        f"{float(np.max(cone.correction_sigma_rad)) * 1e6:.1f} urad from {len(cone.corrections)} exposures"
+        f"{float(np.max(cone.correction_sigma_rad)) * 1e6:.1f} urad from {len(cone.corrections)} "
+        "exposures"
     )
 
 

@@ -80,8 +80,9 @@ def read_thermal_records(missions: Sequence[Path]) -> ThermalRecords:
         if rig is None or state is None:
             if not own.is_calibrated:
                 raise ThermalCalibrationError(
-                    f"{mission.id} was flown with the uncalibrated rig {own.name}; drift is learned "
-                    "against a calibration: calibrate the camera, and process the mission again"
+                    f"{mission.id} was flown with the uncalibrated rig {own.name}; drift is "
+                    "learned against a calibration: calibrate the camera, and process the mission "
+                    "again"
                 )
             rig, state = own, empty_state(own)
         elif own != rig:

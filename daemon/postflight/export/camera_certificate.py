@@ -132,17 +132,18 @@ def _page(content: dict[str, Any]) -> str:
     )
     return (
         "<!doctype html>\n<html lang='en'><head><meta charset='utf-8'><title>"
-        f"{escape(content['camera'])}: camera certificate</title><style>body{{font:15px/1.5 system-ui,"
+        f"{escape(content['camera'])}: camera "
+        f"certificate</title><style>body{{font:15px/1.5 system-ui,"
         "sans-serif;max-width:60rem;margin:2rem auto;padding:0 1rem}table{border-collapse:collapse}"
         "td,th{border-bottom:1px solid #8884;padding:.3rem .7rem;text-align:left}</style></head>"
         f"<body><h1>{escape(content['camera'])}</h1>{simulated}<p>Camera certificate of mission "
-        f"{escape(content['mission'])}, {content['exposures']} exposures. Rig {escape(content['rig'])}, "
-        f"calibration {escape(content['calibration']['id'])} of "
+        f"{escape(content['mission'])}, {content['exposures']} exposures. Rig "
+        f"{escape(content['rig'])}, calibration {escape(content['calibration']['id'])} of "
         f"{escape(content['calibration']['date'])}.</p><table><tr><th>image</th><th>principal "
         "distance mm</th><th>principal point x, y mm</th><th>pixels</th><th>pixel um</th>"
         "<th>format mm</th>"
         f"<th>serial numbers</th></tr>{rows}</table><p>Lenses: {escape(lenses) or '&ndash;'}.</p>"
         "<h2>Axes and signs</h2>"
-        f"<p>{escape(content['axes'])}.</p><p>Distortion: none, it was removed when the images were "
-        f"made.</p><h2>Validity</h2><p>Valid {escape(content['valid'])}.</p></body></html>\n"
+        f"<p>{escape(content['axes'])}.</p><p>Distortion: none, it was removed when the images "
+        f"were made.</p><h2>Validity</h2><p>Valid {escape(content['valid'])}.</p></body></html>\n"
     )

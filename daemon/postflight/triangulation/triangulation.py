@@ -203,8 +203,9 @@ def _common_image(rig: Rig, heads: Sequence[str]) -> VirtualImage:
     image = images.pop()
     if image is None or images:
         raise TriangulationError(
-            f"--head {', '.join(heads)}: a block is made of images of heads with the same pixels and "
-            f"principal distance; {rig.name} has {', '.join(known) or 'stitched images, no heads'}"
+            f"--head {', '.join(heads)}: a block is made of images of heads with the same pixels "
+            f"and principal distance; {rig.name} has "
+            f"{', '.join(known) or 'stitched images, no heads'}"
         )
     return image
 

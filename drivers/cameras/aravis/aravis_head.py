@@ -218,7 +218,8 @@ class AravisHead(AravisSettings, HeadDevice):
         if status == ACTION_LATE:
             self.counters["actions_late"] += 1
             raise DeviceError(
-                f"{self.name}: the head received the action command after its time; increase lead_ms"
+                f"{self.name}: the head received the action command after its time; increase "
+                "lead_ms"
             )
         if status != SUCCESS:
             status_text = "no answer" if status is None else f"status 0x{status:04x}"
@@ -499,8 +500,8 @@ class AravisHead(AravisSettings, HeadDevice):
         self.counters.update(self._of_stream)
         self._of_stream = Counter()
         if session.is_lost and self._closing.is_set():
-            # Quirk: Aravis sends three release requests to a dead head, 2.5 s each. Closing does not
-            # wait for them. Upstream: no report known (2026-11-23).
+            # Quirk: Aravis sends three release requests to a dead head, 2.5 s each. Closing does
+            # not wait for them. Upstream: no report known (2026-11-23).
             threading.Thread(
                 target=self._close_session, args=(session,), name=f"{self.name}-let-go", daemon=True
             ).start()

@@ -56,5 +56,6 @@ def open_camera(head_name: str, interface: str, address: str) -> Any:
         return library.Camera.new_with_device(device)
     except failed as error:
         raise DeviceError(
-            f"{head_name}: the head cannot be opened ({message_of(error)}); check power, cable and address"
+            f"{head_name}: the head cannot be opened ({message_of(error)}); check power, cable and "
+            "address"
         ) from None

@@ -57,7 +57,8 @@ def _described(name: str, head: FoundHead, camera: Any) -> HeadDescription:
     pixel_format = usual_format(features.entries("PixelFormat"))
     if pixel_format is None:
         raise DeviceError(
-            f"{name}: it has no pixel format of 8 to 16 bits, monochrome or Bayer; it cannot be used"
+            f"{name}: it has no pixel format of 8 to 16 bits, monochrome or Bayer; it cannot be "
+            "used"
         )
     pattern, bits = _pattern_and_bits(pixel_format)
     serial = head.serial or _text(camera.get_device_serial_number())

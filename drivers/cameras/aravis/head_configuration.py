@@ -332,7 +332,8 @@ class HeadConfiguration:
         }[settings.trigger_source]
         # Quirk: some heads accept a source only while the trigger is off, others only while it is
         # on. It is written in both states.
-        # Upstream: no report known (2026-11-23); on the order of features, AravisProject/aravis#560.
+        # Upstream: no report known (2026-11-23); on the order of features,
+        # AravisProject/aravis#560.
         with contextlib.suppress(FeatureError):
             features.set("TriggerSource", source)
         self._set("trigger_source", "TriggerMode", "On", "the head cannot be triggered")

@@ -68,8 +68,8 @@ NEUTRAL: Final[tuple[tuple[str, FeatureValue], ...]] = (
 )
 """Feature and its neutral value, in the order in which they are written."""
 PASSES: Final = 2
-# Quirk: heads lock the processing of colour images while they send monochrome or Bayer images. It has
-# no effect then, so a locked feature is no refusal.
+# Quirk: heads lock the processing of colour images while they send monochrome or Bayer images. It
+# has no effect then, so a locked feature is no refusal.
 # Upstream: manual: GenICam description PGR_Blackfly_50S5C, OBCPLocked_Int.
 WITHOUT_EFFECT_WHILE_LOCKED: Final = frozenset(
     {"OnBoardColorProcessEnabled", "HueEnabled", "SaturationEnabled", "SharpnessEnabled"}

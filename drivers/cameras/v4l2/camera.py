@@ -65,15 +65,16 @@ class V4l2Camera:
             ) from None
         except OSError as error:
             raise DeviceError(
-                f"{self._who}: {path} cannot be opened ({_message_of(error)}); check cable and power"
+                f"{self._who}: {path} cannot be opened ({_message_of(error)}); check cable and "
+                "power"
             ) from None
         try:
             self._configure(settings)
         except OSError as error:
             self.node.close()
             raise DeviceError(
-                f"{self._who}: the head was lost while it was set ({_message_of(error)}); check cable "
-                "and power"
+                f"{self._who}: the head was lost while it was set ({_message_of(error)}); check "
+                "cable and power"
             ) from None
         except DeviceError:
             self.node.close()
@@ -270,8 +271,8 @@ class V4l2Camera:
         except OSError as error:
             _record_refusal(error)
             refusals.append(
-                f"{width} x {height} {requested.name} is refused ({_message_of(error)}); if the node is "
-                "busy, end the program that uses it"
+                f"{width} x {height} {requested.name} is refused ({_message_of(error)}); if the "
+                "node is busy, end the program that uses it"
             )
             return current
         if layout.code != requested.code:

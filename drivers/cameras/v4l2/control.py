@@ -24,7 +24,8 @@ NUMBERS: Final = (
 
 @dataclass(frozen=True)
 class Control:
-    """A control of the head, named as v4l2-ctl does; `path` is its sub-device, empty for the node."""
+    """A control of the head, named as v4l2-ctl does; `path` is its sub-device, empty for the
+    node."""
 
     id: int
     name: str

@@ -29,8 +29,8 @@ def describe(found: FoundNode) -> HeadDescription:
     usable = [FORMATS[name] for name in found.formats if name in FORMATS]
     if not usable:
         raise DeviceError(
-            f"head {found.card} at {found.path}: it has no pixel format of 8 to 16 bits, monochrome "
-            "or Bayer; it cannot be used"
+            f"head {found.card} at {found.path}: it has no pixel format of 8 to 16 bits, "
+            "monochrome or Bayer; it cannot be used"
         )
     widest = max(usable, key=lambda one: (one.bits, one.name))
     try:

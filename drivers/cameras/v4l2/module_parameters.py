@@ -42,14 +42,14 @@ def wrong_parameters(wanted: Sequence[str], *, modules: Path = MODULES) -> list[
             )
         except PermissionError:
             problems.append(
-                f"module_parameters has {text}; the kernel does not let this user read it, leave it "
-                "out"
+                f"module_parameters has {text}; the kernel does not let this user read it, leave "
+                "it out"
             )
             continue
         except OSError:
             problems.append(
-                f"module_parameters has {text}; the kernel has no such parameter of a loaded module, "
-                f"see modinfo {module}"
+                f"module_parameters has {text}; the kernel has no such parameter of a loaded "
+                f"module, see modinfo {module}"
             )
             continue
         if found != value and BOOLEANS.get(found, found) != BOOLEANS.get(value, value):

@@ -73,7 +73,8 @@ class V4l2Settings(Configured):
         0.0,
         minimum=0,
         maximum=3600,
-        help="time without a frame after which a free-running head is reopened; 0 for triggered ones",
+        help="time without a frame after which a free-running head is reopened; "
+        "0 for triggered ones",
     )
     check_interval_s = Setting(
         2.0, minimum=0.2, maximum=60, help="time between looks at the head's controls and health"
@@ -88,7 +89,8 @@ class V4l2Settings(Configured):
                 "give both or neither"
             )
         found += [
-            f"controls has {text!r}; name=number as in 'trigger_mode=1', the name as printed by v4l2-ctl"
+            f"controls has {text!r}; name=number as in 'trigger_mode=1', the name as printed by "
+            "v4l2-ctl"
             for text in values["controls"]
             if not ASSIGNMENT.fullmatch(text)
         ]

@@ -384,9 +384,10 @@ class V4l2Head(V4l2Settings, HeadDevice):
         try:
             node.stream_off()
         except OSError:
-            # Quirk: a lost head refuses to stop. Its mappings are released all the same, or its node
-            # never comes back. Upstream: manual: Linux, Documentation/driver-api/media/v4l2-dev.rst,
-            # section video device cleanup; realsenseai/librealsense#406.
+            # Quirk: a lost head refuses to stop. Its mappings are released all the same, or its
+            # node never comes back. Upstream: manual: Linux,
+            # Documentation/driver-api/media/v4l2-dev.rst, section video device cleanup;
+            # realsenseai/librealsense#406.
             self.counters["stop_failures"] += 1
         node.close()
 

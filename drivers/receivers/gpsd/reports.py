@@ -174,7 +174,8 @@ class GpsdReports:
         velocity, speed_sigma = _velocity(report)
         horizontal_m = _horizontal_sigma_m(report)
         # Quirk: gpsd sends leap seconds only for receivers that decode them, never with NMEA. The
-        # built-in table is used. Upstream: no report known (2026-11-23); gpsd_json(5), TPV, leapseconds.
+        # built-in table is used. Upstream: no report known (2026-11-23); gpsd_json(5), TPV,
+        # leapseconds.
         is_by_table = self._leap_seconds is None
         leap_seconds = leap_seconds_at(utc) if self._leap_seconds is None else self._leap_seconds
         self.fix = fix

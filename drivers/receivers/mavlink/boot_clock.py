@@ -42,8 +42,8 @@ RESTART_BACK_NS: Final = 1_000 * MS_NS
 that was overtaken."""
 CERTAIN_STEP_NS: Final = SECOND_NS // 2
 """Two messages in succession that are further off have another UTC."""
-# Quirk: UTC of real autopilots jitters against their own clock by milliseconds, now and then by tens
-# of them, and it steps. Upstream: PX4/PX4-Autopilot#16653, PX4/PX4-Autopilot#22440.
+# Quirk: UTC of real autopilots jitters against their own clock by milliseconds, now and then by
+# tens of them, and it steps. Upstream: PX4/PX4-Autopilot#16653, PX4/PX4-Autopilot#22440.
 STEPS: Final = ((3, 3, 0.95, 1.5), (8, 7, 0.75, 1.0), (12, 11, 0.6, 1.0))
 """UTC has stepped where of so many newest messages so many err to the same side by more than that
 quantile of all before, times a factor: by chance that happens once in days."""

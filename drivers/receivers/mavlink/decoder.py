@@ -76,7 +76,8 @@ class MavlinkDecoder(MessageDecoder):
         super().__init__(
             receiver,
             self._parser.framer(),
-            ("samples", "samples_without_time", "marks", "marks_far", "marks_without_time", "marks_open_loop",
+            ("samples", "samples_without_time", "marks", "marks_far",
+             "marks_without_time", "marks_open_loop",
              "messages_of_others", "messages_lost", "clock_steps"),
         )  # fmt: skip
         self.decode_errors = self._parser.errors

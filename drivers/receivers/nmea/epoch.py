@@ -93,7 +93,8 @@ class Epoch:
         """Height above the ellipsoid.
 
         Args:
-            undulation_m: geoid above ellipsoid, m, if the receiver does not send it; None if unknown.
+            undulation_m: geoid above ellipsoid, m, if the receiver does not send it; None if
+            unknown.
 
         Returns:
             Height, m; None if none was received, or only one above the geoid without undulation.

@@ -305,7 +305,8 @@ class SbfDecoder(MessageDecoder):
         if rx_ns == self._marked_rx_ns:
             return
         self._marked_rx_ns = rx_ns
-        # Quirk: the block contains neither input nor edge. They are known only if there is one kind.
+        # Quirk: the block contains neither input nor edge. They are known only if there is one
+        # kind.
         # Upstream: manual: Septentrio mosaic-X5 reference guide, ExtEventPVTGeodetic.
         if len(self._counts) == 1 and not self.counters["marks_other_edge"]:
             self._counts[next(iter(self._counts))] += 1

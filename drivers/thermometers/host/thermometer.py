@@ -22,9 +22,9 @@ class HostThermometer(DeviceDriver):
     """Sensors of the Linux host: hwmon chips (processor, disks, boards) and iio devices.
 
     A sensor is named `chip/channel` or `chip/label`, or `chip@device/...` if chips share a name. It
-    is never named by its number, which changes from boot to boot. A sensor whose files vanish yields
-    nothing until it is found again by its name. A sensor that its chip reports as faulty yields
-    samples with `value_c=None`.
+    is never named by its number, which changes from boot to boot. A sensor whose files vanish
+    yields nothing until it is found again by its name. A sensor that its chip reports as faulty
+    yields samples with `value_c=None`.
 
     Source: Linux Documentation/hwmon/sysfs-interface, ABI/testing/sysfs-bus-iio.
     """

@@ -209,8 +209,9 @@ class ModbusThermometer(SerialDevice):
             self.counters["unconfirmed"] += len(self.channels)
             self.emitter.emit_throttled(
                 "word-order",
-                f"The readings of the thermometer {self.name} are no temperatures in the word order "
-                f'"{self.word_order}" and are left out. Check word_order, scale_c and first_register.',
+                f"The readings of the thermometer {self.name} are no temperatures in the word "
+                f'order "{self.word_order}" and are left out. '
+                "Check word_order, scale_c and first_register.",
             )
         return self._is_word_order_confirmed
 

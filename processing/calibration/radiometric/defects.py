@@ -222,7 +222,8 @@ def _merged(columns: list[DefectColumn]) -> list[DefectColumn]:
 
 
 def _grouped(found: Flags, in_column: Flags) -> tuple[int, tuple[int, ...], Flags]:
-    """Count single pixels and clusters in addition to the columns; holes within clusters are filled."""
+    """Count single pixels and clusters in addition to the columns; holes within clusters are
+    filled."""
     eight = np.ones((3, 3), bool)
     labels, count = ndimage.label(found & ~in_column, structure=eight)
     sizes = np.bincount(labels.ravel(), minlength=count + 1)[1:]

@@ -1,8 +1,8 @@
 """Registers of a camera after power-on, made from its description alone.
 
-A description states which registers a camera has and what they mean, not what they hold. This module
-chooses values under which the features of the description are implemented and available, their
-limits are in order, and every enumeration has a valid entry.
+A description states which registers a camera has and what they mean, not what they hold. This
+module chooses values under which the features of the description are implemented and available,
+their limits are in order, and every enumeration has a valid entry.
 """
 
 from __future__ import annotations

@@ -1,4 +1,5 @@
-"""Answers in other units, out of range, or impossible together are refused with what would be right."""
+"""Answers in other units, out of range, or impossible together are refused with what would be
+right."""
 
 from __future__ import annotations
 

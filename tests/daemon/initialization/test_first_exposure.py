@@ -1,4 +1,5 @@
-"""`syntopic init` to the first stored exposure, with fake cameras of Aravis and an emulated receiver.
+"""`syntopic init` to the first stored exposure, with fake cameras of Aravis and an emulated
+receiver.
 
 Figures: docs/reference/results/processing.md, record `first-exposure`.
 """

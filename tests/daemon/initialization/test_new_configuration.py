@@ -1,4 +1,5 @@
-"""Files of a new rig: they are read back, the heads look where the arrangement states, all or none."""
+"""Files of a new rig: they are read back, the heads look where the arrangement states, all or
+none."""
 
 from __future__ import annotations
 

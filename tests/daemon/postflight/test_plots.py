@@ -23,7 +23,8 @@ from daemon.postflight.plots import (
 VALUES = np.array([1.0, np.nan, 3.0, -1.0])
 DRAWING = (
     "from daemon.postflight.plots import *; import sys; "
-    "sys.stdout.write(chart_svg('t', ('x', 'y'), [Curve('c', [1.0, 2.0], [3.0, 4.0], joined=False)]))"
+    "sys.stdout.write(chart_svg('t', ('x', 'y'), [Curve('c', [1.0, 2.0], [3.0, 4.0], "
+    "joined=False)]))"
 )
 
 

@@ -1,4 +1,5 @@
-"""A rig without `[calibration]`: it is processed, and every product states that it is uncalibrated."""
+"""A rig without `[calibration]`: it is processed, and every product states that it is
+uncalibrated."""
 
 from __future__ import annotations
 

@@ -30,7 +30,8 @@ def strip() -> Network:
 def spoiled(
     network: Network, size_mm: float, seed: int, share: float = 0.02
 ) -> tuple[Network, NDArray[np.float64]]:
-    """A share of the image points displaced by one length in any direction, and the displacements."""
+    """A share of the image points displaced by one length in any direction, and the
+    displacements."""
     random = np.random.default_rng(seed)
     table = network.image_points
     count = len(table.image)

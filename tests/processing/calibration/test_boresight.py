@@ -1,4 +1,5 @@
-"""Boresight, lever arm, time offset err as their covariance predicts; inseparable parameters are named."""
+"""Boresight, lever arm, time offset err as their covariance predicts; inseparable parameters are
+named."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""The formulas of docs/reference/formats.md, written again from the page alone, against the code."""
+"""The formulas of docs/reference/formats.md, written again from the page alone, against the
+code."""
 
 import math
 import re

@@ -31,7 +31,8 @@ def test_pixels_rotate_with_their_image_and_back(quarters: int) -> None:
 
 
 def test_obliques_of_opposite_flights_that_look_alike_are_tied_through_the_ground() -> None:
-    """Ahead of one flight and behind the other: the image is upside down and at another position."""
+    """Ahead of one flight and behind the other: the image is upside down and at another
+    position."""
     random = np.random.default_rng(3)
     texture = ndimage.gaussian_filter(random.normal(size=(900, 900)), 1.5)
     coefficients = ndimage.spline_filter(texture / texture.std() * 500.0 + 5000.0)

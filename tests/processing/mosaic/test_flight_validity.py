@@ -33,7 +33,8 @@ def camera_errors(rig: Rig, seed: int) -> dict[str, tuple[float, float]]:
 
 
 def template(rig: Rig) -> StitchRecord:
-    """The record of one real adjustment, of a camera as calibrated: its covariance is what counts."""
+    """The record of one real adjustment, of a camera as calibrated: its covariance is what
+    counts."""
     rng = np.random.default_rng(0)
     truth = make_truth(rig, rng, temperature_c=20.0, sensor_px=0.0)
     points = tie_points_of(

@@ -12,7 +12,8 @@ from benchmarks.stitching_samples import MatchingErrors, StitchedSample, tie_poi
 from processing.matching.tie_points import PAN_TO_PAN
 
 ERRORS = Path(__file__).parent / "matching_errors.npz"
-"""Of two rendered exposures: `python -m benchmarks.uncertainty_consistency --save-errors` writes it."""
+"""Of two rendered exposures: `python -m benchmarks.uncertainty_consistency --save-errors` writes
+it."""
 EXPOSURES = 16
 
 pytestmark = pytest.mark.timeout(600)

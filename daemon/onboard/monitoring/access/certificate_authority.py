@@ -65,8 +65,8 @@ def issue_certificate(
 ) -> IssuedCertificate:
     """Create a server certificate, and its authority if there is none.
 
-    Existing files are used again: the authority, and the server's key, so that a renewal replaces one
-    file, at once.
+    Existing files are used again: the authority, and the server's key, so that a renewal replaces
+    one file, at once.
 
     Args:
         folder: of the server's certificate and key.
@@ -102,8 +102,8 @@ def issue_certificate(
             openssl("verify", "-CAfile", signer, "-purpose", "sslserver", signed)
         except TlsCertificateError as error:
             raise TlsCertificateError(
-                f"{signer} may not sign for all of {', '.join(subject_names)} ({error}); remove {signer} "
-                "to make a new authority, and install it on the tablets"
+                f"{signer} may not sign for all of {', '.join(subject_names)} ({error}); remove "
+                f"{signer} to make a new authority, and install it on the tablets"
             ) from error
         server_context(signed, key)
         durable.replace_file(certificate, signed.read_bytes())

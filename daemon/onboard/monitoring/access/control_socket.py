@@ -306,7 +306,8 @@ def _listen(path: Path, gid: int) -> socket.socket:
             try:
                 os.chown(path, -1, gid)
             except PermissionError:
-                # The hardened unit may not chown: world-connectable, authorized by peer credentials.
+                # The hardened unit may not chown: world-connectable, authorized by peer
+                # credentials.
                 path.chmod(0o666)
         listening.listen(CALLERS_MAX)
     except OSError as error:

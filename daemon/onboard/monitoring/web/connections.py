@@ -125,7 +125,8 @@ class Connections:
         )
 
     def may_watch(self, new_connection: ClientConnection | None) -> bool:
-        """Whether one more client is served; if all places are taken, another may be disconnected."""
+        """Whether one more client is served; if all places are taken, another may be
+        disconnected."""
         self._remove_closed()
         watchers = [one for one in self._by_peer.values() if one.use is ConnectionUse.WATCHER]
         others = [one for one in watchers if one is not new_connection]

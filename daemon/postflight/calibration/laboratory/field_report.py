@@ -183,8 +183,8 @@ def field_report(
             "rejected": found.rejected,
         },
         verdicts=[
-            f"{point_count} image points, redundancy {result.redundancy}; sigma of an image coordinate "
-            f"{found.sigma_px:.4f} px, sigma0 {result.sigma0:.3f}.",
+            f"{point_count} image points, redundancy {result.redundancy}; sigma of an image "
+            f"coordinate {found.sigma_px:.4f} px, sigma0 {result.sigma0:.3f}.",
             "Datum: principal distance and point of every cone as they were, the first CCD of "
             "each cone not turned, the master cone not rotated.",
         ],

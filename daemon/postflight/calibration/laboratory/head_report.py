@@ -73,8 +73,8 @@ def head_report(
         sentence = (
             f"{head.cone.name}: {len(head.measured_mm)} targets in {len(head.series)} series leave "
             f"{head.residual_px:.4f} px = {head.residual_px * head.sensor.pitch_um:.3f} um (root "
-            f"mean square of a coordinate) to the ten parameters, {head.grid_residual_px:.4f} px with "
-            "the grid"
+            f"mean square of a coordinate) to the ten parameters, {head.grid_residual_px:.4f} px "
+            "with the grid"
         )
         if head.residual_px < RESIDUAL_BAR_PX:
             verdicts.append(f"{sentence}; below 1/20 px.")

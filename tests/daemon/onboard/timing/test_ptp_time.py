@@ -1,4 +1,5 @@
-"""PTP clocks of heads: used while they agree with the receiver, refused by name when they do not."""
+"""PTP clocks of heads: used while they agree with the receiver, refused by name when they do
+not."""
 
 from __future__ import annotations
 
