@@ -98,7 +98,7 @@ class Outcome:
 
     `result` is `found`, `right` (no finding, and the image is right), `covered` (below the
     limit, places are within what is stated), `silent` (wrong beyond what is stated, and good) or
-    `misled` (found, but only the innocent are named).
+    `misled` (found, but only correct frames are named).
     """
 
     number: int

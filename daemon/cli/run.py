@@ -77,7 +77,7 @@ def _print_line(event: Mapping[str, Any]) -> None:
 
 
 def _write_line(line: str) -> None:
-    """Nobody need listen: a reader that has gone, or a full disk behind it, ends no flight."""
+    """A reader that has ended, or a full disk behind it, ends no flight."""
     try:
         print(line, flush=True)
     except OSError:

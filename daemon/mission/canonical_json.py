@@ -59,7 +59,7 @@ def sha256_hex(data: bytes) -> str:
 
 
 def parse_record(data: bytes, name: str) -> dict[str, Any]:
-    """Parse one JSON object from hostile bytes; `name` is used in the error message.
+    """Parse one JSON object from untrusted bytes; `name` is used in the error message.
 
     Raises:
         RecordError: too large, not UTF-8, not JSON, a key given twice, NaN, or not an object.

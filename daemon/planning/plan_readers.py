@@ -1,4 +1,4 @@
-"""Plans of others: GeoJSON, KML, QGroundControl's .plan. Hostile input: limited in every way.
+"""Plans of others: GeoJSON, KML, QGroundControl's .plan. Untrusted input: limited in every way.
 
 GeoJSON is ours as well: every LineString is a line, its `id` and `strip` are properties, and a
 member `specification` of the collection contains the requirements (docs/how-to/flight/plan.md).

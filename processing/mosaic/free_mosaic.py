@@ -230,7 +230,7 @@ def adjust_mosaic(
     Each round linearises (but after a step too small to matter), weighs (a soft weight while the
     model is still far off, then points whose normalised residual exceeds `outlier_limit` are left
     out), solves, and estimates what the two classes of points are worth, until corrections and
-    outliers come to rest.
+    outliers no longer change.
 
     Args:
         rig: the camera.

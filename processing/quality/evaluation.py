@@ -155,20 +155,22 @@ def evaluate(
 
     Source: docs/explanation/mathematics/quality.md#flags-and-verdict.
     """
-    t, figures = thresholds or Thresholds(), figures.finite()
+    limits, figures = thresholds or Thresholds(), figures.finite()
     findings = [
         Finding(flag, *_CAPTURE[flag]) for flag in Flag if flag & capture_flags and flag in _CAPTURE
     ]
-    findings += _frames(figures, capture_flags, missing_sensors, t)
-    findings += _time_and_temperature(figures, missing_probes, probes_out_of_range, t)
+    findings += _frames(figures, capture_flags, missing_sensors, limits)
+    findings += _time_and_temperature(figures, missing_probes, probes_out_of_range, limits)
     findings += content_findings(figures, mismatched_bands)
     findings += stitching_findings(
-        figures, [b for b in nominal_bands if b not in mismatched_bands], t
+        figures, [b for b in nominal_bands if b not in mismatched_bands], limits
     )
     findings += word_format_findings(figures) + identity_findings(figures)
-    findings += [] if figures.of(ContentFigures).mismatched_sensors else signal_findings(figures, t)
-    findings += exposure_findings(figures, t)
-    findings += _attitude(figures.of(GeometryFigures), t)
+    findings += (
+        [] if figures.of(ContentFigures).mismatched_sensors else signal_findings(figures, limits)
+    )
+    findings += exposure_findings(figures, limits)
+    findings += _attitude(figures.of(GeometryFigures), limits)
     broken = list(requirement_findings(figures, requirements or QualityRequirements()))
     findings = [f for f in findings if f.flag not in {b.flag for b in broken}] + broken
     order = list(Verdict)
@@ -183,7 +185,7 @@ def _frames(
     figures: QualityFigures,
     capture_flags: Flag,
     missing_sensors: Sequence[str],
-    t: Thresholds,
+    thresholds: Thresholds,
 ) -> list[Finding]:
     findings, gap = [], _gap(figures.of(ValidAreaFigures))
     if missing_sensors or capture_flags & Flag.FRAME_MISSING:
@@ -200,7 +202,7 @@ def _frames(
         )
     worst = figures.of(UnreadFigures)
     unread = worst.unread_worst_fraction
-    if unread is not None and unread > t.unread_fraction:
+    if unread is not None and unread > thresholds.unread_fraction:
         findings.append(
             Finding(
                 Flag.FRAME_CORRUPT,
@@ -208,18 +210,18 @@ def _frames(
                 f"{unread:.0%} of {worst.unread_worst_sensor} was not read out: it is "
                 f"below black{gap}. Check head and cable.",
                 unread,
-                t.unread_fraction,
+                thresholds.unread_fraction,
             )
         )
     valid = figures.of(ValidFigures).valid_fraction
-    if valid is not None and valid < t.valid_refly_fraction:
+    if valid is not None and valid < thresholds.valid_refly_fraction:
         findings.append(
             Finding(
                 Flag.FRAME_MISSING,
                 Verdict.REFLY,
                 f"Only {valid:.0%} of the image holds data; fly this exposure again.",
                 valid,
-                t.valid_refly_fraction,
+                thresholds.valid_refly_fraction,
             )
         )
     return findings
@@ -237,19 +239,19 @@ def _time_and_temperature(
     figures: QualityFigures,
     missing_probes: Sequence[str],
     probes_out_of_range: Sequence[str],
-    t: Thresholds,
+    thresholds: Thresholds,
 ) -> list[Finding]:
     time = figures.of(TimeFigures)
     findings = above(
         time.time_sigma_ns,
         Flag.TIME_SIGMA,
-        (t.time_sigma_ns, t.time_sigma_refly_ns),
+        (thresholds.time_sigma_ns, thresholds.time_sigma_refly_ns),
         "The exposure's time is uncertain; check strobe cable and receiver.",
     )
     findings += above(
         time.time_error_px,
         Flag.TIME_SIGMA,
-        (t.time_error_px, t.time_error_refly_px),
+        (thresholds.time_error_px, thresholds.time_error_refly_px),
         "The exposure's time is too uncertain for this speed and GSD; see the time budget: "
         "check strobe cable and receiver.",
     )
@@ -267,7 +269,7 @@ def _time_and_temperature(
     findings += above(
         figures.of(GeometryFigures).temperature_age_s,
         Flag.TEMPERATURE_STALE,
-        (t.temperature_age_s, math.inf),
+        (thresholds.temperature_age_s, math.inf),
         "Temperatures are old; check the probe module and its line.",
     )
     findings += _temperature_by_stitching(figures)
@@ -276,8 +278,9 @@ def _time_and_temperature(
             Finding(
                 Flag.TEMPERATURE_RANGE,
                 Verdict.USABLE,
-                f"Probe {', '.join(probes_out_of_range)} is outside {t.temperature_low_c:g} to "
-                f"{t.temperature_high_c:g} degC and was not used; check the probe.",
+                f"Probe {', '.join(probes_out_of_range)} is outside "
+                f"{thresholds.temperature_low_c:g} to {thresholds.temperature_high_c:g} degC "
+                "and was not used; check the probe.",
                 float(len(probes_out_of_range)),
                 0.0,
             )
@@ -306,15 +309,15 @@ def _temperature_by_stitching(figures: QualityFigures) -> list[Finding]:
     return [Finding(Flag.DC_DISAGREEMENT, Verdict.USABLE, sentence, value)]
 
 
-def _attitude(figures: GeometryFigures, t: Thresholds) -> list[Finding]:
+def _attitude(figures: GeometryFigures, thresholds: Thresholds) -> list[Finding]:
     return above(
         figures.tilt_deg,
         Flag.TILT,
-        (math.degrees(t.tilt_rad), math.inf),
+        (math.degrees(thresholds.tilt_rad), math.inf),
         "The camera was tilted; check the mount and fly the line level.",
     ) + above(
         figures.crab_deg,
         Flag.DRIFT,
-        (math.degrees(t.crab_rad), math.inf),
+        (math.degrees(thresholds.crab_rad), math.inf),
         "The camera does not point along the track; set the drift angle of the mount.",
     )

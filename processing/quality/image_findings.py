@@ -109,12 +109,12 @@ def word_format_findings(figures: QualityFigures) -> list[Finding]:
     ]
 
 
-def signal_findings(figures: QualityFigures, t: Thresholds) -> list[Finding]:
+def signal_findings(figures: QualityFigures, thresholds: Thresholds) -> list[Finding]:
     """Signal that a head or its read-out has changed.
 
     Args:
         figures: of one exposure.
-        t: limits.
+        thresholds: limits.
 
     Returns:
         Findings about steps, balance, blocks, clipping and local blur.
@@ -123,7 +123,7 @@ def signal_findings(figures: QualityFigures, t: Thresholds) -> list[Finding]:
     steps, unread = figures.of(SignalStepFigures), figures.of(UnreadFigures)
     step = steps.signal_step
     # Lines that were not read out are a step, too.
-    is_unread = (unread.unread_worst_fraction or 0.0) > t.unread_fraction
+    is_unread = (unread.unread_worst_fraction or 0.0) > thresholds.unread_fraction
     unread_sensor = unread.unread_worst_sensor if is_unread else None
     if step is not None and steps.signal_step_sensor != unread_sensor:
         lines = steps.signal_step_lines or 1
@@ -154,15 +154,17 @@ def signal_findings(figures: QualityFigures, t: Thresholds) -> list[Finding]:
                 1.0,
             )
         )
-    findings += _block(figures.of(BlockFigures), t)
-    findings += _clipping(figures.of(ClippingFigures), t)
-    return findings + _blur(figures.of(RelativeSharpnessFigures), figures.of(LocalBlurFigures), t)
+    findings += _block(figures.of(BlockFigures), thresholds)
+    findings += _clipping(figures.of(ClippingFigures), thresholds)
+    return findings + _blur(
+        figures.of(RelativeSharpnessFigures), figures.of(LocalBlurFigures), thresholds
+    )
 
 
-def _block(block: BlockFigures, t: Thresholds) -> list[Finding]:
+def _block(block: BlockFigures, thresholds: Thresholds) -> list[Finding]:
     """A rectangle of a frame with another offset or gain."""
     step, step_dn = block.block_step, block.block_step_dn
-    if step is None or step_dn is None or abs(step) <= t.block_step:
+    if step is None or step_dn is None or abs(step) <= thresholds.block_step:
         return []
     other = "columns" if block.block_axis == "rows" else "rows"
     return [
@@ -175,15 +177,15 @@ def _block(block: BlockFigures, t: Thresholds) -> list[Finding]:
             "of pixels and no other head shows it. Radiometry of this frame is wrong. Check the "
             "head and its cable.",
             step,
-            t.block_step,
+            thresholds.block_step,
         )
     ]
 
 
-def _clipping(clipping: ClippingFigures, t: Thresholds) -> list[Finding]:
+def _clipping(clipping: ClippingFigures, thresholds: Thresholds) -> list[Finding]:
     """A frame that ends below full scale."""
     share, level_dn = clipping.clipped_fraction, clipping.clipped_dn
-    if share is None or level_dn is None or share <= t.clipped_fraction:
+    if share is None or level_dn is None or share <= thresholds.clipped_fraction:
         return []
     return [
         Finding(
@@ -194,13 +196,13 @@ def _clipping(clipping: ClippingFigures, t: Thresholds) -> list[Finding]:
             "that value, and what is brighter is lost. Check gain, bits and lookup table of the "
             "head.",
             share,
-            t.clipped_fraction,
+            thresholds.clipped_fraction,
         )
     ]
 
 
 def _blur(
-    relative: RelativeSharpnessFigures, local: LocalBlurFigures, t: Thresholds
+    relative: RelativeSharpnessFigures, local: LocalBlurFigures, thresholds: Thresholds
 ) -> list[Finding]:
     """A PAN head, or a region of any frame, that is less sharp than others of the same ground."""
     findings = []
@@ -218,11 +220,11 @@ def _blur(
     for name, deficit, region, least in (
         (
             *(local.colour_blur_sensor, local.colour_blur_deficit, local.colour_blur_region),
-            t.colour_blur_deficit,
+            thresholds.colour_blur_deficit,
         ),
         (
             *(local.pan_blur_sensor, local.pan_blur_deficit, local.pan_blur_region),
-            t.pan_blur_deficit,
+            thresholds.pan_blur_deficit,
         ),
     ):
         if deficit is None or deficit <= least or name == blurred:
@@ -240,20 +242,20 @@ def _blur(
     return findings
 
 
-def exposure_findings(figures: QualityFigures, t: Thresholds) -> list[Finding]:
+def exposure_findings(figures: QualityFigures, thresholds: Thresholds) -> list[Finding]:
     """Exposure that is too dark, too bright or blurred.
 
     Args:
         figures: of one exposure.
-        t: limits.
+        thresholds: limits.
 
     Returns:
         Findings about brightness, exposure times, saturation, smear and sharpness.
     """
     findings = []
     bright = figures.of(SignalFigures).bright_fraction
-    if bright is not None and bright < t.bright_fraction:
-        black = bright < t.bright_refly_fraction
+    if bright is not None and bright < thresholds.bright_fraction:
+        black = bright < thresholds.bright_refly_fraction
         findings.append(
             Finding(
                 Flag.UNDEREXPOSED,
@@ -262,7 +264,7 @@ def exposure_findings(figures: QualityFigures, t: Thresholds) -> list[Finding]:
                 if black
                 else "The image is dark; lengthen the exposure or open the aperture.",
                 bright,
-                t.bright_refly_fraction if black else t.bright_fraction,
+                thresholds.bright_refly_fraction if black else thresholds.bright_fraction,
             )
         )
     unknown = ", ".join(figures.of(UnknownExposureFigures).exposure_unknown_sensors)
@@ -278,7 +280,7 @@ def exposure_findings(figures: QualityFigures, t: Thresholds) -> list[Finding]:
         )
     corrected = figures.of(ExposureScaleFigures)
     scale, scaled = corrected.exposure_scale, corrected.exposure_scaled_sensor
-    if scale is not None and scale > t.exposure_scale:
+    if scale is not None and scale > thresholds.exposure_scale:
         findings.append(
             Finding(
                 Flag.UNDEREXPOSED,
@@ -287,13 +289,13 @@ def exposure_findings(figures: QualityFigures, t: Thresholds) -> list[Finding]:
                 f"record states: its level is corrected, its noise is {scale**0.5:.1f} times "
                 "theirs. Check the exposure times.",
                 scale,
-                t.exposure_scale,
+                thresholds.exposure_scale,
             )
         )
     findings += above(
         figures.of(SaturationFigures).saturated_fraction,
         Flag.OVEREXPOSED,
-        (t.saturated_fraction, t.saturated_refly_fraction),
+        (thresholds.saturated_fraction, thresholds.saturated_refly_fraction),
         "Parts of the image are saturated; shorten the exposure.",
     )
     smear = figures.of(SmearFigures)
@@ -301,18 +303,18 @@ def exposure_findings(figures: QualityFigures, t: Thresholds) -> list[Finding]:
         findings += above(
             smear_px,
             Flag.BLUR,
-            (t.smear_px, t.smear_refly_px),
+            (thresholds.smear_px, thresholds.smear_refly_px),
             f"Motion blur {way} track; shorten the exposure, check TDI, speed, mount and crab.",
         )
     sharpness = figures.of(SharpnessFigures).sharpness
-    if sharpness is not None and sharpness < t.sharpness:
+    if sharpness is not None and sharpness < thresholds.sharpness:
         findings.append(
             Finding(
                 Flag.BLUR,
                 Verdict.USABLE,
                 "The image holds no fine detail; look at the quick look for cloud, dew or blur.",
                 sharpness,
-                t.sharpness,
+                thresholds.sharpness,
             )
         )
     return findings

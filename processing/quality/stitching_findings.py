@@ -30,14 +30,14 @@ from processing.quality.rules import above, probe_bias_phrase
 
 
 def stitching_findings(
-    figures: QualityFigures, nominal_bands: Sequence[str], t: Thresholds
+    figures: QualityFigures, nominal_bands: Sequence[str], thresholds: Thresholds
 ) -> list[Finding]:
     """Stitching that is weak, does not fit, or disagrees with the calibration.
 
     Args:
         figures: of one exposure.
         nominal_bands: bands placed by calibration because too few tie points were found.
-        t: limits.
+        thresholds: limits.
 
     Returns:
         Findings about tie points, fit, scales, mountings, slips and displaced sensors.
@@ -48,17 +48,17 @@ def stitching_findings(
     poorest, name = overlap.tie_points_min_overlap, overlap.tie_points_min_overlap_name
     slipped = slip.slip_sensor is not None and slip.slip_sensor in (name or "")
     explained = slipped or bool(elsewhere)
-    if poorest is not None and poorest < t.tie_points_per_overlap and not explained:
+    if poorest is not None and poorest < thresholds.tie_points_per_overlap and not explained:
         where = name or "an overlap"
         total = figures.of(TiePointFigures).tie_points_pp or 0
-        too_few = total < t.tie_points_pp_refly
+        too_few = total < thresholds.tie_points_pp_refly
         saturation = figures.of(SaturatedOverlapFigures)
         saturated_fraction = saturation.tie_points_min_overlap_burnt or 0.0
         sentence = (
             f"Few tie points in {where} (water, snow, desert or cloud?): look at the quick look; "
             "fly again if it should have had detail."
         )
-        if saturated_fraction > t.saturated_overlap_fraction:
+        if saturated_fraction > thresholds.saturated_overlap_fraction:
             sentence = (
                 f"Few tie points in {where} because it is saturated: {saturated_fraction:.0%} of "
                 "the places where points are sought hold saturated pixels. Shorten the exposure."
@@ -69,7 +69,7 @@ def stitching_findings(
                 Verdict.REFLY if too_few else Verdict.USABLE,
                 sentence,
                 float(poorest),
-                float(t.tie_points_per_overlap),
+                float(thresholds.tie_points_per_overlap),
             )
         )
     weak = figures.of(SupportFigures).resting_on_calibration
@@ -97,19 +97,19 @@ def stitching_findings(
     findings += above(
         figures.of(AdjustmentFigures).sigma0_px,
         Flag.SIGMA0,
-        (t.sigma0_px, t.sigma0_refly_px),
+        (thresholds.sigma0_px, thresholds.sigma0_refly_px),
         "The sensors do not fit together well; check exposure times and the mount of the heads.",
     )
-    findings += _head_scale(figures.of(HeadScaleFigures), t) or _platform(figures)
-    findings += _slip(slip, t)
-    return findings + _displaced(figures, t)
+    findings += _head_scale(figures.of(HeadScaleFigures), thresholds) or _platform(figures)
+    findings += _slip(slip, thresholds)
+    return findings + _displaced(figures, thresholds)
 
 
 def _as_float(value: float | None) -> float | None:
     return None if value is None else float(value)
 
 
-def _displaced(figures: QualityFigures, t: Thresholds) -> list[Finding]:
+def _displaced(figures: QualityFigures, thresholds: Thresholds) -> list[Finding]:
     """A sensor of the master cone that is not where it was calibrated."""
     findings = []
     displaced = figures.of(DisplacedSensorFigures).displaced_sensor
@@ -143,7 +143,7 @@ def _displaced(figures: QualityFigures, t: Thresholds) -> list[Finding]:
                 f"{alternatives}; the image fits together. Go on, and have the camera calibrated."
             )
         test = figures.of(DisplacementTestFigures).displacement_test
-        verdict_level = test is None or test > t.displacement_verdict
+        verdict_level = test is None or test > thresholds.displacement_verdict
         verdict = Verdict.USABLE if verdict_level else Verdict.GOOD
         findings.append(Finding(Flag.DISPLACED_SENSOR, verdict, sentence, size))
     return findings
@@ -190,10 +190,10 @@ def _platform(figures: QualityFigures) -> list[Finding]:
     return [Finding(Flag.CALIBRATION_EXPIRED, Verdict.USABLE, sentence, test, 1.0)]
 
 
-def _head_scale(scale: HeadScaleFigures, t: Thresholds) -> list[Finding]:
+def _head_scale(scale: HeadScaleFigures, thresholds: Thresholds) -> list[Finding]:
     """A converging head whose scale does not fit: rotations cannot correct that."""
     scale_ppm = scale.platform_scale_ppm
-    if scale_ppm is None or abs(scale_ppm) <= t.head_scale_ppm:
+    if scale_ppm is None or abs(scale_ppm) <= thresholds.head_scale_ppm:
         return []
     return [
         Finding(
@@ -204,12 +204,12 @@ def _head_scale(scale: HeadScaleFigures, t: Thresholds) -> list[Finding]:
             "not corrected for it; its stated accuracy includes it. Check the serial numbers, and "
             "calibrate the head.",
             scale_ppm,
-            t.head_scale_ppm,
+            thresholds.head_scale_ppm,
         )
     ]
 
 
-def _slip(slip: SlipFigures, t: Thresholds) -> list[Finding]:
+def _slip(slip: SlipFigures, thresholds: Thresholds) -> list[Finding]:
     """A band of a frame that was read out shifted."""
     shift_px = slip.slip_px
     if shift_px is None:
@@ -218,7 +218,7 @@ def _slip(slip: SlipFigures, t: Thresholds) -> list[Finding]:
     also = f" Also shifted: {', '.join(dict.fromkeys(others))}." if others else ""
     alternatives = ", ".join(slip.slip_alternatives)
     instead = f" (or {alternatives}, which sees the same ground)" if alternatives else ""
-    verdict_level = shift_px >= t.slip_refly_px
+    verdict_level = shift_px >= thresholds.slip_refly_px
     return [
         Finding(
             Flag.FRAME_CORRUPT,
@@ -228,6 +228,6 @@ def _slip(slip: SlipFigures, t: Thresholds) -> list[Finding]:
             f"the rest: lines were lost or repeated in read-out.{also} Check the head and its "
             "cable." + (" Fly this exposure again." if verdict_level else ""),
             shift_px,
-            t.slip_refly_px,
+            thresholds.slip_refly_px,
         )
     ]

@@ -50,7 +50,7 @@ _DAMAGE_ERRORS = (
     EOFError,
     MemoryError,
 )
-"""What the readers of records and chunks raise on damaged or hostile bytes."""
+"""What the readers of records and chunks raise on damaged or untrusted bytes."""
 
 _KNOWN_OPCODES = {int(opcode) for opcode in Opcode}
 _RECORD_HEADER = struct.Struct("<BQ")

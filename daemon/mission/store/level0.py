@@ -182,7 +182,7 @@ def _refuse_other_pixels(
 
 
 def tiff_errors() -> tuple[type[Exception], ...]:
-    """Errors of tifffile on bytes that are no TIFF, or a hostile one."""
+    """Errors of tifffile on bytes that are no TIFF, or a malformed one."""
     from tifffile import TiffFileError
 
     return (

@@ -262,7 +262,7 @@ class Ledger:
     def imbalances(
         self, delivered: Mapping[str, int] | None = None, *, has_landed: bool = False
     ) -> list[str]:
-        """One sentence for everything that does not add up; empty when the books balance.
+        """One sentence for everything that does not add up; empty when all counts agree.
 
         Args:
             delivered: frames delivered according to the driver, by head; compared if given.

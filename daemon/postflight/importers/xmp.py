@@ -1,6 +1,6 @@
 """Reading the XMP packet of an image: simple values and sequences by their names.
 
-The packet is hostile input: its size, depth and number of elements are limited, and a document type
+The packet is untrusted input: its size, depth and number of elements are limited, and a document type
 or an entity is refused.
 """
 
