@@ -41,7 +41,8 @@ class GuidanceLimits:
 
 @dataclass(frozen=True)
 class Turn:
-    """The turn from a line onto the next: its side, the change of course, and the way to its start."""
+    """The turn from a line onto the next: its side, the change of course, and the way to its
+    start."""
 
     line: str
     side: Side

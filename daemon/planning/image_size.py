@@ -1,4 +1,5 @@
-"""Size of one image and of its pixels on level ground, as planned: from the rig and a height alone."""
+"""Size of one image and of its pixels on level ground, as planned: from the rig and a height
+alone."""
 
 from __future__ import annotations
 

@@ -227,7 +227,8 @@ class GpsClock:
         self._awaits_mark = True
 
     def restart(self) -> None:
-        """Forget everything: the receiver's time has stepped. Edges are kept without their GPS times."""
+        """Forget everything: the receiver's time has stepped. Edges are kept without their GPS
+        times."""
         self._marks.clear()
         self._messages.clear()
         self._early_messages.clear()

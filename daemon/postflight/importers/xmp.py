@@ -1,7 +1,7 @@
 """Reading the XMP packet of an image: simple values and sequences by their names.
 
-The packet is untrusted input: its size, depth and number of elements are limited, and a document type
-or an entity is refused.
+The packet is untrusted input: its size, depth and number of elements are limited, and a document
+type or an entity is refused.
 """
 
 from __future__ import annotations

@@ -173,7 +173,8 @@ def test_turns_are_shortest() -> None:
 def test_without_a_position_or_a_length_there_is_no_guidance() -> None:
     point = PlannedLine("P", START, START)
     assert guide(
-        point, any_sample(0.0), is_reversed=False, places_m=(0.0,), planned_height_m=None, limits=LIMITS
+        point, any_sample(0.0), is_reversed=False, places_m=(0.0,), planned_height_m=None,
+        limits=LIMITS,
     ) is None  # fmt: skip
     lost = replace(any_sample(0.0), latitude_deg=None)
     assert guide(
