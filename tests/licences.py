@@ -40,7 +40,7 @@ EXCEPTIONS: Final[Mapping[str, str]] = {
 """Weak copyleft that a person has looked at: used as it is, as a package of its own, replaceable by
 whoever gets the product."""
 
-TOOLS_ONLY: Final = frozenset({"MPL-2.0"})
+TOOLS_ONLY: Final = frozenset({"MPL-2.0", "Unlicense"})
 """Besides the permissive ones, for tools of development that are never delivered."""
 
 _NAMES: Final[Mapping[str, str]] = {
@@ -51,6 +51,7 @@ _NAMES: Final[Mapping[str, str]] = {
     "ISC License (ISCL)": "ISC",
     "MIT License": "MIT",
     "Mozilla Public License 2.0 (MPL 2.0)": "MPL-2.0",
+    "The Unlicense (Unlicense)": "Unlicense",
     "Python Software Foundation License": "PSF-2.0",
     "GNU Lesser General Public License v2 or later (LGPLv2+)": "LGPL-2.1-or-later",
     "GNU Lesser General Public License v3 (LGPLv3)": "LGPL-3.0",

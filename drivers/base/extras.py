@@ -32,6 +32,7 @@ EXTRAS: Final[Mapping[str, OptionalDependency]] = {
     ),
     "geotiff": OptionalDependency("GeoTIFF files need rasterio", ("rasterio",)),
     "plots": OptionalDependency("plots of reports need matplotlib", ("matplotlib",)),
+    "colmap": OptionalDependency("COLMAP's database needs pycolmap", ("pycolmap",)),
     "mavlink": OptionalDependency("MAVLink needs pymavlink", ("pymavlink",)),
     "watch": OptionalDependency(
         "the page, the API and telemetry need the packages of [watch]",

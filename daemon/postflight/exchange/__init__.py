@@ -1,0 +1,1 @@
+"""Blocks of oriented images in the files of other photogrammetric programs, out and in."""

@@ -1,0 +1,364 @@
+"""COLMAP's text model with rigs and frames, and its way back.
+
+Files of COLMAP 3.12 and later: `cameras.txt`, `rigs.txt`, `frames.txt`, `images.txt`,
+`points3D.txt`. Its pixel centres are at 0.5, its cameras look along +z with y down, and it stores
+camera_from_world.
+
+Source: COLMAP documentation, "Output Format" and "Rig Support"; its `src/colmap/sensor/models.h`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from daemon.mission.foreign_files import ForeignFileError, read_regular_file
+from daemon.postflight.exchange.block import (
+    VISION_FROM_CAMERA,
+    Block,
+    BlockCamera,
+    BlockError,
+    BlockImage,
+    BlockPoints,
+    BlockRig,
+    fitted,
+)
+from processing.geometry.forward_distortion import Form, ForwardDistortion
+
+Array = NDArray[np.float64]
+
+VERSION = "3.12"
+"""The oldest version that reads rigs and frames."""
+FORMS: tuple[Form, ...] = ("pinhole", "opencv", "full_opencv")
+MODEL_MAX_BYTES = 2_000_000_000
+CENTRE_PX = 0.5
+"""Coordinates of the first pixel's centre."""
+
+_NAMES: Mapping[str, tuple[str, ...]] = {
+    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
+    "PINHOLE": ("fx", "fy", "cx", "cy"),
+    "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
+    "RADIAL": ("f", "cx", "cy", "k1", "k2"),
+    "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
+    "FULL_OPENCV": (*("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),),
+}
+"""Parameters of the camera models that can be carried, in COLMAP's order."""
+MODEL_OF_FORM: Mapping[Form, str] = {
+    "pinhole": "PINHOLE",
+    "opencv": "OPENCV",
+    "full_opencv": "FULL_OPENCV",
+}
+
+
+def colmap_texts(block: Block, rig: BlockRig | None) -> tuple[dict[str, str], dict[str, float]]:
+    """The five files of a model.
+
+    Args:
+        block: with images where the rig has them (`daemon.postflight.exchange.block.with_rig`).
+        rig: None writes each camera as a rig of its own.
+
+    Returns:
+        Texts by file name, and the largest residual of each camera's fit by its name, px.
+
+    Raises:
+        BlockError: a camera fits none of COLMAP's models.
+    """
+    cameras, residuals = [], {}
+    for number, camera in enumerate(block.cameras, 1):
+        form, model, worst_px = fitted(camera, FORMS)
+        residuals[camera.name] = worst_px
+        values = model_parameters(MODEL_OF_FORM[form], model)
+        cameras.append(
+            _line(number, MODEL_OF_FORM[form], camera.width_px, camera.height_px, *values)
+        )
+    frames = _frames(block, rig)
+    seen: list[list[str]] = [[] for _ in block.images]
+    tracks: list[list[str]] = [[] for _ in block.points.xyz_m]
+    for image, point, (column, row) in zip(
+        block.points.image, block.points.point, block.points.px.tolist(), strict=True
+    ):
+        tracks[point].append(f"{image + 1} {len(seen[image])}")
+        seen[image].append(f"{column + CENTRE_PX!r} {row + CENTRE_PX!r} {point + 1}")
+    images = [
+        line
+        for number, (image, of_image) in enumerate(zip(block.images, seen, strict=True), 1)
+        for line in (
+            _line(number, *_pose(image.rotation, image.centre_m), image.camera + 1, image.name),
+            " ".join(of_image),
+        )
+    ]
+    points = [
+        _line(number, *xyz, 128, 128, 128, 0.0, *track)
+        for number, (xyz, track) in enumerate(
+            zip(block.points.xyz_m.tolist(), tracks, strict=True), 1
+        )
+    ]
+    texts = {
+        "cameras.txt": ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]", *cameras],
+        "rigs.txt": [
+            "# RIG_ID, NUM_SENSORS, REF_SENSOR_TYPE, REF_SENSOR_ID, "
+            "SENSORS[] as (SENSOR_TYPE, SENSOR_ID, HAS_POSE, [QW, QX, QY, QZ, TX, TY, TZ])",
+            *_rigs(block, rig),
+        ],
+        "frames.txt": [
+            "# FRAME_ID, RIG_ID, RIG_FROM_WORLD[QW, QX, QY, QZ, TX, TY, TZ], NUM_DATA_IDS, "
+            "DATA_IDS[] as (SENSOR_TYPE, SENSOR_ID, DATA_ID)",
+            *frames,
+        ],
+        "images.txt": [
+            "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME",
+            "# POINTS2D[] as (X, Y, POINT3D_ID)",
+            *images,
+        ],
+        "points3D.txt": [
+            "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)",
+            *points,
+        ],
+    }
+    return {name: "\n".join(lines) + "\n" for name, lines in texts.items()}, residuals
+
+
+def vision_pose(rotation: Array, centre_m: Array) -> tuple[Array, Array]:
+    """Vision camera_from_world, (3, 3) and (3,), of our frame_from_camera and its centre."""
+    turn = VISION_FROM_CAMERA @ rotation.T
+    return np.asarray(turn), np.asarray(-turn @ centre_m)
+
+
+def camera_pose(turn: Array, shift: Array) -> tuple[Array, Array]:
+    """Our frame_from_camera (3, 3) and centre (3,) of vision camera_from_world."""
+    return np.asarray(turn.T @ VISION_FROM_CAMERA), np.asarray(-turn.T @ shift)
+
+
+def rig_pose(rig: BlockRig, camera: int) -> tuple[Array, Array]:
+    """sensor_from_rig of a camera, (3, 3) and (3,), both in axes of computer vision."""
+    turn = VISION_FROM_CAMERA @ rig.rotation[camera].T @ VISION_FROM_CAMERA
+    return np.asarray(turn), np.asarray(-turn @ VISION_FROM_CAMERA @ rig.offset_m[camera])
+
+
+def quaternion(turn: Array) -> list[float]:
+    """w, x, y, z with w not negative."""
+    x, y, z, w = Rotation.from_matrix(turn).as_quat(canonical=True).tolist()
+    return [w, x, y, z]
+
+
+def rotation_of_quaternion(wxyz: Sequence[float]) -> Array:
+    """The rotation (3, 3) of a quaternion w, x, y, z."""
+    w, x, y, z = wxyz
+    return np.asarray(Rotation.from_quat([x, y, z, w]).as_matrix())
+
+
+def frame_groups(block: Block, rig: BlockRig | None) -> list[tuple[int, list[int]]]:
+    """Frames in order: the rig's index and the indices of their images."""
+    if rig is None:
+        return [(image.camera, [k]) for k, image in enumerate(block.images)]
+    grouped: dict[int, list[int]] = {}
+    for k, image in enumerate(block.images):
+        grouped.setdefault(image.frame, []).append(k)
+    return [(0, members) for members in grouped.values()]
+
+
+def rig_from_world(
+    block: Block, rig: BlockRig | None, members: Sequence[int]
+) -> tuple[Array, Array]:
+    """Pose of a frame's rig, vision axes: (3, 3) and (3,)."""
+    image = block.images[members[0]]
+    turn, shift = vision_pose(image.rotation, image.centre_m)
+    if rig is None:
+        return turn, shift
+    sensor_turn, sensor_shift = rig_pose(rig, image.camera)
+    return np.asarray(sensor_turn.T @ turn), np.asarray(sensor_turn.T @ (shift - sensor_shift))
+
+
+def _rigs(block: Block, rig: BlockRig | None) -> Iterator[str]:
+    if rig is None:
+        for number in range(1, len(block.cameras) + 1):
+            yield _line(number, 1, "CAMERA", number)
+        return
+    others = [camera for camera in rig.rotation if camera != rig.reference]
+    sensors: list[object] = []
+    for camera in others:
+        turn, shift = rig_pose(rig, camera)
+        sensors += ["CAMERA", camera + 1, 1, *quaternion(turn), *shift.tolist()]
+    yield _line(1, len(others) + 1, "CAMERA", rig.reference + 1, *sensors)
+
+
+def _frames(block: Block, rig: BlockRig | None) -> list[str]:
+    lines = []
+    for number, (of_rig, members) in enumerate(frame_groups(block, rig), 1):
+        turn, shift = rig_from_world(block, rig, members)
+        data: list[object] = []
+        for k in members:
+            data += ["CAMERA", block.images[k].camera + 1, k + 1]
+        lines.append(
+            _line(number, of_rig + 1, *quaternion(turn), *shift.tolist(), len(members), *data)
+        )
+    return lines
+
+
+def _pose(rotation: Array, centre_m: Array) -> list[float]:
+    turn, shift = vision_pose(rotation, centre_m)
+    return [*quaternion(turn), *shift.tolist()]
+
+
+def model_parameters(name: str, model: ForwardDistortion) -> list[float]:
+    """Parameters of a COLMAP camera model in its order, pixel centres at 0.5."""
+    values = {
+        "fx": model.fx_px, "fy": model.fy_px,
+        "cx": model.cx_px + CENTRE_PX, "cy": model.cy_px + CENTRE_PX,
+        **{key: getattr(model, key) for key in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")},
+    }  # fmt: skip
+    return [values[key] for key in _NAMES[name]]
+
+
+def _line(*values: object) -> str:
+    return " ".join(repr(v) if isinstance(v, float) else str(v) for v in values)
+
+
+def read_colmap(folder: Path) -> Block:
+    """Read a text model; with rigs the poses of frames hold, those of images without.
+
+    Raises:
+        BlockError: a file is missing or has a line that is not understood; it names the line.
+    """
+    cameras: dict[int, int] = {}
+    found: list[BlockCamera] = []
+    for place, words in _records(folder / "cameras.txt"):
+        with _reading(place):
+            cameras[int(words[0])] = len(found)
+            found.append(_camera(place, words))
+    rows = list(_records(folder / "images.txt", keeps_empty=True))
+    posed = _frame_poses(folder)
+    images: list[BlockImage] = []
+    index: dict[int, int] = {}
+    seen: list[tuple[int, int, float, float]] = []
+    for (place, words), (where, measured) in zip(rows[::2], rows[1::2], strict=False):
+        with _reading(place):
+            number, camera = int(words[0]), int(words[8])
+            if camera not in cameras:
+                raise BlockError(f"{place}: camera {camera} is not in cameras.txt")
+            pose = [float(v) for v in words[1:8]]
+            turn, shift = rotation_of_quaternion(pose[:4]), np.array(pose[4:])
+            frame, own = posed.get(number, (number, (turn, shift)))
+            rotation, centre = camera_pose(*own)
+            index[number] = len(images)
+            name = " ".join(words[9:])
+            images.append(BlockImage(name, cameras[camera], frame, centre, rotation))
+        with _reading(where):
+            for x, y, point in zip(measured[::3], measured[1::3], measured[2::3], strict=True):
+                if int(point) >= 0:
+                    seen.append((index[number], int(point), float(x), float(y)))
+    if not images:
+        raise BlockError(f"{folder}: images.txt names no image; there is nothing to import")
+    return Block(
+        folder.name, tuple(found), tuple(images), points=_points(folder, seen),
+        notes=("COLMAP's files do not state the frame of their coordinates",),
+    )  # fmt: skip
+
+
+class _reading:  # noqa: N801
+    """Turns what is wrong with a line into a sentence that names it."""
+
+    def __init__(self, place: str) -> None:
+        self.place = place
+
+    def __enter__(self) -> None:
+        """Nothing to prepare."""
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        if isinstance(error, ValueError | IndexError | KeyError) and not isinstance(
+            error, BlockError
+        ):
+            raise BlockError(
+                f"{self.place}: not a line of COLMAP's text format ({error}); export the model "
+                "with `colmap model_converter --output_type TXT`"
+            ) from error
+
+
+def _camera(place: str, words: Sequence[str]) -> BlockCamera:
+    name = words[1]
+    if name not in _NAMES:
+        raise BlockError(
+            f"{place}: camera model {name} is not carried; convert it to {', '.join(_NAMES)}"
+        )
+    if len(words) != 4 + len(_NAMES[name]):
+        raise BlockError(f"{place}: {name} has {len(_NAMES[name])} parameters")
+    value = dict(zip(_NAMES[name], (float(v) for v in words[4:]), strict=True))
+    focal = value.pop("f", None)
+    fx, fy = (focal, focal) if focal is not None else (value.pop("fx"), value.pop("fy"))
+    cx, cy = value.pop("cx") - CENTRE_PX, value.pop("cy") - CENTRE_PX
+    model = ForwardDistortion(fx, fy, cx, cy, **value)
+    return BlockCamera(f"camera{words[0]}", int(words[2]), int(words[3]), model)
+
+
+def _frame_poses(folder: Path) -> dict[int, tuple[int, tuple[Array, Array]]]:
+    """Frame number and camera_from_world of every image, from rigs and frames; empty without."""
+    if not ((folder / "rigs.txt").exists() and (folder / "frames.txt").exists()):
+        return {}
+    sensors: dict[tuple[int, int], tuple[Array, Array]] = {}
+    for place, words in _records(folder / "rigs.txt"):
+        with _reading(place):
+            rig, rest = int(words[0]), words[4:]
+            sensors[rig, int(words[3])] = (np.eye(3), np.zeros(3))
+            while rest:
+                has_pose = int(rest[2])
+                if has_pose:
+                    pose = [float(v) for v in rest[3:10]]
+                    sensors[rig, int(rest[1])] = (
+                        rotation_of_quaternion(pose[:4]), np.array(pose[4:]),
+                    )  # fmt: skip
+                rest = rest[10 if has_pose else 3 :]
+    posed = {}
+    for place, words in _records(folder / "frames.txt"):
+        with _reading(place):
+            pose = [float(v) for v in words[2:9]]
+            turn, shift = rotation_of_quaternion(pose[:4]), np.array(pose[4:])
+            data = words[10:]
+            if len(data) != 3 * int(words[9]):
+                raise BlockError(f"{place}: {words[9]} images are announced, others are listed")
+            for sensor, image in zip(data[1::3], data[2::3], strict=True):
+                key = (int(words[1]), int(sensor))
+                if key not in sensors:
+                    raise BlockError(
+                        f"{place}: rig {words[1]} has no pose of camera {sensor}; the model "
+                        "belongs to another rig"
+                    )
+                rig_turn, rig_shift = sensors[key]
+                own = (rig_turn @ turn, rig_turn @ shift + rig_shift)
+                posed[int(image)] = (int(words[0]), own)
+    return posed
+
+
+def _points(folder: Path, seen: Sequence[tuple[int, int, float, float]]) -> BlockPoints:
+    at: dict[int, int] = {}
+    xyz: list[list[float]] = []
+    for place, words in _records(folder / "points3D.txt"):
+        with _reading(place):
+            at[int(words[0])] = len(xyz)
+            xyz.append([float(v) for v in words[1:4]])
+    unknown = next((point for _, point, *_ in seen if point not in at), None)
+    if unknown is not None:
+        raise BlockError(
+            f"{folder}: images.txt measures point {unknown}, which is not in points3D.txt"
+        )
+    return BlockPoints(
+        np.array(xyz).reshape(-1, 3),
+        tuple(str(number) for number in at),
+        np.array([image for image, *_ in seen], dtype=np.int64),
+        np.array([at[point] for _, point, *_ in seen], dtype=np.int64),
+        np.array([(x - CENTRE_PX, y - CENTRE_PX) for *_, x, y in seen]).reshape(-1, 2),
+    )
+
+
+def _records(path: Path, *, keeps_empty: bool = False) -> Iterator[tuple[str, list[str]]]:
+    """Place and words of every line that is no comment."""
+    try:
+        text = read_regular_file(path, MODEL_MAX_BYTES).decode("utf-8")
+    except (ForeignFileError, UnicodeDecodeError) as error:
+        raise BlockError(f"{path}: {error}; a COLMAP text model has this file") from error
+    for number, line in enumerate(text.splitlines(), 1):
+        if not line.startswith("#") and (keeps_empty or line.strip()):
+            yield f"{path}, line {number}", line.split()
