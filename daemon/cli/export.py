@@ -10,6 +10,7 @@ import typer
 from rich.progress import Progress
 
 from daemon.cli.exit_status import exit_if_failed
+from daemon.cli.export_block import BLOCK_HELP, block
 from daemon.cli.options import AsJson
 from daemon.terminal.console import Console, light_table
 from drivers.base.extras import require
@@ -24,15 +25,17 @@ Examples: `syntopic orient MISSION`, `syntopic orient MISSION --trajectory sbet.
 `syntopic orient MISSION --mount boresight-2026-11-21/mount.toml`
 """
 
-PICTURES_HELP = """Export Level-2 as Cloud Optimized GeoTIFF, or as JPEG with EXIF and XMP.
+PICTURES_HELP = """Export pictures as Cloud Optimized GeoTIFF, tiled TIFF, JPEG 2000, or JPEG with EXIF and XMP.
 
-The images are not rectified. A COG has overviews, tags, and ground control points on level ground.
-A JPEG contains time, position, attitude, focal length and pixel size for programs that read EXIF
-(exiftool, photogrammetric programs). COGs require
-`pip install 'syntopic[geotiff]'`.
+Level-2, or with --level 3 the pansharpened RGB and CIR images in 16 or 8 bits. The images are not
+rectified. A COG and a TIFF have tags, and ground control points on level ground. A JPEG contains
+time, position, attitude, accuracies, focal length and pixel size for programs that read EXIF and
+XMP (exiftool, photogrammetric programs); its description names bands that it cannot hold. All but
+JPEG require `pip install 'syntopic[geotiff]'`.
 
 Examples: `syntopic export pictures MISSION --trajectory sbet.out`,
-`syntopic export pictures MISSION --as jpeg --only 12`
+`syntopic export pictures MISSION --as jpeg --only 12`,
+`syntopic export pictures MISSION --level 3 --bits 8 --as tiff`
 """
 
 CERTIFICATE_HELP = """Export the camera of the images as a calibration certificate: JSON and HTML.
@@ -59,6 +62,9 @@ Examples: `syntopic export raw MISSION`, `syntopic export orientation MISSION --
 @app.callback()
 def export() -> None:
     """Export a mission for other programs."""
+
+
+app.command("block", help=BLOCK_HELP)(block)
 
 
 @app.command()
@@ -121,8 +127,14 @@ def foxglove(
 
 @app.command(help=PICTURES_HELP)
 def pictures(
-    mission: Annotated[Path, typer.Argument(help="Mission folder with Level-2.")],
-    kind: Annotated[str, typer.Option("--as", help="Format: cog or jpeg.")] = "cog",
+    mission: Annotated[Path, typer.Argument(help="Mission folder with Level-2 or Level-3.")],
+    kind: Annotated[str, typer.Option("--as", help="Format: cog, tiff, jp2 or jpeg.")] = "cog",
+    level: Annotated[int, typer.Option(help="Level of the products: 2 or 3.")] = 2,
+    bits: Annotated[int, typer.Option(help="Bits of Level-3: 16 or 8.")] = 16,
+    attitude_sigma: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(help="Standard deviation of roll, pitch, heading in mdeg."),
+    ] = None,
     trajectory: Annotated[
         Path | None, typer.Option(help="Post-processed trajectory: SBET, or .csv.")
     ] = None,
@@ -139,8 +151,12 @@ def pictures(
     from daemon.postflight.export.level2_export import KINDS, PictureError, export_pictures
 
     if kind not in KINDS:
-        raise PictureError(f"--as is {kind!r}; cog or jpeg is right")
-    if kind == "cog":
+        raise PictureError(f"--as is {kind!r}; {', '.join(KINDS)} are right")
+    if level not in (2, 3) or bits not in (8, 16) or (level == 2 and bits == 8 and kind != "jpeg"):
+        raise PictureError(
+            f"--level {level} --bits {bits}; Level-2 has 16 bits, Level-3 has 16 and 8"
+        )
+    if kind != "jpeg":
         require("geotiff")
     folder = Mission.open(mission)
     with folder.held(), Progress(console=Console(stderr=True), transient=True) as progress:
@@ -152,6 +168,11 @@ def pictures(
             trajectory_file=trajectory,
             mount_file=mount,
             only=only or (),
+            level=level,
+            depth=bits,
+            roll_pitch_yaw_sigma_deg=None
+            if attitude_sigma is None
+            else (attitude_sigma[0] * 1e-3, attitude_sigma[1] * 1e-3, attitude_sigma[2] * 1e-3),
             progress=lambda count: progress.update(task, completed=count),
         )
     if as_json:

@@ -298,6 +298,8 @@ class Cone:
     """The sensors in its focal plane."""
     rotation_sigma_urad: Positive = 30.0
     """Standard deviation of each small rotation."""
+    wavelengths_nm: tuple[Positive, ...] = ()
+    """Central wavelengths of the bands, nm, in their order; empty: not known."""
 
 
 @dataclass(frozen=True)
@@ -359,6 +361,7 @@ class Rig:
     virtual_image: VirtualImage | None
     cones: tuple[Cone, ...]
     calibration_valid_days: int = CALIBRATION_VALID_DAYS
+    serial: str = ""
     probe_serials: Mapping[str, str] = field(default_factory=dict, hash=False)
 
     def cone(self, name: str | None) -> Cone:

@@ -139,6 +139,8 @@ class RigFile(_Table):
     """Calibration; without it the rig is uncalibrated."""
     virtual_image: Annotated[VirtualImage, AfterValidator(_fitting)] | None = None
     """Stitched image; without it heads or bands are images of their own."""
+    serial: Text = ""
+    """Serial number of the rig as a whole."""
     probe_serials: dict[str, Text] = {}
     """Serial number of each probe by its name."""
     defaults: DefaultsTable = DefaultsTable()
@@ -165,6 +167,7 @@ class RigFile(_Table):
             ),
             virtual_image=self.virtual_image,
             cones=self.cone,
+            serial=self.serial,
             probe_serials=self.probe_serials,
         )
 

@@ -25,6 +25,7 @@ def rig_toml(rig: Rig, *, remark: str = "", names_schema: bool = True) -> bytes:
             "format": RIG_FORMAT,
             "name": rig.name,
             "title": rig.title,
+            **({"serial": rig.serial} if rig.serial else {}),
             "timing": rig.timing,
             "frame_interval_s": rig.frame_interval_s,
             "master_cone": rig.master_cone or "",

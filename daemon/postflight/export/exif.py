@@ -6,17 +6,16 @@ otherwise. Source: CIPA DC-008 (EXIF 2.32); Adobe XMP specification, part 3.
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from fractions import Fraction
-from xml.sax.saxutils import quoteattr
 
+from daemon.postflight.export.xmp_packet import xmp_bytes
 from drivers.timescales.leap_seconds import leap_seconds_at
 
-XMP_NAMESPACE = "urn:syntopic:exposure:1"
-CAMERA_NAMESPACE = "http://pix4d.com/camera/1.0/"
 _GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC)
 _ASCII, _SHORT, _LONG, _RATIONAL, _BYTE, _UNDEFINED = 2, 3, 4, 5, 1, 7
 _SIZE = {_ASCII: 1, _SHORT: 2, _LONG: 4, _RATIONAL: 8, _BYTE: 1, _UNDEFINED: 1}
@@ -26,12 +25,32 @@ _EXIF_IFD, _GPS_IFD = 0x8769, 0x8825
 Value = bytes | int | tuple[Fraction, ...]
 
 
+FULL_FRAME_DIAGONAL_MM = 43.266615
+"""Of 36 x 24 mm, which EXIF's equivalent focal length refers to."""
+
+
+@dataclass(frozen=True)
+class RigPlace:
+    """Place of a picture's head in its rig: index, that of the reference head, and its rotation.
+
+    `relatives_deg` are the angles about x, y, z of R = Rx Ry Rz, reference from head, in axes of
+    computer vision (x right, y down, z forward); `capture` is the same for all heads of an exposure.
+    """
+
+    name: str
+    index: int
+    reference: int
+    relatives_deg: tuple[float, float, float]
+    capture: str
+
+
 @dataclass(frozen=True)
 class PictureMetadata:
     """Metadata of a picture.
 
     `height_m` is above the ellipsoid (EXIF 2.32 knows no such reference: `remark` states it);
-    `position_sigma_m` is None where it is not known; angles are of the image's camera against the
+    sigmas are None where they are not known, `serial` is the rig's, `lens_serial` of one lens,
+    `wavelengths_nm` are those of `bands` or empty; angles are of the image's camera against the
     local level (yaw from true north) and omega, phi, kappa against the grid `crs`.
     """
 
@@ -51,6 +70,16 @@ class PictureMetadata:
     centre_m: tuple[float, float, float]
     crs: str
     remark: str
+    width_px: int = 0
+    height_px: int = 0
+    f_number: float | None = None
+    height_sigma_m: float | None = None
+    roll_pitch_yaw_sigma_deg: tuple[float, float, float] | None = None
+    bands: tuple[str, ...] = ()
+    wavelengths_nm: tuple[float, ...] = ()
+    rig: RigPlace | None = None
+    lens_serial: str = ""
+    is_perspective: bool = True
 
 
 def utc_of(gps_ns: int) -> tuple[datetime, int]:
@@ -90,6 +119,16 @@ def exif_bytes(shot: PictureMetadata) -> bytes:
         detail.append(
             (0x829A, _RATIONAL, (_rational(shot.exposure_time_s, max_denominator=1_000_000),))
         )
+    if shot.f_number is not None:
+        detail.append((0x829D, _RATIONAL, (_rational(shot.f_number),)))
+    if shot.width_px and shot.height_px:
+        diagonal_mm = math.hypot(shot.width_px, shot.height_px) * shot.pixel_um * 1e-3
+        equivalent_mm = round(shot.f_mm * FULL_FRAME_DIAGONAL_MM / diagonal_mm)
+        # A tag of 16 bits, and 0 means that it is not known.
+        if 0 < equivalent_mm < 65_536:
+            detail.append((0xA405, _SHORT, equivalent_mm))
+    if shot.lens_serial:
+        detail.append((0xA435, _ASCII, _text(shot.lens_serial)))
     if shot.serial:
         detail.append((0xA431, _ASCII, _text(shot.serial)))
     second = Fraction(instant.second * 1_000_000 + beyond_ns // 1000, 1_000_000)
@@ -110,46 +149,6 @@ def exif_bytes(shot: PictureMetadata) -> bytes:
     if shot.position_sigma_m is not None:
         gps.append((0x001F, _RATIONAL, (_rational(shot.position_sigma_m),)))
     return _tiff(main, detail, gps)
-
-
-def xmp_bytes(shot: PictureMetadata) -> bytes:
-    """The XMP packet: attitude in Pix4D's `Camera` properties, orientation in our own."""
-    yaw, pitch, roll = shot.yaw_pitch_roll_deg
-    omega, phi, kappa = shot.omega_phi_kappa_deg
-    camera = {
-        "Yaw": f"{yaw:.6f}",
-        "Pitch": f"{pitch:.6f}",
-        "Roll": f"{roll:.6f}",
-        "PerspectiveFocalLength": f"{shot.f_mm:.6f}",
-        "PerspectiveFocalLengthUnits": "mm",
-    }
-    if shot.position_sigma_m is not None:
-        camera["GPSXYAccuracy"] = f"{shot.position_sigma_m:.4f}"
-    own = {
-        "GpsNanoseconds": str(shot.gps_ns),
-        "Crs": shot.crs,
-        "East": f"{shot.centre_m[0]:.4f}",
-        "North": f"{shot.centre_m[1]:.4f}",
-        "Height": f"{shot.centre_m[2]:.4f}",
-        "EllipsoidalHeight": f"{shot.height_m:.4f}",
-        "Omega": f"{omega:.7f}",
-        "Phi": f"{phi:.7f}",
-        "Kappa": f"{kappa:.7f}",
-        "AngleOrder": "R = Rx(omega) Ry(phi) Rz(kappa), camera to grid, degrees",
-        "PixelSizeMicrometres": f"{shot.pixel_um:.6f}",
-    }
-    attributes = [f"Camera:{key}={quoteattr(value)}" for key, value in camera.items()]
-    attributes += [f"syntopic:{key}={quoteattr(value)}" for key, value in own.items()]
-    body = "\n   ".join(attributes)
-    return (
-        '<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>\n'
-        '<x:xmpmeta xmlns:x="adobe:ns:meta/">\n'
-        ' <rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">\n'
-        f'  <rdf:Description rdf:about="" xmlns:Camera="{CAMERA_NAMESPACE}" '
-        f'xmlns:syntopic="{XMP_NAMESPACE}"\n   {body}/>\n'
-        " </rdf:RDF>\n</x:xmpmeta>\n"
-        '<?xpacket end="w"?>'
-    ).encode()
 
 
 def with_metadata(jpeg: bytes, shot: PictureMetadata) -> bytes:

@@ -1,4 +1,4 @@
-"""Level-2 for other programs: Cloud Optimized GeoTIFFs, and JPEGs with EXIF and XMP.
+"""Pictures for other programs: Level-2 and Level-3 as rasters, and JPEGs with EXIF and XMP.
 
 The geometry stays that of the image: nothing is rectified. A COG carries ground control points on
 level ground, from trajectory and mount, so that it is roughly in place; its orientation is
@@ -8,35 +8,46 @@ in its tags.
 from __future__ import annotations
 
 import math
+import uuid
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from daemon import DaemonError
 from daemon.mission.exposure import Exposure
 from daemon.mission.exposure_batch import ExposureFailure, for_each_exposure
-from daemon.mission.layout import Mission
-from daemon.mission.store.durable import make_directories, new_file, replace_file
-from daemon.mission.store.level0 import read_description, refuse_decompression_bomb
-from daemon.mission.store.level2 import jpeg_bytes
+from daemon.mission.layout import Mission, exposure_name
+from daemon.mission.store.durable import make_directories, replace_file
+from daemon.mission.store.level0 import read_description
 from daemon.orientation.exterior_orientation import ExteriorOrientation, sealed_exposures
 from daemon.orientation.georeference import Georeference
 from daemon.orientation.orientation_inputs import read_orientation_inputs
-from daemon.postflight.export.exif import PictureMetadata, metadata_texts, with_metadata
-from drivers.base.extras import require
+from daemon.postflight.export.exif import PictureMetadata, RigPlace, with_metadata
+from daemon.postflight.export.picture_files import (
+    SUFFIXES,
+    jpeg_picture,
+    left_out_of_jpeg,
+    read_planes,
+    write_raster,
+)
+from daemon.products.level3 import IMAGES as LEVEL3_IMAGES
+from daemon.products.level3 import level3_root
 from processing.geometry.orientation import BODY_FROM_CAMERA, ENU_FROM_NED, on_level_ground
-from processing.geometry.rotation import roll_pitch_heading
+from processing.geometry.rotation import omega_phi_kappa, roll_pitch_heading, rotation_matrix
 from processing.rig import Rig
 
-KINDS = ("cog", "jpeg")
-JPEG_QUALITY = 92
+KINDS = tuple(SUFFIXES)
 GRID = 5
 """Ground control points along each side of a COG."""
 
+VISION_FROM_CAMERA = np.diag([1.0, -1.0, -1.0])
+_RAW_REMARK = (
+    "raw frame with the distortion of its lens; oriented by trajectory and mount; altitude above the "
+    "ellipsoid of WGS 84"
+)
 _REMARK = (
     "perspective image, not rectified; oriented by trajectory and mount; altitude above the "
     "ellipsoid of WGS 84"
@@ -57,6 +68,9 @@ class Level2Image:
     f_mm: float
     pixel_mm: float
     exposure_time_s: float | None
+    bands: tuple[str, ...] = ()
+    size_px: tuple[int, int] = (0, 0)
+    is_perspective: bool = True
 
 
 def export_pictures(
@@ -67,9 +81,18 @@ def export_pictures(
     trajectory_file: Path | None = None,
     mount_file: Path | None = None,
     only: Sequence[int] = (),
+    level: int = 2,
+    depth: int = 16,
+    roll_pitch_yaw_sigma_deg: tuple[float, float, float] | None = None,
     progress: Callable[[int], None] = lambda _done: None,
 ) -> tuple[list[Path], tuple[ExposureFailure, ...]]:
-    """Write every raster of Level-2 as `kind` into `export/<kind>/`.
+    """Write every raster of a level as `kind` into `export/<kind>/`.
+
+    Args:
+        kind: "cog", "tiff", "jp2" or "jpeg".
+        level: 2, or 3 for pansharpened RGB and CIR.
+        depth: 16 or 8 bits of Level-3; Level-2 has 16.
+        roll_pitch_yaw_sigma_deg: standard deviations of attitude, where they are known.
 
     Returns:
         The files, and the exposures that could not be exported.
@@ -98,14 +121,16 @@ def export_pictures(
 
     def export_one(number: int) -> list[Path]:
         exposure, written = exposures[number], []
-        for picture in _pictures(mission, rig, exposure, inputs.oriented([exposure])):
-            shot = _shot(rig, picture, inputs.crs, simulated=exposure.simulated)
-            if kind == "cog":
-                final = folder / f"{picture.name}.tif"
-                _cog(picture, shot, inputs.georeference, inputs.ground_height_m, final)
+        for picture in _pictures(mission, rig, exposure, inputs.oriented([exposure]), level, depth):
+            shot = metadata_of(
+                rig, picture, inputs.crs, simulated=exposure.simulated, mission_id=mission.id,
+                roll_pitch_yaw_sigma_deg=roll_pitch_yaw_sigma_deg,
+            )  # fmt: skip
+            final = folder / f"{picture.name}{SUFFIXES[kind]}"
+            if kind == "jpeg":
+                replace_file(final, jpeg_with_metadata(picture, shot))
             else:
-                final = folder / f"{picture.name}.jpg"
-                replace_file(final, with_metadata(_jpeg(picture.path), shot))
+                _raster(kind, picture, shot, inputs.georeference, inputs.ground_height_m, final)
             written.append(final)
         return written
 
@@ -115,17 +140,25 @@ def export_pictures(
     if not files:
         causes = "".join(f"; {cause}" for cause in dict.fromkeys(one.cause for one in failures))
         raise PictureError(
-            f"{mission.path}: no exposure has both Level-2 and an orientation; run "
-            "`syntopic process` first, and give --trajectory where no receiver knew the attitude"
+            f"{mission.path}: no exposure has both Level-{level} and an orientation; run "
+            f"`syntopic {'process' if level == 2 else 'pansharpen'}` first, and give --trajectory "
+            "where no receiver knew the attitude"
             f"{causes}"
         )
     return files, failures
 
 
 def _pictures(
-    mission: Mission, rig: Rig, exposure: Exposure, oriented: Sequence[ExteriorOrientation]
+    mission: Mission,
+    rig: Rig,
+    exposure: Exposure,
+    oriented: Sequence[ExteriorOrientation],
+    level: int,
+    depth: int,
 ) -> Iterator[Level2Image]:
     folder = mission.level2(exposure.number)
+    if level == 3:
+        folder = level3_root(mission) / exposure_name(exposure.number)
     times = {
         f.sensor: f.exposure_time_us * 1e-6
         for f in exposure.frames
@@ -138,28 +171,74 @@ def _pictures(
         if image is not None:
             if not eo.is_virtual:
                 continue
-            for file, ratio in (("pan.tif", 1.0), ("rgbn.tif", float(image.colour_ratio))):
+            ratio = float(image.colour_ratio)
+            files = [("pan.tif", 1.0), ("rgbn.tif", ratio)]
+            if level == 3:
+                files = [(f"{name}-{depth}.tif", 1.0) for name in LEVEL3_IMAGES]
+            for file, scale in files:
                 if (folder / file).exists():
                     name = f"{eo.name}_{file.removesuffix('.tif')}"
-                    yield Level2Image(
-                        folder / file, name, eo, image.f_mm, image.pitch_mm * ratio, seconds
-                    )
-        elif (folder / f"{eo.cone}.tif").exists():
-            sensor = cone.sensors[0]
-            yield Level2Image(
-                folder / f"{eo.cone}.tif", eo.name, eo, cone.lens.f_mm, sensor.pitch_mm, seconds
-            )
+                    pitch_mm = image.pitch_mm * scale
+                    yield _image(folder / file, name, eo, image.f_mm, pitch_mm, seconds)
+        elif level == 2 and (folder / f"{eo.cone}.tif").exists():
+            path, pitch_mm = folder / f"{eo.cone}.tif", cone.sensors[0].pitch_mm
+            yield _image(path, eo.name, eo, cone.lens.f_mm, pitch_mm, seconds)
 
 
-def _shot(rig: Rig, picture: Level2Image, crs: str, *, simulated: bool) -> PictureMetadata:
+def _image(
+    path: Path,
+    name: str,
+    eo: ExteriorOrientation,
+    f_mm: float,
+    pixel_mm: float,
+    seconds: float | None,
+) -> Level2Image:
+    """With its bands as the file names them, and its size."""
+    from tifffile import TiffFile
+
+    with TiffFile(path) as tiff:
+        page = tiff.pages[0]
+        size = (int(page.imagewidth), int(page.imagelength))
+    bands = tuple(str(band) for band in read_description(path).get("bands", ("pan",)))
+    return Level2Image(path, name, eo, f_mm, pixel_mm, seconds, bands, size)
+
+
+def jpeg_with_metadata(picture: Level2Image, shot: PictureMetadata) -> bytes:
+    """A JPEG of 8 bits with EXIF and XMP; its remark names the bands that are left out."""
+    if missing := left_out_of_jpeg(picture.bands):
+        remark = f"{shot.remark}; without {', '.join(missing)}: a JPEG holds three bands"
+        shown = len(picture.bands) - len(missing)
+        shot = replace(
+            shot,
+            remark=remark,
+            bands=shot.bands[:shown],
+            wavelengths_nm=shot.wavelengths_nm[:shown],
+        )
+    return with_metadata(jpeg_picture(read_planes(picture.path), picture.bands), shot)
+
+
+def metadata_of(
+    rig: Rig,
+    picture: Level2Image,
+    crs: str,
+    *,
+    simulated: bool,
+    mission_id: str = "",
+    roll_pitch_yaw_sigma_deg: tuple[float, float, float] | None = None,
+) -> PictureMetadata:
+    """Metadata of a picture from its orientation and the rig file."""
     eo = picture.eo
     body = ENU_FROM_NED.T @ eo.enu_from_camera @ BODY_FROM_CAMERA.T
     roll, pitch, yaw = (math.degrees(angle) for angle in roll_pitch_heading(body))
-    yaw %= 360.0
     east, north, height = (float(v) for v in eo.centre_m)
+    shown = [cone for cone in rig.cones if set(cone.bands) & set(picture.bands)]
+    if not eo.is_virtual and any(cone.name == eo.cone for cone in rig.cones):
+        shown = [rig.cone(eo.cone)]
+    lenses = {cone.lens.serial for cone in shown}
+    f_numbers = {cone.lens.f_number for cone in shown}
     return PictureMetadata(
         camera=rig.title or rig.name,
-        serial=rig.cone(eo.cone).sensors[0].serial,
+        serial=rig.serial,
         name=picture.name,
         gps_ns=eo.gps_ns,
         latitude_deg=eo.latitude_deg,
@@ -169,50 +248,68 @@ def _shot(rig: Rig, picture: Level2Image, crs: str, *, simulated: bool) -> Pictu
         f_mm=picture.f_mm,
         pixel_um=picture.pixel_mm * 1e3,
         exposure_time_s=picture.exposure_time_s,
-        yaw_pitch_roll_deg=(yaw, pitch, roll),
+        yaw_pitch_roll_deg=(yaw % 360.0, pitch, roll),
         omega_phi_kappa_deg=eo.omega_phi_kappa_deg,
         centre_m=(east, north, height),
         crs=crs,
         remark=("SIMULATED: " if simulated else "")
         + ("" if rig.is_calibrated else "UNCALIBRATED: ")
-        + _REMARK,
+        + (_REMARK if picture.is_perspective else _RAW_REMARK),
+        width_px=picture.size_px[0],
+        height_px=picture.size_px[1],
+        f_number=f_numbers.pop() if len(f_numbers) == 1 else None,
+        height_sigma_m=eo.vertical_sigma_m,
+        roll_pitch_yaw_sigma_deg=roll_pitch_yaw_sigma_deg,
+        bands=picture.bands,
+        wavelengths_nm=_wavelengths(rig, picture.bands),
+        rig=_rig_place(rig, eo, mission_id),
+        lens_serial=lenses.pop() if len(lenses) == 1 else "",
+        is_perspective=picture.is_perspective,
     )
 
 
-def _cog(
+def _wavelengths(rig: Rig, bands: Sequence[str]) -> tuple[float, ...]:
+    """Of every band, or nothing where one is not known."""
+    known = {
+        band: wavelength
+        for cone in rig.cones
+        for band, wavelength in zip(cone.bands, cone.wavelengths_nm, strict=False)
+    }
+    return tuple(known[band] for band in bands) if all(band in known for band in bands) else ()
+
+
+def _rig_place(rig: Rig, eo: ExteriorOrientation, mission_id: str) -> RigPlace | None:
+    """Index and rotation of a head whose images are its own; None for stitched images."""
+    names = [cone.name for cone in rig.cones]
+    if eo.is_virtual or len(names) < 2 or eo.cone not in names:
+        return None
+    reference = rig.cone(rig.master_cone or rig.reference_cone)
+    turn = rotation_matrix(*reference.rotation_rad).T @ rotation_matrix(
+        *rig.cone(eo.cone).rotation_rad
+    )
+    angles = np.degrees(omega_phi_kappa(VISION_FROM_CAMERA @ turn @ VISION_FROM_CAMERA))
+    capture = uuid.uuid5(uuid.NAMESPACE_URL, f"syntopic:{mission_id}/{eo.exposure}")
+    return RigPlace(
+        rig.title or rig.name,
+        names.index(eo.cone),
+        names.index(reference.name),
+        (float(angles[0]), float(angles[1]), float(angles[2])),
+        str(capture),
+    )
+
+
+def _raster(
+    kind: str,
     picture: Level2Image,
     shot: PictureMetadata,
     georeference: Georeference,
     ground_m: float,
     final: Path,
 ) -> None:
-    require("geotiff")
-    from rasterio.io import MemoryFile
-    from rasterio.shutil import copy
-
-    planes = _planes(picture.path)
-    count, height, width = planes.shape
-    bands = read_description(picture.path).get("bands", [])
-    with MemoryFile() as memory:
-        with memory.open(
-            driver="GTiff",
-            width=width,
-            height=height,
-            count=count,
-            dtype="uint16",
-            nodata=0,
-            gcps=_ground_control(picture, georeference, ground_m, width, height),
-            crs=georeference.crs.to_wkt(),
-        ) as raster:
-            raster.write(planes)
-            raster.update_tags(**metadata_texts(shot))
-            for number, band in enumerate(bands[:count], 1):
-                raster.set_band_description(number, str(band))
-        with memory.open() as raster, new_file(final) as part:
-            copy(
-                raster, str(part), driver="COG", COMPRESS="DEFLATE", PREDICTOR="2", BLOCKSIZE="512",
-                OVERVIEW_RESAMPLING="AVERAGE",
-            )  # fmt: skip
+    planes = read_planes(picture.path)
+    _, height, width = planes.shape
+    points = _ground_control(picture, georeference, ground_m, width, height)
+    write_raster(kind, final, planes, shot, control_points=points, crs=georeference.crs.to_wkt())
 
 
 def _ground_control(
@@ -237,27 +334,3 @@ def _ground_control(
         for c, r, p in zip(columns.ravel(), rows.ravel(), ground, strict=True)
         if np.isfinite(p).all()
     ]
-
-
-def _planes(path: Path) -> NDArray[np.uint16]:
-    """(bands, h, w) uint16, the saturation bit taken out."""
-    from tifffile import TiffFile
-
-    with TiffFile(path) as tiff:
-        refuse_decompression_bomb(tiff.pages[0], path)
-        planes = np.asarray(tiff.pages[0].asarray())
-    planes = planes if planes.ndim == 3 else planes[None]
-    return np.asarray(planes & np.uint16(0xFFFE), np.uint16)
-
-
-def _jpeg(path: Path) -> bytes:
-    """8 bits: red, green, blue where there are three bands, else grey; one stretch for all."""
-    planes = _planes(path)
-    chosen = planes[:3] if len(planes) >= 3 else planes[:1]
-    sample = chosen[:, ::8, ::8]
-    seen = sample[sample > 0]
-    low, high = np.percentile(seen, (0.5, 99.5)) if seen.size else (0.0, 1.0)
-    unit = np.clip((chosen.astype(np.float32) - low) / max(float(high - low), 1.0), 0.0, 1.0)
-    grey = (255.0 * unit**0.6).astype(np.uint8)
-    picture = grey[0] if len(grey) == 1 else np.ascontiguousarray(np.moveaxis(grey, 0, -1))
-    return jpeg_bytes(picture, quality=JPEG_QUALITY)
