@@ -25,7 +25,7 @@ Examples: `syntopic orient MISSION`, `syntopic orient MISSION --trajectory sbet.
 `syntopic orient MISSION --mount boresight-2026-11-21/mount.toml`
 """
 
-PICTURES_HELP = """Export pictures as Cloud Optimized GeoTIFF, tiled TIFF, JPEG 2000, or JPEG with EXIF and XMP.
+PICTURES_HELP = """Export pictures as COG, tiled TIFF, JPEG 2000, or JPEG with EXIF and XMP.
 
 Level-2, or with --level 3 the pansharpened RGB and CIR images in 16 or 8 bits. The images are not
 rectified. A COG and a TIFF have tags, and ground control points on level ground. A JPEG contains

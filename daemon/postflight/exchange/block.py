@@ -129,8 +129,8 @@ def fitted(
             return form, model, worst_px
         found.append(f"{form} {worst_px:.3f} px")
     raise BlockError(
-        f"camera {camera.name}: its calibration does not fit {', '.join(found)}; {limit_px:g} px is "
-        "the limit. Export images in strict perspective instead: --images perspective"
+        f"camera {camera.name}: its calibration does not fit {', '.join(found)}; {limit_px:g} px "
+        "is the limit. Export images in strict perspective instead: --images perspective"
     )
 
 

@@ -14,6 +14,7 @@ from pathlib import Path
 from xml.etree import ElementTree as ET
 
 import numpy as np
+import pyproj
 from numpy.typing import NDArray
 
 from daemon.mission.foreign_files import ForeignFileError, read_regular_file
@@ -73,10 +74,7 @@ def metashape_texts(
     for number, image in enumerate(block.images):
         _camera(cameras, number, image, masters[number], suffix)
     reference = ET.SubElement(chunk, "reference")
-    reference.text = 'GEOGCS["WGS 84",DATUM["World Geodetic System 1984",SPHEROID["WGS 84",6378137,' \
-        '298.257223563,AUTHORITY["EPSG","7030"]],TOWGS84[0,0,0,0,0,0,0],AUTHORITY["EPSG","6326"]],' \
-        'PRIMEM["Greenwich",0,AUTHORITY["EPSG","8901"]],UNIT["degree",0.01745329251994328,' \
-        'AUTHORITY["EPSG","9102"]],AUTHORITY["EPSG","4326"]]'  # fmt: skip
+    reference.text = pyproj.CRS.from_epsg(4326).to_wkt("WKT1_GDAL")
     _chunk_transform(chunk, block.frame)
     ET.indent(root)
     text = '<?xml version="1.0" encoding="UTF-8"?>\n' + ET.tostring(root, encoding="unicode") + "\n"
@@ -225,8 +223,8 @@ def _block_of(path: Path, chunk: ET.Element) -> Block:
             continue
         if camera.attrib["sensor_id"] not in index:
             raise BlockError(
-                f"{path}: camera {camera.attrib['label']} names sensor {camera.attrib['sensor_id']}, "
-                "which is not in the file"
+                f"{path}: camera {camera.attrib['label']} names sensor "
+                f"{camera.attrib['sensor_id']}, which is not in the file"
             )
         pose = _numbers(text, 16).reshape(4, 4)
         images.append(

@@ -34,7 +34,8 @@ class RigPlace:
     """Place of a picture's head in its rig: index, that of the reference head, and its rotation.
 
     `relatives_deg` are the angles about x, y, z of R = Rx Ry Rz, reference from head, in axes of
-    computer vision (x right, y down, z forward); `capture` is the same for all heads of an exposure.
+    computer vision (x right, y down, z forward); `capture` is the same for all heads of one
+    exposure.
     """
 
     name: str

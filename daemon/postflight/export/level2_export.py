@@ -45,8 +45,8 @@ GRID = 5
 
 VISION_FROM_CAMERA = np.diag([1.0, -1.0, -1.0])
 _RAW_REMARK = (
-    "raw frame with the distortion of its lens; oriented by trajectory and mount; altitude above the "
-    "ellipsoid of WGS 84"
+    "raw frame with the distortion of its lens; oriented by trajectory and mount; altitude above "
+    "the ellipsoid of WGS 84"
 )
 _REMARK = (
     "perspective image, not rectified; oriented by trajectory and mount; altitude above the "

@@ -52,7 +52,7 @@ def read_planes(path: Path) -> Planes:
 
 
 def colour_interpretation(bands: Sequence[str]) -> list[str]:
-    """Names of GDAL's interpretations by band; false colour images are shown as they are ordered."""
+    """GDAL's interpretation of each band; false colour is shown in the order of its bands."""
     if set(bands) == {"nir", "red", "green"}:
         return ["red", "green", "blue"]
     if len(bands) == 1:
@@ -88,6 +88,8 @@ def write_raster(
     from rasterio.shutil import copy
 
     count, height, width = planes.shape
+    interpretation = colour_interpretation(shot.bands)
+    photometric = "RGB" if interpretation[:3] == list(_RGB) else "MINISBLACK"
     options = {
         "cog": {
             "driver": "COG", "COMPRESS": "DEFLATE", "PREDICTOR": "2", "BLOCKSIZE": str(BLOCK_PX),
@@ -106,12 +108,10 @@ def write_raster(
         with memory.open(
             driver="GTiff", width=width, height=height, count=count, dtype=planes.dtype.name,
             nodata=0, gcps=list(control_points), crs=crs if control_points else None,
-            photometric="RGB" if colour_interpretation(shot.bands)[:3] == list(_RGB) else "MINISBLACK",
+            photometric=photometric,
         ) as raster:  # fmt: skip
             raster.write(planes)
-            raster.colorinterp = [
-                getattr(ColorInterp, name) for name in colour_interpretation(shot.bands)
-            ]
+            raster.colorinterp = [getattr(ColorInterp, name) for name in interpretation]
             raster.update_tags(**metadata_texts(shot))
             raster.update_tags(ns="xml:XMP", **{"xml:XMP": xmp_bytes(shot).decode()})
             for number, band in enumerate(shot.bands, 1):

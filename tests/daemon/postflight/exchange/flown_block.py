@@ -132,7 +132,8 @@ def _write(path: Path, planes: list[np.ndarray], bands: list[str]) -> None:
 def local_of_world(world_enu_m: np.ndarray, origin: dict) -> np.ndarray:
     """Places of the emulator's world in a topocentric frame, by PROJ's own operation."""
     to_local = pyproj.Transformer.from_pipeline(
-        "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart +ellps=WGS84 "
+        "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad "
+        "+step +proj=cart +ellps=WGS84 "
         f"+step +proj=topocentric +ellps=WGS84 +lon_0={origin['longitude_deg']!r} "
         f"+lat_0={origin['latitude_deg']!r} +h_0=0"
     )
@@ -141,7 +142,7 @@ def local_of_world(world_enu_m: np.ndarray, origin: dict) -> np.ndarray:
 
 
 def targets(flown: FlownBlock, cone_name: str, mark_ns: int, pixels: np.ndarray, *, raw: bool):
-    """World points that a cone sees at its pixels, at 1500 m distance, and its projection centre."""
+    """World points that a cone sees at its pixels, 1500 m away, and its projection centre."""
     cone = flown.rig.cone(cone_name)
     sensor = cone.sensors[0]
     pose = FLIGHT.pose(mark_ns + cone.mark_to_mid_exposure_ns)

@@ -1,4 +1,4 @@
-"""What pycolmap reads of an exported block: places, reprojections, rig, priors, and its adjustment."""
+"""What pycolmap reads of an exported block: places, reprojections, rig, priors, adjustment."""
 
 from __future__ import annotations
 
@@ -165,7 +165,7 @@ def test_export_import_export_is_byte_identical(oblique, tmp_path: Path) -> None
     texts, _ = colmap_texts(block, rig_of(block, 0))
     for name in ("cameras.txt", "points3D.txt"):
         assert texts[name] == (folder / "sparse" / name).read_text()
-    # Poses are composed of rig and frame again: numbers are the same to 1e-9, not to the last digit.
+    # Poses are composed of rig and frame again: the same to 1e-7, not to the last digit.
     for name in ("rigs.txt", "frames.txt", "images.txt"):
         ours = [line.split() for line in texts[name].splitlines()]
         theirs = [line.split() for line in (folder / "sparse" / name).read_text().splitlines()]

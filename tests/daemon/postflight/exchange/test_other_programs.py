@@ -1,4 +1,4 @@
-"""Files for OpenSfM, OpenDroneMap, Metashape, Pix4D and nerfstudio, read by each format's own definition.
+"""Files for OpenSfM, OpenDroneMap, Metashape, Pix4D and nerfstudio, read by their definitions.
 
 The formulas here are those of the programs' manuals, written again; targets and places are the
 emulator's and PROJ's.
@@ -43,7 +43,7 @@ def grid(width: int, height: int) -> np.ndarray:
 
 
 def worst_px(flown: FlownBlock, origin: dict, project) -> float:
-    """Of images of exposure 2 by head: `project` gives pixels, integer at centres, of local points."""
+    """Of exposure 2 by head: `project` gives pixels, integer at centres, of local points."""
     worst = 0.0
     for head in HEADS:
         pixels = grid(1248, 832)
