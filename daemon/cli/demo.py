@@ -70,7 +70,10 @@ def demo(
     ] = None,
     receiver: Annotated[
         str,
-        typer.Option(help="Receiver: ublox, novatel, septentrio, nmea, sbg, vectornav or mavlink."),
+        typer.Option(
+            help="Receiver: ublox, novatel, septentrio, nmea, sbg, vectornav, xsens, applanix, gsof "
+            "or mavlink."
+        ),
     ] = "ublox",
     seed: Annotated[int, typer.Option(help="Seed for all random generators.")] = 1,
     out: Annotated[Path, typer.Option(help="Folder of the flights.")] = Path("flights"),

@@ -100,7 +100,10 @@ def sim(
     scenario: Annotated[Path | None, typer.Option(help="Scenario file with faults.")] = None,
     receiver: Annotated[
         str,
-        typer.Option(help="Receiver: ublox, novatel, septentrio, nmea, sbg, vectornav or mavlink."),
+        typer.Option(
+            help="Receiver: ublox, novatel, septentrio, nmea, sbg, vectornav, xsens, applanix, gsof "
+            "or mavlink."
+        ),
     ] = "ublox",
     probe: Annotated[str, typer.Option(help="Thermometer: modbus or ascii.")] = "modbus",
     pps: Annotated[bool, typer.Option("--pps", help="Emulated pulse per second.")] = False,

@@ -125,6 +125,13 @@ SUPPORT: Final = (
         ),
     ),
     DriverSupport(
+        "navigator", "gsof", "Trimble BD, BX, R, SPS and Alloy, Applanix AP+ and APX, with GSOF",
+        (
+            Proof("navigation, attitude, time", _MANUAL, "OEM GNSS receiver help, GSOF messages"),
+            Proof("event marks", _MANUAL, "OEM GNSS receiver help, GSOF message 51"),
+        ),
+    ),
+    DriverSupport(
         "navigator", "mavlink", "autopilots with PX4 or ArduPilot (Pixhawk, Cube, ...)",
         (Proof("navigation, CAMERA_TRIGGER, CAMERA_FEEDBACK", _PEER, "pymavlink"),),
     ),

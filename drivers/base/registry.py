@@ -42,6 +42,7 @@ _DRIVER_PATHS: Final[Mapping[str, Mapping[str, str]]] = {
         "vectornav": "drivers.receivers.vectornav.navigator:VectornavNavigator",
         "xsens": "drivers.receivers.xsens.navigator:XsensNavigator",
         "applanix": "drivers.receivers.applanix.navigator:ApplanixNavigator",
+        "gsof": "drivers.receivers.gsof.navigator:GsofNavigator",
         "mavlink": "drivers.receivers.mavlink.navigator:MavlinkNavigator",
     },
 }

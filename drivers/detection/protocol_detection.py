@@ -15,6 +15,8 @@ from drivers.detection.line_format import line_format_of
 from drivers.receivers.applanix.decoder import ApplanixDecoder
 from drivers.receivers.applanix.navigator import ApplanixNavigator
 from drivers.receivers.fix_monitor import fix_description
+from drivers.receivers.gsof.decoder import GsofDecoder
+from drivers.receivers.gsof.navigator import GsofNavigator
 from drivers.receivers.mavlink.decoder import MavlinkDecoder
 from drivers.receivers.mavlink.navigator import MavlinkNavigator
 from drivers.receivers.message_decoder import MessageDecoder
@@ -68,6 +70,7 @@ _PROTOCOL_CANDIDATES: Final = (
     _ProtocolCandidate("vectornav", VectornavNavigator, VectornavDecoder),
     _ProtocolCandidate("xsens", XsensNavigator, XsensDecoder),
     _ProtocolCandidate("applanix", ApplanixNavigator, ApplanixDecoder),
+    _ProtocolCandidate("gsof", GsofNavigator, GsofDecoder),
     _ProtocolCandidate("mavlink", MavlinkNavigator, MavlinkDecoder),
     _ProtocolCandidate("nmea", NmeaNavigator, NmeaDecoder),
 )

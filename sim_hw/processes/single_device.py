@@ -41,6 +41,9 @@ KINDS: Mapping[str, DeviceKind] = {
     "septentrio": RECEIVER,
     "sbg": RECEIVER,
     "vectornav": RECEIVER,
+    "xsens": RECEIVER,
+    "applanix": RECEIVER,
+    "gsof": RECEIVER,
     "mavlink": RECEIVER,
     "modbus": THERMOMETER,
     "ascii": THERMOMETER,
@@ -156,6 +159,18 @@ def _line_device(
         from sim_hw.receivers.vectornav_receiver import VectornavReceiver
 
         return VectornavReceiver(clock, state, line=line)
+    if kind == "xsens":
+        from sim_hw.receivers.xsens_receiver import XsensReceiver
+
+        return XsensReceiver(clock, state, line=line)
+    if kind == "applanix":
+        from sim_hw.receivers.applanix_receiver import ApplanixReceiver
+
+        return ApplanixReceiver(clock, state, line=line)
+    if kind == "gsof":
+        from sim_hw.receivers.gsof_receiver import GsofReceiver
+
+        return GsofReceiver(clock, state, line=line)
     if kind == "mavlink":
         from sim_hw.receivers.mavlink_autopilot import MavlinkAutopilot
 

@@ -16,7 +16,9 @@ from sim_hw.devices.device_loop import LineDevice
 from sim_hw.devices.modbus_probe import ModbusProbe
 from sim_hw.devices.network_line import UdpLine
 from sim_hw.devices.pseudo_terminal import PseudoTerminal
+from sim_hw.receivers.applanix_receiver import ApplanixReceiver
 from sim_hw.receivers.emulated_receiver import EmulatedReceiver, ReceiverState
+from sim_hw.receivers.gsof_receiver import GsofReceiver
 from sim_hw.receivers.mavlink_autopilot import MavlinkAutopilot
 from sim_hw.receivers.nmea_receiver import NmeaReceiver
 from sim_hw.receivers.novatel_receiver import NovatelReceiver
@@ -24,6 +26,7 @@ from sim_hw.receivers.sbg_receiver import SbgReceiver
 from sim_hw.receivers.septentrio_receiver import SeptentrioReceiver
 from sim_hw.receivers.ublox_receiver import UbloxReceiver
 from sim_hw.receivers.vectornav_receiver import VectornavReceiver
+from sim_hw.receivers.xsens_receiver import XsensReceiver
 from sim_hw.world.world_clock import WorldClock
 
 BAUDRATE = 115_200
@@ -36,6 +39,9 @@ _ON_A_SERIAL_LINE: dict[str, type[EmulatedReceiver]] = {
     "septentrio": SeptentrioReceiver,
     "sbg": SbgReceiver,
     "vectornav": VectornavReceiver,
+    "xsens": XsensReceiver,
+    "applanix": ApplanixReceiver,
+    "gsof": GsofReceiver,
     "nmea": NmeaReceiver,
 }
 RECEIVERS = (*_ON_A_SERIAL_LINE, "mavlink")

@@ -43,7 +43,7 @@ def test_what_is_read_by_the_manual_only_is_named() -> None:
     manual_only = [
         one.driver for one in SUPPORT if is_from_manual_only(one.kind, one.driver, "event marks")
     ]
-    assert manual_only == ["sbg", "vectornav", "xsens", "applanix"]
+    assert manual_only == ["sbg", "vectornav", "xsens", "applanix", "gsof"]
     assert not is_from_manual_only("navigator", "vectornav", "attitude")
     assert "the manual only (MT0101P)" in proof_summary("navigator", "xsens")
     assert support_of("navigator", "none") is None

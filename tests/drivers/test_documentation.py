@@ -21,6 +21,7 @@ PAGES = [
     ("navigator", "vectornav", "vectornav.md"),
     ("navigator", "xsens", "xsens.md"),
     ("navigator", "applanix", "applanix.md"),
+    ("navigator", "gsof", "gsof.md"),
     ("navigator", "mavlink", "mavlink.md"),
     ("thermometer", "ascii-line", "ascii-line.md"),
     ("thermometer", "host", "host.md"),

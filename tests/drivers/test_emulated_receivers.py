@@ -15,6 +15,8 @@ from dataclasses import replace
 import pytest
 
 from drivers.contract import EventMark, NavSample
+from drivers.receivers.applanix.navigator import ApplanixNavigator
+from drivers.receivers.gsof.navigator import GsofNavigator
 from drivers.receivers.nmea.navigator import NmeaNavigator
 from drivers.receivers.novatel.navigator import NovatelNavigator
 from drivers.receivers.sbg.navigator import SbgNavigator
@@ -22,15 +24,19 @@ from drivers.receivers.septentrio.navigator import SeptentrioNavigator
 from drivers.receivers.streaming_navigator import StreamingNavigator
 from drivers.receivers.ublox.navigator import UbloxNavigator
 from drivers.receivers.vectornav.navigator import VectornavNavigator
+from drivers.receivers.xsens.navigator import XsensNavigator
 from sim_hw.devices.network_line import TcpLine, UdpLine
 from sim_hw.devices.pseudo_terminal import PseudoTerminal
+from sim_hw.receivers.applanix_receiver import ApplanixReceiver
 from sim_hw.receivers.emulated_receiver import EmulatedReceiver, ReceiverState
+from sim_hw.receivers.gsof_receiver import GsofReceiver
 from sim_hw.receivers.nmea_receiver import NmeaReceiver
 from sim_hw.receivers.novatel_receiver import NovatelReceiver
 from sim_hw.receivers.sbg_receiver import SbgReceiver
 from sim_hw.receivers.septentrio_receiver import SeptentrioReceiver
 from sim_hw.receivers.ublox_receiver import UbloxReceiver
 from sim_hw.receivers.vectornav_receiver import VectornavReceiver
+from sim_hw.receivers.xsens_receiver import XsensReceiver
 from sim_hw.world.world_clock import WorldClock
 from tests.drivers.fakes import RecordingSink, running
 from tests.sim_hw.receiver_state import NS, STATE, WEEK_NS
@@ -49,6 +55,9 @@ PAIRS = {
     "nmea": (NmeaReceiver, NmeaNavigator),
     "sbg": (SbgReceiver, SbgNavigator),
     "vectornav": (VectornavReceiver, VectornavNavigator),
+    "xsens": (XsensReceiver, XsensNavigator),
+    "applanix": (ApplanixReceiver, ApplanixNavigator),
+    "gsof": (GsofReceiver, GsofNavigator),
 }
 MARKS_WITHIN_NS = {
     "ublox": 0,
@@ -57,11 +66,15 @@ MARKS_WITHIN_NS = {
     "nmea": 500,
     "sbg": 1000,
     "vectornav": 0,
+    "xsens": 100_000,
+    "applanix": 1,
+    "gsof": 1,
 }
-"""The resolution of each protocol: NMEA and the time stamps of SBG resolve microseconds."""
+"""The resolution of each protocol: NMEA and the time stamps of SBG resolve microseconds, Xsens 0.1 ms."""
 PLACE_WITHIN_M = {
     "ublox": 0.02, "novatel": 1e-3, "septentrio": 1e-3, "nmea": 0.06, "sbg": 1e-3,
     "vectornav": 1e-3,
+    "xsens": 1e-3, "applanix": 1e-3, "gsof": 1e-3,
 }  # fmt: skip
 
 

@@ -30,6 +30,7 @@ def test_there_are_the_drivers_of_the_first_flight() -> None:
             "vectornav",
             "xsens",
             "applanix",
+            "gsof",
             "mavlink",
         ),
     }

@@ -14,6 +14,7 @@ from drivers.receivers.message_decoder import Nav
 from drivers.receivers.xsens.decoder import XsensDecoder
 from drivers.receivers.xsens.framing import data_of
 from drivers.timescales.gps_time import SECOND_NS, WEEK_NS, UtcFields, utc_ns
+from sim_hw.receivers import xsens_messages
 
 # Recorded from an MTi-G-710 by Einride AB, xsens-go, testdata/1/messages.golden, MIT licence;
 # what their own decoder reads is in testdata/1/output.client.golden.
@@ -266,3 +267,25 @@ def test_noise_raises_nothing_and_costs_no_later_message(data: bytes, cut: int) 
         r for at in range(0, len(stream), cut) for r in decoder.feed(stream[at : at + cut], 0)
     ]
     assert [r.gps_ns for r in records if isinstance(r, EventMark)] == [GPS_NS + 20_000_000]
+
+
+def test_the_emulator_encodes_what_was_recorded_byte_by_byte() -> None:
+    recorded = data_of(POSITION)
+    assert recorded is not None
+    nano, *_, flags = recorded["UtcTime"].values
+    gps_ns = (utc_ns(RECORDED_UTC) or 0) + nano + 18 * SECOND_NS
+    again = xsens_messages.message(
+        (0x1020, struct.pack(">H", *recorded["PacketCounter"].values)),
+        xsens_messages.sample_time_fine(*recorded["SampleTimeFine"].values),
+        xsens_messages.utc_time(gps_ns, 18, flags),
+        xsens_messages.status_word(*recorded["StatusWord"].values),
+    )
+    data = again[4:-1]
+    assert len(data) == 5 + 7 + 15 + 7
+    assert data == POSITION[4:][: len(data)]
+    assert xsens_messages.message((0x0000, bytes(range(254))))[:6] == bytes.fromhex("faff36ff0101")
+
+
+def test_the_emulator_writes_fixed_point_as_the_manual_defines_it() -> None:
+    # MT0101P: the fraction as an unsigned number of 32 bits, then the signed whole number.
+    assert xsens_messages.fixed_point(1.5, -0.25) == bytes.fromhex("800000000001c0000000ffff")

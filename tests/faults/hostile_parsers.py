@@ -17,6 +17,7 @@ from drivers.cameras.aravis import gvcp
 from drivers.contract import DeviceError
 from drivers.receivers.applanix.decoder import ApplanixDecoder
 from drivers.receivers.gpsd.reports import GpsdReports
+from drivers.receivers.gsof.decoder import GsofDecoder
 from drivers.receivers.message_decoder import MessageDecoder
 from drivers.receivers.nmea.decoder import NmeaDecoder
 from drivers.receivers.novatel.decoder import NovatelDecoder
@@ -42,6 +43,7 @@ from sim_hw.world.world_clock import WorldClock
 from tests.drivers.fakes import FakeClock
 from tests.faults.resealed_messages import (
     reseal_applanix,
+    reseal_gsof,
     reseal_mavlink,
     reseal_modbus,
     reseal_nmea,
@@ -221,6 +223,13 @@ def applanix() -> Parser:
 
     stream = pos.BEGUN + pos.performance() + pos.nav() + pos.event(1) + pos.event(2)
     return _decoding("applanix", stream, ApplanixDecoder("r"), reseal_applanix, 0.05)
+
+
+def gsof() -> Parser:
+    from tests.drivers import test_gsof as trimble
+
+    stream = trimble.packets(trimble.EPOCH) + trimble.packets(trimble.INS + trimble.event(1), 2)
+    return _decoding("gsof", stream, GsofDecoder("r"), reseal_gsof, 0.05)
 
 
 def mavlink() -> Parser:
@@ -464,6 +473,7 @@ PARSERS: Mapping[str, Callable[[], Parser]] = {
     "vectornav": vectornav,
     "xsens": xsens,
     "applanix": applanix,
+    "gsof": gsof,
     "mavlink": mavlink,
     "gpsd": gpsd,
     "ascii-line": ascii_line,

@@ -74,6 +74,13 @@ def reseal_applanix(message: bytearray) -> bytes:
     return bytes(message)
 
 
+def reseal_gsof(message: bytearray) -> bytes:
+    message[0], message[2], message[-1] = 0x02, 0x40, 0x03
+    message[3] = min(max(len(message) - 6, 0), 255)
+    message[-2] = sum(message[1:-2]) & 0xFF
+    return bytes(message)
+
+
 def reseal_mavlink(message: bytearray) -> bytes:
     message[0], message[2] = 0xFD, 0
     message[1] = max(len(message) - 12, 0) & 0xFF

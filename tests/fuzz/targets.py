@@ -263,8 +263,8 @@ def device(name: str) -> Callable[[], Target]:
 
 
 DEVICES = (
-    "ublox", "nmea", "novatel", "septentrio", "sbg", "vectornav", "xsens", "applanix", "mavlink",
-    "gpsd",    "ascii-line", "modbus", "pulse-bus", "gvcp-answer", "gvcp-command",
+    "ublox", "nmea", "novatel", "septentrio", "sbg", "vectornav", "xsens", "applanix", "gsof",
+    "mavlink", "gpsd", "ascii-line", "modbus", "pulse-bus", "gvcp-answer", "gvcp-command",
 )  # fmt: skip
 
 TARGETS: Mapping[str, Callable[[], Target]] = {

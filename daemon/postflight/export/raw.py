@@ -28,6 +28,7 @@ NATIVE_SUFFIXES = {
     "vectornav": "vnb",
     "xsens": "mtb",
     "applanix": "pos",
+    "gsof": "gsof",
     "nmea": "nmea",
     "mavlink": "raw",
 }

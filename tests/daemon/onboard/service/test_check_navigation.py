@@ -38,7 +38,19 @@ def found(tmp_path: Path, *messages: object) -> CheckResult:
 
 
 @pytest.mark.parametrize(
-    "driver", ["nmea", "mavlink", "ublox", "novatel", "septentrio", "sbg", "vectornav", "xsens"]
+    "driver",
+    [
+        "nmea",
+        "mavlink",
+        "ublox",
+        "novatel",
+        "septentrio",
+        "sbg",
+        "vectornav",
+        "xsens",
+        "applanix",
+        "gsof",
+    ],
 )
 def test_the_event_mark_of_every_receiver_that_can_give_one_is_proven(
     tmp_path: Path, driver: str
@@ -46,7 +58,7 @@ def test_the_event_mark_of_every_receiver_that_can_give_one_is_proven(
     system_check, spec = checked(tmp_path, driver, mark(pulse(1, 0.0)))
     proven = system_check._mark(spec)
     assert proven.outcome is CheckOutcome.PASS
-    is_from_manual = driver in ("sbg", "vectornav", "xsens", "applanix")
+    is_from_manual = driver in ("sbg", "vectornav", "xsens", "applanix", "gsof")
     assert proven.sentence == (
         f"marks of driver {driver} are decoded from the manual only" if is_from_manual else ""
     )

@@ -1,0 +1,1 @@
+"""Trimble receivers and Applanix boards that send GSOF records."""
