@@ -85,7 +85,7 @@ class DescribedRegisters:
         self._identity = identity
         self._state = state
         self.lock = threading.RLock()
-        self._xml = description.xml + bytes(-len(description.xml) % 4)
+        self._stored = description.stored + bytes(-len(description.stored) % 4)
         self._description = description
         self.refused: list[str] = []
         """Names of the registers whose writes were refused, in order."""
@@ -108,8 +108,8 @@ class DescribedRegisters:
         if address % 4 or length % 4 or length <= 0:
             raise RegisterRefusedError(Status.BAD_ALIGNMENT)
         with self.lock:
-            if XML_START <= address < XML_START + len(self._xml):
-                part = self._xml[address - XML_START :][:length]
+            if XML_START <= address < XML_START + len(self._stored):
+                part = self._stored[address - XML_START :][:length]
                 return part.ljust(length, b"\0")
             if address >= _BOOTSTRAP_END and not self._owners(address, length):
                 raise RegisterRefusedError(Status.INVALID_ADDRESS)
@@ -383,6 +383,10 @@ class DescribedRegisters:
         except NodeError:
             return False
 
+    def _url(self) -> str:
+        description = self._description
+        return f"Local:{description.file_name};{XML_START:X};{len(description.stored):X}"
+
     def _write_bootstrap(self) -> None:
         """The bootstrap registers. Source: GigE Vision 2.0, section 28."""
         identity, memory = self._identity, self.memory
@@ -414,6 +418,6 @@ class DescribedRegisters:
             (at.MANUFACTURER_INFO, "emulated", 48),
             (at.SERIAL, identity.serial, 16),
             (at.USER_NAME, identity.user_id, 16),
-            (at.XML_URL, f"Local:head.xml;{XML_START:X};{len(self._xml):X}", 512),
+            (at.XML_URL, self._url(), 512),
         ):
             memory.write(address, text.encode("utf-8")[: length - 1].ljust(length, b"\0"))

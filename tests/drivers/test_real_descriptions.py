@@ -43,7 +43,8 @@ SENSOR_BITS = 12
 EXPOSURE_TIME_US = 1000.0
 EXPOSURES = ("ExposureTime", "ExposureTimeAbs", "ExposureTimeRaw")
 FRAME_TRIGGERS = {"FrameStart", "ExposureStart", "FrameTrigger"}
-MISSING = ("AcquisitionStart", "pixel format", "PixelFormat", "exposure", "trigger", "Trigger")
+MANDATORY = ("AcquisitionStart", "TriggerSoftware", "Width", "Height", "PayloadSize")
+MISSING = (*MANDATORY, "pixel format", "PixelFormat", "exposure", "trigger", "Trigger")
 ARMED_MIN = 50
 """Of the 62 descriptions, so many must arm; about a dozen are of grabbers and other links."""
 
@@ -89,11 +90,16 @@ def must_arm(name: str) -> bool:
     if "FrameStart" in selectors and is_writable("TriggerSelector"):
         reference.get_node("TriggerSelector").value = "FrameStart"
     return (
-        node_of("AcquisitionStart") is not None
+        all(node_of(name) is not None for name in MANDATORY)
         and any(packing_of(entry) is not None for entry in entries("PixelFormat"))
         and any(is_writable(feature) for feature in EXPOSURES)
         and is_writable("TriggerMode")
-        and (not selectors or bool(selectors & FRAME_TRIGGERS) or selectors == {"AcquisitionStart"})
+        and (
+            not selectors
+            or bool(selectors & FRAME_TRIGGERS)
+            or selectors == {"AcquisitionStart"}
+            or ("FrameBurstStart" in selectors and is_writable("AcquisitionBurstFrameCount"))
+        )
         and "Software" in entries("TriggerSource")
     )
 

@@ -14,7 +14,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
-from drivers.cameras.aravis.camera_access import local_interface, open_camera
+from drivers.cameras.aravis.camera_access import (
+    endless_features,
+    local_interface,
+    open_camera,
+)
+from drivers.cameras.aravis.chunk_configuration import switch_on_chunks
 from drivers.cameras.aravis.feature_access import FeatureError, Features
 from drivers.cameras.aravis.formats import packing_of, packing_problem
 from drivers.cameras.aravis.gvcp import GVCP_PORT, is_ip_address
@@ -38,6 +43,7 @@ CLOCKS: Final = (
     ("TimestampLatch", "Timestamp", True),
     ("GevTimestampControlLatch", "GevTimestampValue", False),
 )
+ENDLESS_NAMES_MAX: Final = 4
 TEMPERATURES: Final = ("DeviceTemperature", "TemperatureAbs")
 TEMPERATURE_PLACES: Final = ("Sensor", "Sensorboard", "SensorBoard", "Mainboard", "Coreboard")
 
@@ -113,10 +119,14 @@ class AravisCamera:
             raise ControlDeniedError(
                 f"{self._who}: another program controls the head; end that program"
             )
-        self._features = Features(self._camera.get_device())
+        device = self._camera.get_device()
+        self._features = Features(device, endless_features(self._who, device))
         self._configuration = HeadConfiguration(self._features, settings)
         self.identity = self._identity(settings)
         refusals = self._configure(settings)
+        if refusals and self._features.endless:
+            names = ", ".join(sorted(self._features.endless)[:ENDLESS_NAMES_MAX])
+            refusals.append(f"its description refers to itself ({names}); update its firmware")
         if refusals:
             raise DeviceError("\n".join(f"{self._who}: {refusal}" for refusal in refusals))
         self.ptp = PtpFeatures(self._features) if settings.ptp else None
@@ -335,7 +345,7 @@ class AravisCamera:
             self._write_packets(settings, configuration.refusals)
         if configuration.refusals:
             return configuration.refusals
-        self.chunks = configuration.switch_on_chunks() if settings.chunks else []
+        self.chunks = switch_on_chunks(self._features) if settings.chunks else []
         if self.chunks:
             self.chunk_parser = self._camera.create_chunk_parser()
         return self._read_geometry(settings)
@@ -343,6 +353,8 @@ class AravisCamera:
     def _read_geometry(self, settings: AravisSettings) -> list[str]:
         """Read size and format of a frame; one sentence per reason why they cannot be used."""
         features = self._features
+        if features.kind("PayloadSize") is None and self._camera.is_gv_device():
+            return ["the head has no feature PayloadSize; the size of its frames is unknown"]
         try:
             pixel_format = str(features.get("PixelFormat"))
             code = int(self._camera.get_pixel_format())
@@ -351,7 +363,8 @@ class AravisCamera:
         except (FeatureError, aravis_error()) as error:
             return [f"the size of its frames cannot be read ({message_of(error)})"]
         packing = packing_of(pixel_format)
-        assert packing is not None, "the configuration allows no other format"
+        if packing is None:
+            return [f"its frames are {pixel_format}, which is not read; set pixel_format"]
         if packing is Packing.WORDS and settings.byte_order == "big":
             packing = Packing.WORDS_BIG_ENDIAN
         self.geometry = FrameGeometry(

@@ -2,11 +2,24 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Final
 
-from drivers.cameras.aravis.library import aravis, aravis_error, inet_address, message_of
+from drivers.cameras.aravis.description_cycles import (
+    DescriptionUnreadableError,
+    features_with_cycles,
+)
+from drivers.cameras.aravis.library import (
+    aravis,
+    aravis_error,
+    inet_address,
+    message_of,
+    stored_description,
+)
 from drivers.cameras.aravis.packet_filter import interface_towards
 from drivers.contract import DeviceError
+
+DEVICE_ERRORS: Final = "arv-device-error-quark"
+"""Domain of the errors of Aravis' devices."""
 
 
 def local_interface(head_name: str, address: str) -> str:
@@ -55,7 +68,45 @@ def open_camera(head_name: str, interface: str, address: str) -> Any:
         device = library.GvDevice.new(gio.new_from_string(interface), gio.new_from_string(address))
         return library.Camera.new_with_device(device)
     except failed as error:
+        not_found = (DEVICE_ERRORS, int(library.DeviceError.GENICAM_NOT_FOUND))
+        if (getattr(error, "domain", ""), getattr(error, "code", -1)) == not_found:
+            raise DeviceError(unreadable_description(head_name, message_of(error))) from None
         raise DeviceError(
             f"{head_name}: the head cannot be opened ({message_of(error)}); check power, cable and "
             "address"
         ) from None
+
+
+def endless_features(head_name: str, device: Any) -> frozenset[str]:
+    """Features of an opened head that refer to themselves and must not be evaluated.
+
+    Args:
+        head_name: name of the head, for the message.
+        device: the device of Aravis.
+
+    Returns:
+        Names of features; empty if only Aravis can read the description.
+
+    Raises:
+        DeviceError: neither this program nor Aravis can read the description.
+    """
+    try:
+        return features_with_cycles(stored_description(device).rstrip(b"\0"))
+    except DescriptionUnreadableError as error:
+        reason = str(error)
+    if all(device.get_feature(name) is None for name in ("PixelFormat", "AcquisitionStart")):
+        raise DeviceError(unreadable_description(head_name, reason))
+    return frozenset()
+
+
+def unreadable_description(head_name: str, reason: str) -> str:
+    """The sentence for a head whose description of its features cannot be read.
+
+    Args:
+        head_name: name of the head.
+        reason: what is wrong with it.
+
+    Returns:
+        A sentence with the remedy.
+    """
+    return f"{head_name}: the head's GenICam description cannot be read ({reason}); update its firmware"

@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterable
 from typing import Any, Final
 
-from drivers.cameras.aravis.camera_access import local_interface, open_camera
+from drivers.cameras.aravis.camera_access import endless_features, local_interface, open_camera
 from drivers.cameras.aravis.discovery import FoundHead
 from drivers.cameras.aravis.feature_access import FeatureError, Features
 from drivers.cameras.aravis.formats import widest_format
@@ -53,7 +53,7 @@ def _described(name: str, head: FoundHead, camera: Any) -> HeadDescription:
     device = camera.get_device()
     if camera.is_gv_device() and not device.is_controller():
         raise DeviceError(f"{name}: another program controls the head; end that program")
-    features = Features(device)
+    features = Features(device, endless_features(name, device))
     pixel_format = usual_format(features.entries("PixelFormat"))
     if pixel_format is None:
         raise DeviceError(

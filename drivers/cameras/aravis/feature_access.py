@@ -7,7 +7,7 @@ exception with the reason.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any, Final
 
 from drivers import DriverError
@@ -27,10 +27,12 @@ class Features:
 
     Args:
         device: the device of Aravis.
+        endless: features that refer to themselves; they are not available, and never evaluated.
     """
 
-    def __init__(self, device: Any) -> None:
+    def __init__(self, device: Any, endless: Collection[str] = ()) -> None:
         self._device = device
+        self.endless = endless
         self._library = aravis()
         self._failed = aravis_error()
 
@@ -44,7 +46,7 @@ class Features:
             `boolean`, `integer`, `float`, `enumeration`, `string` or `command`; None if the head's
             description has no feature of this name, or only a category.
         """
-        node = self._device.get_feature(name)
+        node = None if name in self.endless else self._device.get_feature(name)
         library = self._library
         if node is None or isinstance(node, library.GcCategory):
             return None
@@ -85,7 +87,7 @@ class Features:
         Returns:
             False also if the head does not answer.
         """
-        node = self._device.get_feature(name)
+        node = None if name in self.endless else self._device.get_feature(name)
         try:
             return bool(node is not None and node.is_locked())
         except self._failed:

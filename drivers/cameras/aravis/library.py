@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ctypes
 import functools
 import threading
+from pathlib import Path
 from typing import Any, Final
 
 from drivers.base.extras import missing
@@ -77,3 +79,37 @@ def message_of(error: Exception) -> str:
         Its message without domain and code.
     """
     return str(getattr(error, "message", error))
+
+
+def stored_description(device: Any) -> bytes:
+    """The GenICam description of an opened device, as it stores it; unzipped.
+
+    Args:
+        device: the device of Aravis.
+
+    Returns:
+        The bytes; empty if they cannot be read.
+    """
+    # Quirk: PyGObject takes the description for text that ends with a zero byte. Aravis ends it by
+    # its length alone, so that what lies behind it in memory is read. The function is called in C.
+    # Upstream: no report known (2026-11-23); arv_device_get_genicam_xml in src/arvdevice.c.
+    function = _library_function("arv_device_get_genicam_xml")
+    if function is None:
+        return b""
+    capsule = ctypes.pythonapi.PyCapsule_GetPointer
+    capsule.restype, capsule.argtypes = ctypes.c_void_p, [ctypes.py_object, ctypes.c_char_p]
+    function.restype, function.argtypes = ctypes.c_void_p, [ctypes.c_void_p, ctypes.c_void_p]
+    nbytes = ctypes.c_size_t()
+    start = function(capsule(device.__gpointer__, None), ctypes.byref(nbytes))
+    return ctypes.string_at(start, nbytes.value) if start else b""
+
+
+@functools.cache
+def _library_function(name: str) -> Any:
+    """A function of the library that is loaded; None if it is not found."""
+    aravis()
+    for line in Path("/proc/self/maps").read_text(encoding="utf-8").splitlines():
+        path = line.split(maxsplit=5)[-1]
+        if Path(path).name.startswith("libaravis-0.8.so"):
+            return getattr(ctypes.CDLL(path), name, None)
+    return None

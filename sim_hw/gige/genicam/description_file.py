@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import functools
 import io
+import lzma
 import zipfile
+import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from xml.etree import ElementTree
@@ -17,6 +19,7 @@ from sim_hw import SimulatorError
 _CONTAINERS = frozenset({"Group", "RegisterDescription"})
 _BIT_PROPERTIES = frozenset({"Bit", "LSB", "MSB", "Sign"})
 _DESCRIPTION_MAX_NBYTES = 64 << 20
+_UTF_16_MARKS = (b"\xff\xfe", b"\xfe\xff")
 
 
 class DescriptionError(SimulatorError, ValueError):
@@ -60,6 +63,13 @@ class Description:
     schema: tuple[int, int]
     nodes: Mapping[str, Node]
     xml: bytes
+    stored: bytes
+    """As the camera stores it: the XML, or an archive with it."""
+
+    @property
+    def file_name(self) -> str:
+        """Name of the stored file, whose suffix is its kind."""
+        return "head.xml" if self.stored is self.xml else "head.zip"
 
 
 # Emulated heads of one camera share what was read; a description is never written.
@@ -67,19 +77,22 @@ class Description:
 def read_description(data: bytes) -> Description:
     """Read a description as a camera stores it, also zipped.
 
-    Text before the first `<`, which programs write that save a description, is skipped.
+    Text before the first `<` and after the last `>`, which programs write that save a description
+    and cameras that fill their memory, is skipped.
 
     Raises:
         DescriptionError: it is no GenICam description.
     """
+    archive = b""
     if data[:2] == b"PK":
-        data = _unzip(data)
-    start = data.find(b"<")
-    if start < 0 or len(data) > _DESCRIPTION_MAX_NBYTES:
+        archive, data = data, _unzip(data)
+    xml = data
+    if data[:2] not in _UTF_16_MARKS:
+        xml = data[max(data.find(b"<"), 0) : data.rfind(b">") + 1]
+    if not xml or len(xml) > _DESCRIPTION_MAX_NBYTES:
         raise DescriptionError("the file contains no XML; save the description of a camera")
-    xml = data[start:]
     try:
-        root = ElementTree.fromstring(xml)
+        root = _root_of(xml)
     except ElementTree.ParseError as error:
         raise DescriptionError(f"the XML cannot be read: {error}") from None
     if _tag(root) != "RegisterDescription":
@@ -89,10 +102,28 @@ def read_description(data: bytes) -> Description:
         vendor=root.get("VendorName", ""),
         model=root.get("ModelName", ""),
         namespace=root.get("StandardNameSpace", ""),
-        schema=(int(root.get("SchemaMajorVersion", 1)), int(root.get("SchemaMinorVersion", 0))),
+        schema=(_version(root, "SchemaMajorVersion"), _version(root, "SchemaMinorVersion")),
         nodes=nodes,
         xml=xml,
+        stored=archive or xml,
     )
+
+
+def _root_of(xml: bytes) -> ElementTree.Element:
+    """The root; bytes that are no UTF-8 are read as Windows-1252, which some makers' editors write."""
+    try:
+        return ElementTree.fromstring(xml)
+    except ElementTree.ParseError:
+        try:
+            xml.decode("utf-8")
+        except UnicodeDecodeError:
+            return ElementTree.fromstring(xml.decode("cp1252", "replace"))
+        raise
+
+
+def _version(root: ElementTree.Element, attribute: str) -> int:
+    text = root.get(attribute, "")
+    return int(text) if text.isdigit() else 1
 
 
 def _unzip(data: bytes) -> bytes:
@@ -102,7 +133,14 @@ def _unzip(data: bytes) -> bytes:
             if not names or archive.getinfo(names[0]).file_size > _DESCRIPTION_MAX_NBYTES:
                 raise DescriptionError("the archive contains no description")
             return archive.read(names[0])
-    except zipfile.BadZipFile as error:
+    except (
+        zipfile.BadZipFile,
+        zlib.error,
+        lzma.LZMAError,
+        OSError,
+        NotImplementedError,
+        RuntimeError,
+    ) as error:
         raise DescriptionError(f"the archive cannot be read: {error}") from None
 
 

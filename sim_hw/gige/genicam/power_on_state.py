@@ -120,7 +120,7 @@ _TRIALS_MAX = 60
 def features_of(nodes: NodeMap) -> list[str]:
     """Names of the features that the categories list, each once, in their order."""
     found: dict[str, None] = {}
-    waiting = ["Root"]
+    waiting = ["Root"] if "Root" in nodes.nodes else _categories(nodes)
     visited = set()
     while waiting:
         name = waiting.pop(0)
@@ -133,6 +133,11 @@ def features_of(nodes: NodeMap) -> list[str]:
         else:
             found[name] = None
     return list(found)
+
+
+def _categories(nodes: NodeMap) -> list[str]:
+    """All categories, for a description without a root."""
+    return [name for name, node in nodes.nodes.items() if node.kind == "Category"]
 
 
 def controller_selectors(nodes: NodeMap) -> dict[str, list[int]]:
@@ -150,7 +155,7 @@ def controller_selectors(nodes: NodeMap) -> dict[str, list[int]]:
         if node.kind == "Enumeration" and nodes.nodes[last].texts("Value"):
             entries = sorted(node.entries, key=lambda entry: entry.name != "FrameStart")
             found[last] = [nodes.entry_value(entry) for entry in entries]
-    return found
+    return {selector: values for selector, values in found.items() if values}
 
 
 def write_power_on_state(nodes: NodeMap, state: InitialState = InitialState.FACTORY) -> None:

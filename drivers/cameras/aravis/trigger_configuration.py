@@ -1,0 +1,179 @@
+"""Writes what starts an exposure of a head, and the output that reports it.
+
+Source: GenICam SFNC 2.7, chapter 5 "Acquisition control" and chapter 8 "Digital I/O control".
+"""
+
+from __future__ import annotations
+
+import contextlib
+from typing import Final
+
+from drivers.cameras.aravis.feature_access import FeatureError
+from drivers.cameras.aravis.feature_writer import FeatureWriter
+from drivers.cameras.aravis.settings import AravisSettings
+
+FRAME_TRIGGERS: Final = ("FrameStart", "ExposureStart", "FrameTrigger")
+BURST_TRIGGER: Final = "FrameBurstStart"
+BURST_LENGTH: Final = "AcquisitionBurstFrameCount"
+"""Frames of a burst; a burst of one frame is a single frame (SFNC 2.7, section 5.5)."""
+ACQUISITION_TRIGGER: Final = "AcquisitionStart"
+TRIGGER_DELAYS: Final = ("TriggerDelay", "TriggerDelayAbs")
+DEBOUNCERS: Final = ("LineDebouncerTime", "LineDebouncerTimeAbs", "LineDebounceTime")
+
+
+def write_trigger(writer: FeatureWriter, settings: AravisSettings) -> None:
+    """Let a trigger start every single frame, and switch every other trigger off.
+
+    Args:
+        writer: of the head's features.
+        settings: the configured settings.
+    """
+    features = writer.features
+    if not features.is_available("TriggerMode"):
+        writer.refusals.append(
+            "the head has no feature TriggerMode; it cannot be triggered and is of no use here"
+        )
+        return
+    if settings.trigger_source == "software" and features.kind("TriggerSoftware") != "command":
+        writer.refusals.append(
+            'trigger_source is "software"; the head has no command TriggerSoftware, set '
+            'trigger_source = "line"'
+        )
+        return
+    selectors = features.entries("TriggerSelector")
+    frame_trigger = _frame_trigger(writer, selectors)
+    if selectors and frame_trigger is None:
+        return
+    for other in selectors:
+        if other != frame_trigger:
+            with contextlib.suppress(FeatureError):
+                features.set("TriggerSelector", other)
+                if features.text("TriggerMode") == "On":
+                    features.set("TriggerMode", "Off")
+    hint = "choose one that the head has"
+    if frame_trigger is not None:
+        writer.set("trigger_source", "TriggerSelector", frame_trigger, hint)
+    with contextlib.suppress(FeatureError):
+        features.set("TriggerMode", "Off")
+    key, source = {
+        "software": ("trigger_source", "Software"),
+        "line": ("trigger_line", settings.trigger_line),
+        "action": ("trigger_action", settings.trigger_action),
+    }[settings.trigger_source]
+    # Quirk: some heads accept a source only while the trigger is off, others only while it is
+    # on. It is written in both states.
+    # Upstream: no report known (2026-11-23); on the order of features, AravisProject/aravis#560.
+    with contextlib.suppress(FeatureError):
+        features.set("TriggerSource", source)
+    writer.set("trigger_source", "TriggerMode", "On", "the head cannot be triggered")
+    offered = ", ".join(features.entries("TriggerSource")) or "no trigger source"
+    writer.set(key, "TriggerSource", source, f"the head has {offered}")
+    if settings.trigger_source == "line":
+        _write_line(writer, settings)
+    delay = features.first_available(TRIGGER_DELAYS)
+    if delay is not None:
+        writer.set("trigger_delay_us", delay, settings.trigger_delay_us, "choose another delay")
+    elif settings.trigger_delay_us:
+        writer.refusals.append(
+            f"trigger_delay_us is {settings.trigger_delay_us:g}; the head has no trigger delay"
+        )
+    if settings.trigger_source == "action":
+        _write_action(writer, settings)
+
+
+def _frame_trigger(writer: FeatureWriter, selectors: list[str]) -> str | None:
+    """The entry of TriggerSelector that starts a single frame; None if there is none."""
+    features = writer.features
+    found = features.first_entry("TriggerSelector", FRAME_TRIGGERS)
+    if found is not None:
+        return found
+    if selectors == [ACQUISITION_TRIGGER]:
+        # Quirk: the only trigger of Basler scout and pilot starts every single frame.
+        # Upstream: manual: GenICam description of Basler scA1300-32gm, TriggerSelector.
+        return ACQUISITION_TRIGGER
+    if BURST_TRIGGER in selectors and features.is_available(BURST_LENGTH):
+        hint = "the head starts bursts of frames only"
+        is_single = writer.set("trigger_source", BURST_LENGTH, 1, hint)
+        return BURST_TRIGGER if is_single else None
+    if selectors:
+        missing = f" or {BURST_LENGTH}" if BURST_TRIGGER in selectors else ""
+        writer.refusals.append(
+            "the head has no trigger for single frames (TriggerSelector has "
+            f"{', '.join(selectors)}; FrameStart{missing} is needed)"
+        )
+    return None
+
+
+def _write_line(writer: FeatureWriter, settings: AravisSettings) -> None:
+    features = writer.features
+    if features.is_available("TriggerActivation"):
+        writer.set(
+            "trigger_activation",
+            "TriggerActivation",
+            settings.trigger_activation,
+            "choose one that the head has",
+        )
+    elif settings.trigger_activation != "RisingEdge":
+        writer.refusals.append(
+            f"trigger_activation is {settings.trigger_activation!r}; the head triggers on its "
+            "own edge only"
+        )
+    if settings.debounce_us:
+        if settings.trigger_line in features.entries("LineSelector"):
+            with contextlib.suppress(FeatureError):
+                features.set("LineSelector", settings.trigger_line)
+        name = features.first_available(DEBOUNCERS)
+        if name is None:
+            writer.refusals.append(
+                f"debounce_us is {settings.debounce_us:g}; the head has no debouncer"
+            )
+        else:
+            writer.set("debounce_us", name, settings.debounce_us, "choose another time")
+
+
+def _write_action(writer: FeatureWriter, settings: AravisSettings) -> None:
+    """Write keys and mask of action commands; a head may have several action signals."""
+    features = writer.features
+    number = "".join(c for c in settings.trigger_action if c.isdigit())
+    if features.is_available("ActionSelector") and number:
+        writer.set(
+            "trigger_action",
+            "ActionSelector",
+            int(number),
+            "choose an action signal the head has",
+        )
+    for key, name in (
+        ("action_device_key", "ActionDeviceKey"),
+        ("action_group_key", "ActionGroupKey"),
+        ("action_group_mask", "ActionGroupMask"),
+    ):
+        # Quirk: heads do not return their keys, so they are not read back.
+        # Upstream: manual: GenICam SFNC 2.7, ActionDeviceKey.
+        value = int(getattr(settings, key))
+        writer.attempt(
+            f"{key} = {value!r}",
+            "the head accepts no action commands",
+            # mypy infers no type for the default of a parameter of a lambda.
+            lambda name=name, value=value: features.write_only(name, value),  # type: ignore[misc]
+        )
+
+
+def write_strobe(writer: FeatureWriter, settings: AravisSettings) -> None:
+    """Let an output be active during the exposure, if one is configured.
+
+    Args:
+        writer: of the head's features.
+        settings: the configured settings.
+    """
+    line = settings.strobe_line
+    if not line:
+        return
+    features = writer.features
+    if not features.entries("LineSelector"):
+        writer.refusals.append(f"strobe_line is {line!r}; the head has no LineSelector")
+        return
+    hint = "the head has " + ", ".join(features.entries("LineSelector"))
+    writer.set("strobe_line", "LineSelector", line, hint)
+    if "Output" in features.entries("LineMode"):
+        writer.set("strobe_line", "LineMode", "Output", "choose a line that is an output")
+    writer.set("strobe_line", "LineSource", "ExposureActive", "choose another line")
