@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.cameras.aravis.aravis_head import AravisHead
-from drivers.contract import CHUNK_ALLOWANCE_NBYTES, Frame, LifeCycle, Record
+from drivers.contract import CHUNK_ALLOWANCE_NBYTES, DeviceEvent, Frame, LifeCycle, Record
 from sim_hw.gige.genicam.power_on_state import SENSOR_HEIGHT_PX, SENSOR_WIDTH_PX
 
 WITHIN_S: Final = 30.0
@@ -30,12 +30,16 @@ class Memory:
         return int(self.slots[slot].ctypes.data)
 
 
-def first_frame(driver: AravisHead, memory: Memory) -> tuple[Frame, NDArray[np.uint16]]:
-    """Run the driver until one triggered frame has come."""
+def first_frame(
+    driver: AravisHead, memory: Memory, *, events: list[DeviceEvent] | None = None
+) -> tuple[Frame, NDArray[np.uint16]]:
+    """Run the driver until one triggered frame has come; its events are added to `events`."""
     frames: list[tuple[Frame, NDArray[np.uint16]]] = []
     arrived = threading.Event()
 
     def sink(record: Record) -> None:
+        if isinstance(record, DeviceEvent) and events is not None:
+            events.append(record)
         if isinstance(record, Frame) and not frames:
             pixels = memory.slots[record.slot, : 2 * record.width_px * record.height_px]
             image = pixels.view(np.uint16).reshape(record.height_px, record.width_px).copy()

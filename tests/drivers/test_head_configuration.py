@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from drivers.cameras.aravis.aravis_head import AravisHead
-from drivers.contract import DeviceError
+from drivers.contract import DeviceError, DeviceEvent, FrameStatus
 from sim_hw.gige.described_head import DescribedHead
 from sim_hw.gige.genicam.power_on_state import InitialState
 from tests.drivers.described_frames import Memory, first_frame
@@ -101,6 +101,27 @@ def test_words_of_either_byte_order(byte_order: str) -> None:
         _, pixels = first_frame(driver, memory)
         assert emulated.last_image is not None
         assert np.array_equal(pixels, emulated.last_image)
+
+
+@pytest.mark.parametrize("byte_order", ["little", "big"])
+def test_words_of_the_other_byte_order_are_reported_and_not_used(byte_order: str) -> None:
+    other = "big" if byte_order == "little" else "little"
+    with camera(big_endian_words=byte_order == "little", byte_order=byte_order) as (
+        _,
+        driver,
+        memory,
+    ):
+        events: list[DeviceEvent] = []
+        driver.bind()
+        frame, _ = first_frame(driver, memory, events=events)
+        statistics = driver.statistics()
+    assert frame.status is FrameStatus.CORRUPT
+    assert statistics["frames_swapped"] == statistics["corrupt_byte_order"] >= 1
+    assert statistics.get("frames", 0) == 0
+    (event,) = [event for event in events if event.name == "byte-order"]
+    assert event.is_fault
+    assert f'byte_order is "{byte_order}"' in event.sentence
+    assert f'Set byte_order = "{other}".' in event.sentence
 
 
 def test_features_are_written_in_addition() -> None:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import ClassVar, Final
 
 from drivers import DriverError
+from drivers.cameras.aravis.byte_order import swapped_sentence
 from drivers.cameras.aravis.camera import AravisCamera, ClockLatch, ControlDeniedError
 from drivers.cameras.aravis.frame_record import frame_record, frame_status
 from drivers.cameras.aravis.gvcp import (
@@ -402,13 +403,15 @@ class AravisHead(AravisSettings, HeadDevice):
             self.counters[f"buffers_{reason}"] += 1
             session.stream.queue_slot(received.slot)
             return
+        if status is not FrameStatus.CORRUPT:
+            session.stream.unpack(received.slot)
+        if status is FrameStatus.COMPLETE and session.stream.is_swapped(received.slot):
+            status, reason = FrameStatus.CORRUPT, "byte_order"
         if status is FrameStatus.COMPLETE:
             self.counters["frames"] += 1
         else:
             self.counters[f"frames_{status.value}"] += 1
             self.counters[f"{status.value}_{reason}"] += 1
-        if status is not FrameStatus.CORRUPT:
-            session.stream.unpack(received.slot)
         self._mark_in_use(received.slot)
         sink(
             frame_record(
@@ -469,6 +472,10 @@ class AravisHead(AravisSettings, HeadDevice):
             self._report_other_senders(session, now["other_senders"])
         if now["chunks_unreadable"] > before["chunks_unreadable"]:
             self.emitter.emit_throttled("chunks-unreadable", unreadable_chunks_sentence(self.name))
+        if now["frames_swapped"] > before["frames_swapped"]:
+            self.emitter.emit_throttled(
+                "byte-order", swapped_sentence(self.name, str(self.byte_order))
+            )
         if session.stream.restart_if_behind():
             self.emitter.emit_throttled(
                 "stream-restarted",

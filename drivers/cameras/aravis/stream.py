@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+from drivers.cameras.aravis.byte_order import bits_of, is_swapped
 from drivers.cameras.aravis.camera import AravisCamera
 from drivers.cameras.aravis.library import aravis, aravis_error
 from drivers.cameras.aravis.packet_filter import (
@@ -98,6 +99,7 @@ class FrameStream:
         geometry = camera.geometry
         pixel_count = geometry.width_px * geometry.height_px
         self._packing, self._pixel_count = geometry.packing, pixel_count
+        self._width_px, self._bits = geometry.width_px, bits_of(geometry.pixel_format)
         needed = max(nbytes, 2 * pixel_count)
         if memory.slot_nbytes < needed:
             raise DeviceError(
@@ -132,6 +134,7 @@ class FrameStream:
         self._ignored = 0
         self._restarts = 0
         self._chunks_unreadable = 0
+        self._swapped = 0
         if camera.raw.is_gv_device():
             self._filter_to_head(camera, settings)
             self._tune(settings)
@@ -184,6 +187,22 @@ class FrameStream:
             self._chunks_unreadable += 1
         return received
 
+    def is_swapped(self, slot: int) -> bool:
+        """Whether the words of a complete frame came in the other byte order; after `unpack`.
+
+        Args:
+            slot: number of the slot.
+
+        Returns:
+            True if their values show it; it is counted.
+        """
+        if self._packing not in (Packing.WORDS, Packing.WORDS_BIG_ENDIAN):
+            return False
+        words = words_at(self._memory.address(slot), self._pixel_count)
+        found = is_swapped(words.reshape(-1, self._width_px), self._bits)
+        self._swapped += found
+        return found
+
     def unpack(self, slot: int) -> None:
         """Convert the received pixels of a slot to right-justified 16-bit words; after `pop`.
 
@@ -202,8 +221,9 @@ class FrameStream:
         Returns:
             Counts by the names of STATISTIC_NAMES; also `underruns` in frames, `stream_restarts`,
             `chunks_unreadable`, complete frames whose chunk data could not be read,
-            `other_senders`, dropped datagrams of other senders, and `kernel_drops`, datagrams of
-            the head that found the buffer of the socket full.
+            `frames_swapped`, whose bytes came in the other order, `other_senders`, dropped datagrams
+            of other senders, and `kernel_drops`, datagrams of the head that found the buffer of the
+            socket full.
         """
         found: Counter[str] = Counter()
         for theirs, ours in STATISTIC_NAMES.items():
@@ -211,6 +231,7 @@ class FrameStream:
         found["underruns"] = -(-found["underrun_packets"] // self._packets_per_frame)
         found["stream_restarts"] = self._restarts
         found["chunks_unreadable"] = self._chunks_unreadable
+        found["frames_swapped"] = self._swapped
         if self._senders is not None:
             found["other_senders"] = self._senders.poll(found["received_packets"])
             found["kernel_drops"] = self._senders.kernel_drops()
