@@ -74,6 +74,10 @@ _CAPTURE: Final[Mapping[Flag, tuple[Verdict, str]]] = {
         Verdict.USABLE,
         "The clock coasts without marks or pulse per second; check the cables of the receiver.",
     ),
+    Flag.PTP_FAULT: (
+        Verdict.GOOD,
+        "The clock of a head lost its PTP master, or contradicts the receiver; check the grandmaster.",
+    ),
     Flag.DC_DISAGREEMENT: (
         Verdict.USABLE,
         "Probes and stitching disagree on the temperature; check the probes after landing.",

@@ -49,6 +49,7 @@ class Flag(enum.IntFlag):
     FRAME_AMBIGUOUS = 1 << 29
     NOT_MIRRORED = 1 << 30
     UNCALIBRATED = 1 << 31
+    PTP_FAULT = 1 << 32
 
 
 NO_FLAGS: Final = Flag(0)

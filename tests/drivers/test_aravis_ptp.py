@@ -112,7 +112,7 @@ def by_ptp(head: Head, *, utc_is_served: bool) -> tuple[PtpInstant | None, list[
     def gps_ns(mono_ns: int) -> int:
         return mono_ns + realtime_ns + gps_of_realtime_ns * NS
 
-    ptp = PtpTime()
+    ptp, now_ns = PtpTime(), head.readings[-1].mono_ns
     for reading in [r for r in head.readings if r.status == "Slave"][-5:]:
         ptp.read(reading)
     for frame in head.frames:
@@ -120,8 +120,10 @@ def by_ptp(head: Head, *, utc_is_served: bool) -> tuple[PtpInstant | None, list[
         assert frame.device_clock_mono_ns is not None
         assert frame.latch_sigma_ns is not None
         reference = GpsEstimate(gps_ns(frame.device_clock_mono_ns), 1_000, False)
-        ptp.compare_latch("SU00", frame.device_clock_ns, reference, frame.latch_sigma_ns)
-    last, now_ns = head.frames[-1], head.readings[-1].mono_ns
+        ptp.compare_latch(
+            "SU00", frame.device_clock_ns, reference, frame.latch_sigma_ns, mono_ns=now_ns
+        )
+    last = head.frames[-1]
     assert last.device_ns is not None
     found = ptp.at("SU00", last.device_ns, now_ns)
     faults = [event.name for event in ptp.events(now_ns) if event.is_fault]

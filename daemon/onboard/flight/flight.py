@@ -188,7 +188,9 @@ class Flight:
             reading = ClockReading(frame.head, at_ns, mono_ns, frame.latch_sigma_ns)
             self.device_clocks.read(reading)
             latched = self.clock.gps_at(mono_ns)
-            self.ptp.compare_latch(frame.head, at_ns, latched, frame.latch_sigma_ns)
+            self.ptp.compare_latch(
+                frame.head, at_ns, latched, frame.latch_sigma_ns, mono_ns=mono_ns
+            )
 
     def _mark(self, mark: EventMark) -> Cause:
         cause = self._matcher.mark(mark).cause
@@ -461,6 +463,8 @@ class Flight:
         ptp = ptp_instant_of(self.rig, starts, pulse, self.ptp, now_ns)
         if mark is not None:
             compare_ptp(self.rig, starts, pulse, mark, self.ptp)
+        heads = [head for head, _ in starts]
+        suspect = Flag.PTP_FAULT if self.ptp.is_suspect(heads, now_ns) else NO_FLAG
         record = build_record(
             self.rig,
             stored,
@@ -468,7 +472,7 @@ class Flight:
             instant_of(mark, pulse, self.clock, ptp),
             self.track,
             self.temperatures,
-            exposure.reported_flags,
+            exposure.reported_flags | suspect,
         )
         return replace(record, disks=exposure.disks)
 

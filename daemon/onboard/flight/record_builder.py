@@ -125,7 +125,7 @@ def compare_ptp(
         if device_ns is not None:
             start_ns = mark.gps_ns - strobe_from_start_ns(rig, head, pulse)
             sigma_ns = math.hypot(mark.accuracy_ns, pulse.spread_ns)
-            ptp.compare(head, device_ns, start_ns, sigma_ns)
+            ptp.compare(head, device_ns, start_ns, sigma_ns, mono_ns=pulse.mono_ns)
 
 
 def strobe_from_start_ns(rig: Rig, head: str, pulse: FiredPulse) -> int:

@@ -63,7 +63,9 @@ def seal_from_log(rig: Rig) -> Complete:
         starts = [(frame.sensor, frame.device_ns) for frame in capture.frames]
         by_ptp = ptp_instant_of(rig, starts, pulse, ptp, now_ns)
         instant = instant_of(matcher.mark_of(capture.number), pulse, clock, by_ptp)
-        return build_record(rig, capture, pulse, instant, track, temperatures, Flag(0))
+        heads = [head for head, _ in starts]
+        suspect = Flag.PTP_FAULT if ptp.is_suspect(heads, now_ns) else Flag(0)
+        return build_record(rig, capture, pulse, instant, track, temperatures, suspect)
 
     return complete
 
@@ -75,7 +77,7 @@ def _compare_latch(frame: Frame, ptp: PtpTime, clock: GpsClock) -> None:
         frame.latch_sigma_ns,
     )
     if at_ns is not None and mono_ns is not None and sigma_ns is not None:
-        ptp.compare_latch(frame.head, at_ns, clock.gps_at(mono_ns), sigma_ns)
+        ptp.compare_latch(frame.head, at_ns, clock.gps_at(mono_ns), sigma_ns, mono_ns=mono_ns)
 
 
 def pulse_of(logged: LoggedTrigger) -> FiredPulse:

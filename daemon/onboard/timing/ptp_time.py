@@ -76,8 +76,13 @@ class _HeadState:
     """The name of the fault by comparison with the receiver; empty while they agree."""
     disagreement_ns: int = 0
     latched_ns: int | None = None
+    since_ns: int = 0
+    """The host's time of the reading with which the present synchronisation began."""
+    has_new_master: bool = False
+    """The grandmaster changed, and its time has not agreed with the receiver since."""
 
-    def restart(self) -> None:
+    def restart(self, mono_ns: int) -> None:
+        self.since_ns = mono_ns
         self.offsets.clear()
         self.residuals.clear()
         self.disagreement = ""
@@ -98,6 +103,7 @@ class PtpTime:
         changed = reading.grandmaster != state.grandmaster
         if reading.status == "Slave" and changed:
             if state.grandmaster:
+                state.has_new_master = True
                 self.counts["ptp-grandmaster-changed"] += 1
                 self._events.append(
                     ClockEvent(
@@ -110,9 +116,9 @@ class PtpTime:
                     )
                 )
             state.grandmaster = reading.grandmaster
-            state.restart()
+            state.restart(reading.mono_ns)
         if reading.status != "Slave" or reading.offset_ns is None:
-            state.restart()
+            state.restart(reading.mono_ns)
         elif abs(reading.offset_ns) > OFFSET_LIMIT_NS:
             state.offsets.clear()
         else:
@@ -120,7 +126,14 @@ class PtpTime:
         self._judge(reading.device, state, reading.mono_ns)
 
     def compare(
-        self, head: str, tai_ns: int, reference_ns: int, sigma_ns: float, *, is_coarse: bool = False
+        self,
+        head: str,
+        tai_ns: int,
+        reference_ns: int,
+        sigma_ns: float,
+        *,
+        mono_ns: int,
+        is_coarse: bool = False,
     ) -> None:
         """Compare a head's clock with the receiver's time of the same instant.
 
@@ -129,10 +142,12 @@ class PtpTime:
             tai_ns: what the head's clock showed.
             reference_ns: GPS time of the receiver at that instant.
             sigma_ns: standard deviation of the difference, without that of the head's clock.
+            mono_ns: that instant on the host's clock. One before the head's present synchronisation
+                proves nothing of it.
             is_coarse: only navigation messages are known: large errors show, agreement does not.
         """
         state = self._heads.get(head)
-        if state is None or state.last is None:
+        if state is None or state.last is None or mono_ns < state.since_ns:
             return
         difference_ns = gps_ns_of_tai(tai_ns) - reference_ns
         tolerance_ns = OFFSET_LIMIT_NS + SIGMAS * sigma_ns
@@ -145,18 +160,27 @@ class PtpTime:
             state.residuals.clear()
         elif not is_coarse:
             state.residuals.append((difference_ns, max(sigma_ns, 1.0)))
+            if len(state.residuals) >= RESIDUALS_MIN:
+                state.has_new_master = False
         self._judge(head, state, state.last.mono_ns)
 
     def compare_latch(
-        self, head: str, tai_ns: int, reference: GpsEstimate | None, half_width_ns: int
+        self,
+        head: str,
+        tai_ns: int,
+        reference: GpsEstimate | None,
+        half_width_ns: int,
+        *,
+        mono_ns: int,
     ) -> None:
-        """Compare a latch of a head's clock with the host's estimate of GPS time."""
+        """Compare a latch of a head's clock at `mono_ns` with the host's estimate of GPS time."""
         state = self._heads.get(head)
         if state is None or reference is None or tai_ns == state.latched_ns:
             return
         state.latched_ns = tai_ns
         sigma_ns = math.hypot(reference.sigma_ns, half_width_ns)
-        self.compare(head, tai_ns, reference.gps_ns, sigma_ns, is_coarse=reference.is_coarse)
+        is_coarse = reference.is_coarse
+        self.compare(head, tai_ns, reference.gps_ns, sigma_ns, mono_ns=mono_ns, is_coarse=is_coarse)
 
     def at(self, head: str, tai_ns: int, mono_ns: int) -> PtpInstant | None:
         """GPS time of an instant on a head's clock; None while it may not be used.
@@ -178,6 +202,16 @@ class PtpTime:
         common_ns = math.hypot(middle_ns, reference_ns / math.sqrt(len(state.residuals)))
         sigma_ns = math.ceil(max(SIGMA_MIN_NS, math.hypot(spread_ns, common_ns)))
         return PtpInstant(gps_ns_of_tai(tai_ns), sigma_ns)
+
+    def is_suspect(self, heads: Iterable[str], mono_ns: int) -> bool:
+        """Whether the PTP time of one of these heads may not be used: a fault, or a new master.
+
+        Args:
+            heads: names of heads; those without PTP are passed over.
+            mono_ns: now, on the host's clock.
+        """
+        states = [self._heads[head] for head in heads if head in self._heads]
+        return any(self._fault_of(state, mono_ns) or state.has_new_master for state in states)
 
     def events(self, mono_ns: int) -> list[ClockEvent]:
         """Events since the last call."""

@@ -166,6 +166,7 @@ def test_bits_keep_their_places_for_ever() -> None:
         *("CALIBRATION_EXPIRED", "UNDEREXPOSED", "OVEREXPOSED", "BLUR", "TILT", "DRIFT"),
         *("OVERLAP", "GNSS", "DISK_LOW", "PROCESSING_BEHIND", "SIMULATED", "NOT_PROCESSED"),
         *("TIME_HOLDOVER", "SUN", "GSD", "FRAME_AMBIGUOUS", "NOT_MIRRORED", "UNCALIBRATED"),
+        "PTP_FAULT",
     ]
     assert {name: int(Flag[name]) for name in names} == {
         name: 1 << bit for bit, name in enumerate(names)

@@ -458,13 +458,16 @@ def ptp_frame(given: FiredPulse, *, error_ns: int = 0) -> Frame:
     )
 
 
-def fly_with_ptp(error_ns: int) -> tuple[Exposure, list[str]]:
+def fly_with_ptp(
+    error_ns: int, *, last_status: str = "Slave", last_master: str = MASTER
+) -> tuple[Exposure, list[str]]:
     """Four exposures with marks and one without; it is returned, with the faults."""
     flying, faults = flight(has_pps=False), list[str]()
     for number in range(1, 6):
         t_s = 2.0 * (number - 1)
         now_ns = round((t_s + 1) * NS)
-        flying.take(PtpReading("G", round(t_s * NS), "Slave", 400, MASTER))
+        status, master = (last_status, last_master) if number == 5 else ("Slave", MASTER)
+        flying.take(PtpReading("G", round(t_s * NS), status, 400, master))
         flying.order(round(t_s * NS))
         given = pulse(number, t_s)
         flying.fired(given)
@@ -497,6 +500,25 @@ def test_a_lost_mark_is_timed_by_a_head_that_ptp_synchronises() -> None:
     green = exposure.frame("G")
     assert green is not None and green.time_source == "ptp"
     assert "ptp" in exposure.time_budget_ns
+
+
+@pytest.mark.parametrize(
+    ("error_ns", "last", "is_flagged"),
+    [
+        (300, {}, False),
+        (-37 * NS, {}, True),
+        (300, {"last_status": "Listening"}, True),
+        (300, {"last_master": "ffffffffffffffff"}, True),
+    ],
+    ids=["synchronised", "utc", "no-master", "other-master"],
+)
+def test_a_fault_of_ptp_is_a_flag_of_the_exposure(
+    error_ns: int, last: dict[str, str], is_flagged: bool
+) -> None:
+    exposure, faults = fly_with_ptp(error_ns, **last)
+    assert bool(Flag(exposure.flags) & Flag.PTP_FAULT) == is_flagged
+    assert bool(faults) == is_flagged
+    assert (exposure.mark_source == "ptp") != is_flagged
 
 
 @pytest.mark.parametrize(("seconds", "name"), [(-37, "ptp-utc"), (-19, "ptp-gps")])

@@ -34,7 +34,7 @@ def latched(
 ) -> None:
     mono_ns = round(second * NS)
     estimate = GpsEstimate(GPS_NS + mono_ns, sigma_ns, is_coarse)
-    ptp.compare_latch("SU00", TAI_NS + mono_ns + error_ns, estimate, 40_000)
+    ptp.compare_latch("SU00", TAI_NS + mono_ns + error_ns, estimate, 40_000, mono_ns=mono_ns)
 
 
 def synchronised(seconds: int = 6, *, error_ns: int = 0, is_coarse: bool = False) -> PtpTime:
@@ -154,12 +154,34 @@ def test_another_grandmaster_has_to_agree_with_the_receiver_first() -> None:
     assert event.name == "ptp-grandmaster-changed"
     assert OTHER in event.sentence
     assert MASTER in event.sentence
+    assert ptp.is_suspect(["SU00"], 6 * NS) and not ptp.is_suspect(["other"], 6 * NS)
     for second in (7, 8, 9):
         ptp.read(reading(second, master=OTHER))
         latched(ptp, second, error_ns=-37 * NS)
     assert instant(ptp, 9) is None
     assert faults(ptp, 9) == ["ptp-utc"]
+    for second in (10, 11):
+        ptp.read(reading(second, master=OTHER))
+        latched(ptp, second)
+        assert ptp.is_suspect(["SU00"], second * NS)
+    ptp.read(reading(12, master=OTHER))
+    latched(ptp, 12)
+    assert not ptp.is_suspect(["SU00"], 12 * NS)
     assert ptp.counts["ptp-grandmaster-changed"] == 1
+
+
+def test_what_was_stamped_before_the_master_changed_proves_nothing_of_the_new_one() -> None:
+    ptp = synchronised()
+    for second in (6, 7, 8):
+        ptp.read(reading(second, master=OTHER))
+    for earlier in (5.1, 5.3, 5.5, 5.999):
+        latched(ptp, earlier)
+    assert instant(ptp, 8) is None
+    assert ptp.is_suspect(["SU00"], 8 * NS)
+    for later in (6.0, 7.0, 8.0):
+        latched(ptp, later)
+    assert instant(ptp, 8) is not None
+    assert not ptp.is_suspect(["SU00"], 8 * NS)
 
 
 @pytest.mark.parametrize("offset_ns", [OFFSET_LIMIT_NS + 1, -OFFSET_LIMIT_NS - 1, None])
