@@ -71,8 +71,8 @@ def demo(
     receiver: Annotated[
         str,
         typer.Option(
-            help="Receiver: ublox, novatel, septentrio, nmea, sbg, vectornav, xsens, applanix, gsof "
-            "or mavlink."
+            help="Receiver: ublox, novatel, septentrio, nmea, sbg, vectornav, xsens, applanix, "
+            "gsof or mavlink."
         ),
     ] = "ublox",
     seed: Annotated[int, typer.Option(help="Seed for all random generators.")] = 1,

@@ -101,8 +101,8 @@ def sim(
     receiver: Annotated[
         str,
         typer.Option(
-            help="Receiver: ublox, novatel, septentrio, nmea, sbg, vectornav, xsens, applanix, gsof "
-            "or mavlink."
+            help="Receiver: ublox, novatel, septentrio, nmea, sbg, vectornav, xsens, applanix, "
+            "gsof or mavlink."
         ),
     ] = "ublox",
     probe: Annotated[str, typer.Option(help="Thermometer: modbus or ascii.")] = "modbus",

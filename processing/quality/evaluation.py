@@ -76,7 +76,8 @@ _CAPTURE: Final[Mapping[Flag, tuple[Verdict, str]]] = {
     ),
     Flag.PTP_FAULT: (
         Verdict.GOOD,
-        "The clock of a head lost its PTP master, or contradicts the receiver; check the grandmaster.",
+        "The clock of a head lost its PTP master, or contradicts the receiver; check the "
+        "grandmaster.",
     ),
     Flag.DC_DISAGREEMENT: (
         Verdict.USABLE,

@@ -70,7 +70,7 @@ MARKS_WITHIN_NS = {
     "applanix": 1,
     "gsof": 1,
 }
-"""The resolution of each protocol: NMEA and the time stamps of SBG resolve microseconds, Xsens 0.1 ms."""
+"""The resolution of each protocol: NMEA and SBG resolve microseconds, Xsens 0.1 ms."""
 PLACE_WITHIN_M = {
     "ublox": 0.02, "novatel": 1e-3, "septentrio": 1e-3, "nmea": 0.06, "sbg": 1e-3,
     "vectornav": 1e-3,

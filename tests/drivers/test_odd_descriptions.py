@@ -33,13 +33,16 @@ pytestmark = pytest.mark.timeout(120)
 ADDRESS = f"127.{1 + os.getpid() % 250}.82.1"
 TEXT = DESCRIPTION.decode("utf-8")
 BURST_LENGTH = """
- <Integer Name="AcquisitionBurstFrameCount"><pValue>BurstReg</pValue><Min>{lowest}</Min><Max>100</Max></Integer>
- <IntReg Name="BurstReg"><Address>0x10060</Address><Length>4</Length><AccessMode>{access}</AccessMode>
-  <pPort>Device</pPort><Endianess>BigEndian</Endianess></IntReg>
+ <Integer Name="AcquisitionBurstFrameCount"><pValue>BurstReg</pValue>
+  <Min>{lowest}</Min><Max>100</Max></Integer>
+ <IntReg Name="BurstReg"><Address>0x10060</Address><Length>4</Length>
+  <AccessMode>{access}</AccessMode><pPort>Device</pPort><Endianess>BigEndian</Endianess></IntReg>
 """
 LOOP = """
- <IntSwissKnife Name="LoopA"><pVariable Name="B">LoopB</pVariable><Formula>B</Formula></IntSwissKnife>
- <IntSwissKnife Name="LoopB"><pVariable Name="A">LoopA</pVariable><Formula>A</Formula></IntSwissKnife>
+ <IntSwissKnife Name="LoopA"><pVariable Name="B">LoopB</pVariable>
+  <Formula>B</Formula></IntSwissKnife>
+ <IntSwissKnife Name="LoopB"><pVariable Name="A">LoopA</pVariable>
+  <Formula>A</Formula></IntSwissKnife>
 """
 
 
@@ -113,7 +116,8 @@ def refusal_of(text: str | bytes, **settings: object) -> str:
         with_nodes(LOOP, text=TEXT.replace(
             '<Integer Name="OffsetX">', '<Integer Name="OffsetX"><pIsLocked>LoopA</pIsLocked>')),
     ],
-    ids=["burst", "burst-of-one", "zip", "stored", "trailing", "comment", "latin-1", "cycle-elsewhere"],
+    ids=["burst", "burst-of-one", "zip", "stored", "trailing", "comment", "latin-1",
+         "cycle-elsewhere"],
 )  # fmt: skip
 def test_it_is_armed_and_sends_the_pattern(text: str | bytes) -> None:
     with head(text) as (emulated, driver, memory):
@@ -130,9 +134,10 @@ def test_it_is_armed_and_sends_the_pattern(text: str | bytes) -> None:
 def test_a_mode_of_exposure_in_the_makers_own_words_is_kept() -> None:
     nodes = """
      <Enumeration Name="ExposureMode"><EnumEntry Name="TriggerWidth"><Value>0</Value></EnumEntry>
-      <EnumEntry Name="{own}"><Value>1</Value></EnumEntry><pValue>ModeOfExposure</pValue></Enumeration>
-     <IntReg Name="ModeOfExposure"><Address>0x10064</Address><Length>4</Length><AccessMode>RW</AccessMode>
-      <pPort>Device</pPort><Endianess>BigEndian</Endianess></IntReg>"""
+      <EnumEntry Name="{own}"><Value>1</Value></EnumEntry>
+      <pValue>ModeOfExposure</pValue></Enumeration>
+     <IntReg Name="ModeOfExposure"><Address>0x10064</Address><Length>4</Length>
+      <AccessMode>RW</AccessMode><pPort>Device</pPort><Endianess>BigEndian</Endianess></IntReg>"""
     with head(with_nodes(nodes.format(own="EdgePreSelect"), "ExposureMode")) as (
         emulated,
         driver,

@@ -26,8 +26,8 @@ def is_swapped(image: NDArray[np.uint16], bits: int) -> bool:
     """Whether swapping the bytes of an image makes a picture of it.
 
     Below 16 bits the wrong order shows in values that the format does not have. With 16 bits,
-    neighbouring pixels differ more in the wrong order than in the right one, since the lower byte is
-    the rougher one. An image whose lower or upper byte is the same everywhere decides nothing.
+    neighbouring pixels differ more in the wrong order than in the right one, since the lower byte
+    is the rougher one. An image whose lower or upper byte is the same everywhere decides nothing.
 
     Args:
         image: pixels as they were read, shape (rows, columns).

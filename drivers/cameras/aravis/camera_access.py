@@ -109,4 +109,7 @@ def unreadable_description(head_name: str, reason: str) -> str:
     Returns:
         A sentence with the remedy.
     """
-    return f"{head_name}: the head's GenICam description cannot be read ({reason}); update its firmware"
+    return (
+        f"{head_name}: the head's GenICam description cannot be read ({reason}); update its "
+        "firmware"
+    )

@@ -221,8 +221,8 @@ class FrameStream:
         Returns:
             Counts by the names of STATISTIC_NAMES; also `underruns` in frames, `stream_restarts`,
             `chunks_unreadable`, complete frames whose chunk data could not be read,
-            `frames_swapped`, whose bytes came in the other order, `other_senders`, dropped datagrams
-            of other senders, and `kernel_drops`, datagrams of the head that found the buffer of the
+            `frames_swapped`, whose bytes came in the other order, `other_senders`, dropped
+            datagrams of other senders, and `kernel_drops`, datagrams of the head that found the buffer of the
             socket full.
         """
         found: Counter[str] = Counter()

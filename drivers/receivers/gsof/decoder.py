@@ -25,7 +25,7 @@ VELOCITY_VALID, TRACK_VALID = 1 << 0, 1 << 2
 TIME_VALID, UTC_OFFSET_VALID = 1 << 0, 1 << 1
 """Bits of the current time flags."""
 LEVELLED: Final = 2
-"""IMU alignment status from which on roll and pitch are given: degraded, aligned, full navigation."""
+"""IMU alignment status from which on roll and pitch are given: degraded."""
 ALIGNED: Final = 3
 """Status from which on the heading is given."""
 NO_FIX, DEAD_RECKONING, MANUAL_INPUT = 0, 6, 7

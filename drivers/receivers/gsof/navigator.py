@@ -15,8 +15,8 @@ from drivers.receivers.streaming_navigator import StreamingNavigator
 class GsofNavigator(StreamingNavigator):
     """A Trimble receiver (BD, BX, R, SPS, Alloy) or an Applanix board (AP+, APX) that sends GSOF.
 
-    Yields a NavSample for every transmission with records 49, or 1 and 2, and an EventMark for every
-    record 51.
+    Yields a NavSample for every transmission with record 49, or with 1 and 2, and an EventMark
+    for every record 51.
 
     Source: Trimble OEM GNSS receiver help, "GSOF messages: overview".
     """

@@ -110,7 +110,7 @@ def read_description(data: bytes) -> Description:
 
 
 def _root_of(xml: bytes) -> ElementTree.Element:
-    """The root; bytes that are no UTF-8 are read as Windows-1252, which some makers' editors write."""
+    """The root; bytes that are no UTF-8 are read as Windows-1252, as some editors write."""
     try:
         return ElementTree.fromstring(xml)
     except ElementTree.ParseError:
