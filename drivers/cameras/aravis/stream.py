@@ -222,8 +222,8 @@ class FrameStream:
             Counts by the names of STATISTIC_NAMES; also `underruns` in frames, `stream_restarts`,
             `chunks_unreadable`, complete frames whose chunk data could not be read,
             `frames_swapped`, whose bytes came in the other order, `other_senders`, dropped
-            datagrams of other senders, and `kernel_drops`, datagrams of the head that found the buffer of the
-            socket full.
+            datagrams of other senders, and `kernel_drops`, datagrams of the head that found the
+            buffer of the socket full.
         """
         found: Counter[str] = Counter()
         for theirs, ours in STATISTIC_NAMES.items():
