@@ -200,6 +200,20 @@ def test_a_gain_that_is_fixed_is_refused_with_its_value_and_accepted_at_it() -> 
         driver.bind()
 
 
+@pytest.mark.parametrize(
+    ("feature", "value", "link"),
+    [
+        ("GevLinkSpeed", 100, "100 Mbit/s"),
+        ("DeviceLinkSpeed", 125_000_000, "1000 Mbit/s"),
+        ("GevLinkSpeed", 0, ""),
+    ],
+)
+def test_the_rate_of_its_own_link_is_reported(feature: str, value: int, link: str) -> None:
+    node = f'<Integer Name="{feature}"><Value>{value}</Value></Integer>'
+    with head(with_nodes(node, feature)) as (_, driver, _memory):
+        assert driver.bind()["link"] == link
+
+
 @needs_descriptions
 def test_no_real_description_refers_to_itself() -> None:
     endless = {

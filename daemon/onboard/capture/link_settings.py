@@ -194,6 +194,28 @@ def plan_as_json(plan: LinkPlan) -> dict[str, Any]:
     }
 
 
+def head_link_problem(
+    configuration: Configuration, head: str, found: Mapping[str, str]
+) -> str | None:
+    """A sentence if a head's own link is slower than its link budget assumes.
+
+    Args:
+        configuration: the service's configuration.
+        head: name of the head.
+        found: what its driver reports; `link` is the rate that the head reports, such as
+            "100 Mbit/s".
+    """
+    reported, _, unit = found.get("link", "").partition(" ")
+    assumed_mbps = configuration.network.head_link_mbps
+    if unit != "Mbit/s" or float(reported) >= assumed_mbps:
+        return None
+    return (
+        f"head {head} is connected at {reported} Mbit/s, and its link budget assumes "
+        f"{assumed_mbps:g} Mbit/s; check its cable and the port of the switch, or set "
+        f"network.head_link_mbps = {reported}"
+    )
+
+
 def _fitting_sentence(plan: LinkPlan) -> str:
     rate = plan.link.rate_bytes_per_s / BYTES_PER_S_OF_MBPS
     return (

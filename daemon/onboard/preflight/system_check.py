@@ -18,6 +18,7 @@ from daemon import DaemonError
 from daemon.configuration.model import Configuration
 from daemon.onboard.capture.device_states import DeviceStates
 from daemon.onboard.capture.devices import bound_problem, device_specs
+from daemon.onboard.capture.link_settings import head_link_problem
 from daemon.onboard.flight.flight import Flight
 from daemon.onboard.flight.flight_identity import FlightIdentity
 from daemon.onboard.flight.ledger import Ledger
@@ -276,6 +277,7 @@ class SystemCheck:
         found = self._bound.get(spec.name)
         if found is not None:
             problem = bound_problem(self._rig, spec.kind, spec.name, found)
+            problem = problem or head_link_problem(self._configuration, spec.name, found)
             if problem is not None:
                 return failed(spec.kind, spec.name, problem, is_blocking=True)
             properties = {"driver": spec.driver, **found}

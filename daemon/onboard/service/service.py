@@ -24,6 +24,7 @@ from daemon.mission.verification import recovery
 from daemon.onboard.capture.device_states import DeviceStates
 from daemon.onboard.capture.devices import bound_problem
 from daemon.onboard.capture.exposure_controller import ExposureController
+from daemon.onboard.capture.link_settings import head_link_problem
 from daemon.onboard.flight.arming import FILE as OVERRIDES
 from daemon.onboard.flight.arming import MissingPrerequisite, override_message, overrides_content
 from daemon.onboard.flight.decisions import Decision
@@ -284,6 +285,7 @@ class Service:
 
     def _on_bound(self, bound: Bound) -> None:
         problem = bound_problem(self.rig, bound.kind, bound.name, bound.found)
+        problem = problem or head_link_problem(self.configuration, bound.name, bound.found)
         if problem is not None:
             self._fail(problem)
 

@@ -109,7 +109,8 @@ class AravisHead(AravisSettings, HeadDevice):
             sink: receives an event while another controller has control.
 
         Returns:
-            Identity, size of a frame, packet size, chunks, sigma of the clock and temperature.
+            Identity, size of a frame, packet size, rate of the link, chunks, sigma of the clock and
+            temperature.
 
         Raises:
             DeviceError: it does not answer, refuses a setting, or stays under another's control.
@@ -125,6 +126,9 @@ class AravisHead(AravisSettings, HeadDevice):
             **session.camera.identity,
             "frame": f"{geometry.width_px} x {geometry.height_px} {geometry.pixel_format}",
             "packet_size": str(session.camera.frame_settings.get("GevSCPSPacketSize", "")),
+            "link": ""
+            if session.camera.link_mbps is None
+            else f"{session.camera.link_mbps:g} Mbit/s",
             "chunks": "yes" if session.camera.chunk_parser is not None else "no",
             "clock": "no" if session.latch is None else f"+-{session.latch.sigma_ns / 1e3:.0f} us",
             "temperature": ""
@@ -522,3 +526,7 @@ class AravisHead(AravisSettings, HeadDevice):
             session.stream.close()
             session.camera.release()
             gc.collect()
+
+
+def _rate_text(rate_mbps: float | None) -> str:
+    return "" if rate_mbps is None else f"{rate_mbps:g} Mbit/s"

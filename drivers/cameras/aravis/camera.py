@@ -26,7 +26,7 @@ from drivers.cameras.aravis.gvcp import GVCP_PORT, is_ip_address
 from drivers.cameras.aravis.head_configuration import HeadConfiguration
 from drivers.cameras.aravis.library import aravis, aravis_error, message_of
 from drivers.cameras.aravis.packet_filter import ControlSocketFilter, SocketCapture
-from drivers.cameras.aravis.packet_pacing import write_pacing
+from drivers.cameras.aravis.packet_pacing import link_rate_mbps, write_pacing
 from drivers.cameras.aravis.presets import FeatureValue
 from drivers.cameras.aravis.ptp import PtpFeatures
 from drivers.cameras.aravis.settings import AravisSettings
@@ -140,6 +140,7 @@ class AravisCamera:
                 f"{self._who}: the head has no thermometer ({' or '.join(TEMPERATURES)}) for "
                 f"temperature_probe = {settings.temperature_probe!r}; leave that setting out"
             )
+        self.link_mbps = link_rate_mbps(self._features)
         self.exposure_time_us = self._configuration.exposure_time_us()
         self.frame_settings = self._frame_settings()
         self._earlier: deque[Mapping[str, float | int | str]] = deque(

@@ -24,6 +24,30 @@ STREAM_BYTES: Final = "StreamBytesPerSecond"
 TRANSFER_DELAYS: Final = ("GevSCFTD", "StreamTransferStartDelay")
 
 
+LINK_SPEEDS: Final = (("DeviceLinkSpeed", 1 / BYTES_PER_S_OF_MBPS), ("GevLinkSpeed", 1.0))
+"""Features with the rate of the head's own link, and their unit in Mbit/s."""
+LINK_MIN_MBPS: Final = 1.0
+
+
+def link_rate_mbps(features: Features) -> float | None:
+    """The rate that a head reports of its own link.
+
+    Args:
+        features: the head's features.
+
+    Returns:
+        Rate, Mbit/s; None if it reports none.
+
+    Source: GenICam SFNC 2.7, DeviceLinkSpeed (bytes per second); GigE Vision 2.0, link speed
+    register (Mbit/s).
+    """
+    for name, unit in LINK_SPEEDS:
+        value = features.number(name)
+        if value is not None and value * unit >= LINK_MIN_MBPS:
+            return value * unit
+    return None
+
+
 def packet_delay_ticks(
     packet_size: int, stream_rate_mbps: float, head_link_mbps: float, tick_hz: int
 ) -> int:

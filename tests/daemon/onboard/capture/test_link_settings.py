@@ -14,7 +14,12 @@ from daemon.configuration.model import Configuration
 from daemon.configuration.service_file import from_mapping
 from daemon.onboard.capture import link_settings
 from daemon.onboard.capture.devices import device_specs
-from daemon.onboard.capture.link_settings import link_budget, link_plans, paced_specs
+from daemon.onboard.capture.link_settings import (
+    head_link_problem,
+    link_budget,
+    link_plans,
+    paced_specs,
+)
 from daemon.onboard.preflight.check_results import CheckOutcome
 from processing.rig import Rig, find_rig
 from tests.daemon.configuration.test_configuration import GOOD
@@ -178,3 +183,27 @@ def test_check_prints_the_budget_and_gives_it_as_json(
             assert link["needed_s"] == pytest.approx(3.49, abs=0.01)
         else:
             assert "take 3.49 s of 1.35 s (does not fit" in " ".join(text.split())
+
+
+@pytest.mark.parametrize(
+    ("link", "assumed_mbps", "is_refused"),
+    [
+        ("100 Mbit/s", 1000, True),
+        ("1000 Mbit/s", 1000, False),
+        ("100 Mbit/s", 100, False),
+        ("1000 Mbit/s", 2500, True),
+        ("", 1000, False),
+    ],
+)
+def test_a_head_that_is_connected_more_slowly_than_its_budget_assumes_is_refused(
+    link: str, assumed_mbps: float, is_refused: bool
+) -> None:
+    configuration, _ = configured_with_network("10.0.0", {"head_link_mbps": assumed_mbps})
+    problem = head_link_problem(configuration, "SU00", {"frame": "", "link": link})
+    assert (problem is not None) == is_refused
+    if problem is not None:
+        rate = link.partition(" ")[0]
+        assert f"connected at {rate} Mbit/s" in problem
+        assert f"assumes {assumed_mbps} Mbit/s" in problem
+        assert f"network.head_link_mbps = {rate}" in problem
+    assert head_link_problem(configuration, "SU00", {"port": "tcp://"}) is None
