@@ -14,7 +14,7 @@ PYTHON=${PYTHON:-python3}
 PACKAGES="gir1.2-aravis-0.8 libgirepository1.0-dev libcairo2-dev gcc pkg-config python3-dev
     python3-venv openssl"
 # Programs that the tests compare our devices, pages and files with, and programs that inject faults.
-TESTS="aravis-tools-cli aravis-tools gpsd systemd strace libimage-exiftool-perl libnss3-tools
+TESTS="aravis-tools-cli aravis-tools gpsd systemd strace libimage-exiftool-perl rtklib libnss3-tools
     iproute2 linuxptp hugin-tools enblend e2fsprogs procps groff-base"
 # The virtual machine of `make test-v4l2`; if it cannot be installed that test reports it.
 MACHINE="qemu-system-x86 busybox-static kmod v4l-utils"

@@ -34,7 +34,7 @@ def boresight(
     project: Annotated[Path, typer.Argument(help="project.toml, or the folder that holds it.")],
     mission: Annotated[Path | None, typer.Option(help="Mission that holds the trajectory.")] = None,
     trajectory: Annotated[
-        Path | None, typer.Option(help="Post-processed trajectory: SBET, or .csv.")
+        Path | None, typer.Option(help="Post-processed trajectory: SBET, .csv or .pos.")
     ] = None,
     crs: Annotated[str | None, typer.Option(help="Coordinate system of the project.")] = None,
     mount: Annotated[

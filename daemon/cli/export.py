@@ -11,6 +11,7 @@ from rich.progress import Progress
 
 from daemon.cli.exit_status import exit_if_failed
 from daemon.cli.export_block import BLOCK_HELP, block
+from daemon.cli.export_gnss import RINEX_HELP, rinex
 from daemon.cli.options import AsJson
 from daemon.terminal.console import Console, light_table
 from drivers.base.extras import require
@@ -65,6 +66,7 @@ def export() -> None:
 
 
 app.command("block", help=BLOCK_HELP)(block)
+app.command("rinex", help=RINEX_HELP)(rinex)
 
 
 @app.command()
@@ -136,7 +138,7 @@ def pictures(
         typer.Option(help="Standard deviation of roll, pitch, heading in mdeg."),
     ] = None,
     trajectory: Annotated[
-        Path | None, typer.Option(help="Post-processed trajectory: SBET, or .csv.")
+        Path | None, typer.Option(help="Post-processed trajectory: SBET, .csv or .pos.")
     ] = None,
     mount: Annotated[Path | None, typer.Option(help="TOML file with the [mount].")] = None,
     crs: Annotated[
@@ -219,7 +221,7 @@ def certificate(
 def orientation(
     mission: Annotated[Path, typer.Argument(help="Mission folder.")],
     trajectory: Annotated[
-        Path | None, typer.Option(help="Post-processed trajectory: SBET, or .csv.")
+        Path | None, typer.Option(help="Post-processed trajectory: SBET, .csv or .pos.")
     ] = None,
     crs: Annotated[
         str | None, typer.Option(help="CRS, such as EPSG:25833+7837 (default: UTM zone).")

@@ -19,7 +19,9 @@ NewFolder = Annotated[
     typer.Option(help="New folder (default: next to the input, named by its id)."),
 ]
 
-Trajectory = Annotated[Path | None, typer.Option(help="Post-processed trajectory: SBET, or .csv.")]
+Trajectory = Annotated[
+    Path | None, typer.Option(help="Post-processed trajectory: SBET, .csv or .pos.")
+]
 MountFile = Annotated[Path | None, typer.Option(help="TOML file with the [mount].")]
 Crs = Annotated[str | None, typer.Option(help="CRS, such as EPSG:25833 (default: UTM zone).")]
 PositionSigma = Annotated[

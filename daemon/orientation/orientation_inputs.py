@@ -12,6 +12,7 @@ from pathlib import Path
 
 from daemon import DaemonError
 from daemon.configuration.model import MountSection
+from daemon.mission.canonical_json import sha256_hex
 from daemon.mission.exposure import Exposure
 from daemon.mission.layout import Mission
 from daemon.orientation.exterior_orientation import (
@@ -23,6 +24,7 @@ from daemon.orientation.exterior_orientation import (
 )
 from daemon.orientation.geodesy import utm_of
 from daemon.orientation.georeference import Georeference
+from daemon.orientation.rtklib_positions import SUFFIX, read_positions, with_flown_attitude
 from daemon.orientation.trajectory import Trajectory, flown_trajectory, read_trajectory
 from processing.rig import Rig, load_rig
 
@@ -108,4 +110,9 @@ def trajectory_of(
         )
     if trajectory_file is None:
         return flown_trajectory(mission, receiver)
+    if trajectory_file.suffix.lower() == SUFFIX:
+        positions = read_positions(trajectory_file)
+        digest = sha256_hex(trajectory_file.read_bytes())[:8]
+        name = f"{trajectory_file.stem}-{digest}"
+        return with_flown_attitude(name, positions, flown_trajectory(mission, receiver))
     return read_trajectory(trajectory_file, around_gps_ns=stamped)

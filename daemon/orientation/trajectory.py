@@ -99,7 +99,7 @@ def flown_trajectory(mission: Mission, receiver: str | None = None) -> Trajector
             f"{mission.log_dir}: no navigation of {receiver or 'any receiver'}; received: "
             f"{recorded}"
         )
-    return _of_samples("in-flight", found[receiver])
+    return trajectory_of_samples("in-flight", found[receiver])
 
 
 def read_trajectory(path: Path, *, around_gps_ns: int) -> Trajectory:
@@ -119,7 +119,7 @@ def read_trajectory(path: Path, *, around_gps_ns: int) -> Trajectory:
         raise TrajectoryError(f"trajectory {error}") from error
     name = f"{path.stem}-{sha256_hex(data)[:8]}"
     if path.suffix.lower() == ".csv":
-        return _of_samples(name, list(_csv(path, data)))
+        return trajectory_of_samples(name, list(_csv(path, data)))
     return _sbet(path, data, around_gps_ns, name)
 
 
@@ -259,8 +259,12 @@ def _with_attitude(samples: Sequence[NavSample]) -> int:
     return sum(sample.heading_rad is not None for sample in samples)
 
 
-def _of_samples(name: str, samples: Sequence[NavSample]) -> Trajectory:
-    """By time; of two at one instant the first."""
+def trajectory_of_samples(name: str, samples: Sequence[NavSample]) -> Trajectory:
+    """A trajectory of samples, by time; of two at one instant the first.
+
+    Raises:
+        TrajectoryError: fewer than two.
+    """
     ordered: list[NavSample] = []
     for sample in sorted(samples, key=lambda sample: sample.gps_ns):
         if not ordered or sample.gps_ns > ordered[-1].gps_ns:

@@ -1,0 +1,80 @@
+"""`syntopic export rinex`: recorded observations of a receiver for post-processing."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from daemon.cli.exit_status import exit_if_failed
+from daemon.cli.options import AsJson
+from daemon.terminal.console import Console
+
+RINEX_HELP = """Export a receiver's observations as RINEX with the event marks of the exposures.
+
+Reads the recorded RXM-RAWX of u-blox and RANGE of NovAtel receivers. Each event mark is an epoch of
+flag 5, rounded to 100 ns; `marks.csv` keeps nanoseconds and standard deviations. A position file of
+RTKLIB comes back with `syntopic orient --trajectory`.
+
+Examples: `syntopic export rinex MISSION`,
+`syntopic export rinex MISSION --version 4.00 --antenna "NOV703GGG.R2    NONE"`
+"""
+
+
+def rinex(
+    mission: Annotated[Path, typer.Argument(help="Mission folder.")],
+    version: Annotated[str, typer.Option(help="RINEX version: 3.04 or 4.00.")] = "3.04",
+    receiver: Annotated[str | None, typer.Option(help="Navigator, if there are several.")] = None,
+    antenna: Annotated[str, typer.Option(help="Antenna type by IGS name.")] = "",
+    rtklib: Annotated[
+        bool, typer.Option("--rtklib", help="Refusal of several marks between two epochs.")
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    from daemon.mission.layout import Mission
+    from daemon.postflight.export.gnss_export import export_rinex
+
+    folder = Mission.open(mission)
+    with folder.held():
+        done = export_rinex(
+            folder,
+            version=version,
+            receiver=receiver,
+            antenna=antenna,
+            one_mark_per_epoch=rtklib,
+        )
+    if as_json:
+        content = {
+            "folder": str(done.folder),
+            "file": done.name,
+            "epochs": done.written.epochs,
+            "values": done.written.values,
+            "values_left_out": done.written.left_out,
+            "marks": done.written.marks,
+            "without_mark": list(done.without_mark),
+            "intervals_with_several_marks": done.crowded,
+            "unknown_signals": done.counts.unknown_signals,
+            "unreadable_messages": done.counts.unreadable,
+            "failures": [failure.as_json() for failure in done.failures],
+        }
+        typer.echo(json.dumps(content))
+        exit_if_failed(done.failures)
+        return
+    console = Console()
+    console.print(
+        f"{done.written.epochs} epochs, {done.written.values} values, {done.written.marks} event "
+        f"marks in {done.folder / done.name}",
+        soft_wrap=True,
+    )
+    for count, what in (
+        (done.written.left_out, "values do not fit RINEX's columns and are left out"),
+        (done.counts.unknown_signals, "signals have no RINEX code and are left out"),
+        (done.counts.unreadable, "messages could not be decoded"),
+        (len(done.without_mark), "exposures have no event mark of the receiver"),
+        (done.crowded, "intervals between epochs hold several marks, of which RTKLIB reads one"),
+    ):
+        if count:
+            console.print(f"{count} {what}", style="yellow", soft_wrap=True)
+    exit_if_failed(done.failures)
