@@ -31,8 +31,12 @@ Without an address announced services are listed; a single one is monitored. An
 announcement determines neither TLS nor the receiver of a token: https:// or --tls requires TLS,
 and a token is sent only to a given address.
 
+With --serve the services at several addresses, or all announced ones, are gathered on one page:
+one row each, and their alarms merged.
+
 Examples: `syntopic monitor`, `syntopic monitor 10.0.0.5:8470 --bytes-per-s 4000`,
-`syntopic monitor https://camera1.local:8470 --authority authority.pem`
+`syntopic monitor https://camera1.local:8470 --authority authority.pem`,
+`syntopic monitor --serve 8480 10.0.0.5 10.0.0.6`
 """
 ROWS = 12
 FAULTS_SHOWN = 20
@@ -105,9 +109,13 @@ class _Record(BaseModel):
 
 
 def monitor(
-    address: Annotated[
-        str, typer.Argument(help="HOST:PORT or URL (default: discovered by mDNS).")
-    ] = "",
+    addresses: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[ADDRESS]...",
+            help="HOST:PORT or URL (default: discovered by mDNS); several with --serve.",
+        ),
+    ] = None,
     token: Annotated[
         str, typer.Option(envvar="SYNTOPIC_TOKEN", help="Access token, if reading requires one.")
     ] = "",
@@ -124,6 +132,9 @@ def monitor(
     as_json: Annotated[
         bool, typer.Option("--json", help="Print the state once, as one JSON object.")
     ] = False,
+    serve: Annotated[
+        str, typer.Option(help="HOST:PORT or PORT of a page that shows several aircraft.")
+    ] = "",
 ) -> None:
     from daemon.onboard.monitoring.client.telemetry_client import (
         AccessOptions,
@@ -132,8 +143,17 @@ def monitor(
     )
 
     console = Console(stderr=as_json)
-    service = parse_service_address(address or _single_service(console, token), tls=tls)
+    given = addresses or []
     access = AccessOptions(token, authority, token_without_tls)
+    if serve:
+        from daemon.cli.monitor_fleet import serve_fleet
+
+        named = given or _announced_services(token)
+        serve_fleet(serve, [parse_service_address(one, tls=tls) for one in named], access)
+        return
+    if len(given) > 1:
+        raise MonitorError("one service is monitored in a terminal; for several add --serve 8480")
+    service = parse_service_address(given[0] if given else _single_service(console, token), tls=tls)
     state: _MonitorState | None = None
     with Live(Text(f"calling {service.address}"), console=console, refresh_per_second=4) as live:
         for record in telemetry_records(service, access, bytes_per_s):
@@ -150,6 +170,18 @@ def monitor(
                     typer.echo(json.dumps(state.as_json()))
                     return
                 live.update(state.drawn(service.address))
+
+
+def _announced_services(token: str) -> list[str]:
+    """The addresses of all announced services, for one page; none of them gets a token."""
+    from daemon.onboard.monitoring.client.mdns_browser import find_services
+
+    if token:
+        raise MonitorError("a token is not sent to announced addresses; give the addresses")
+    found = [one.address for one in find_services()]
+    if not found:
+        raise MonitorError("no service announced itself; give the addresses of the services")
+    return found
 
 
 def _single_service(console: Console, token: str) -> str:

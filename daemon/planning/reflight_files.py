@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 from collections.abc import Sequence
 from typing import Any
@@ -102,3 +104,39 @@ def mavlink_mission(segments: Sequence[Segment], *, height_m: float, distance_m:
         for i, (frame, command, values) in enumerate(rows)
     ]
     return "\n".join([HEADER_QGC, *lines]) + "\n"
+
+
+TABLE_COLUMNS = (
+    *("line", "strip", "kind", "from_m", "to_m", "length_m", "area_m2"),
+    *("start_latitude_deg", "start_longitude_deg", "end_latitude_deg", "end_longitude_deg"),
+    *("simulated", "reasons"),
+)
+"""Columns of the table, documented in docs/reference/flight/reflight-files.md."""
+
+
+def table(segments: Sequence[Segment], *, simulated: bool = False) -> str:
+    """A table of the segments: CSV after RFC 4180, UTF-8, a header, SI units, WGS 84 degrees.
+
+    A text that a spreadsheet would run as a formula begins with an apostrophe.
+    """
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\r\n")
+    writer.writerow(TABLE_COLUMNS)
+    for one in segments:
+        writer.writerow(
+            [
+                _harmless(one.line.id),
+                _harmless(one.line.strip or one.line.id),
+                one.kind,
+                *(f"{metres:.1f}" for metres in (one.from_m, one.to_m, one.to_m - one.from_m)),
+                f"{one.area_m2:.1f}",
+                *(f"{degrees:.8f}" for place in (one.start, one.end) for degrees in place),
+                int(simulated),
+                _harmless("; ".join(one.reasons)),
+            ]
+        )
+    return text.getvalue()
+
+
+def _harmless(text: str) -> str:
+    return f"'{text}" if text[:1] in ("=", "+", "-", "@", "\t", "\r") else text

@@ -26,12 +26,15 @@ class DiskCapacity:
     """Free space of the disk above the reserve.
 
     `seconds` at the current rate; None where there is none yet. `is_low` is the warning, `is_full`
-    the stop: no exposure is begun that might not fit.
+    the stop: no exposure is begun that might not fit. `free_nbytes` is free above the reserve,
+    `exposure_nbytes` the size of one exposure with its products.
     """
 
     exposures: int
     seconds: float | None
     is_low: bool
+    free_nbytes: int = 0
+    exposure_nbytes: int = 0
 
     @property
     def is_full(self) -> bool:
@@ -77,7 +80,8 @@ class DiskSpaceMonitor:
         exposures = max(0, free_nbytes // self._needed_nbytes)
         interval_s = self._interval_s()
         seconds = None if interval_s is None else exposures * interval_s
-        return DiskCapacity(exposures, seconds, exposures < self._limits.disk_warn_exposures)
+        is_low = exposures < self._limits.disk_warn_exposures
+        return DiskCapacity(exposures, seconds, is_low, max(0, free_nbytes), self._needed_nbytes)
 
     def warning(self) -> str | None:
         """Message to the crew when free space has just become low; None at any other time."""

@@ -14,6 +14,7 @@ from pydantic import BaseModel
 
 from daemon.mission.canonical_json import RecordError, canonical_bytes, parse_record
 from daemon.mission.record_types import LongText, Ordinal, read_record
+from daemon.onboard.flight.event_table import Severity, entry_of
 
 FILE = "unhandled-faults.json"
 """In the root of missions: the unacknowledged faults of the last run."""
@@ -29,7 +30,12 @@ FILE_MAX_BYTES = 1_000_000
 
 @dataclass(frozen=True)
 class LatchedFault:
-    """A fault. `stands` is true while it is active; `previous` marks an earlier run."""
+    """A fault. `stands` is true while it is active; `previous` marks an earlier run.
+
+    `code` is an event of `daemon.onboard.flight.event_table`, which has its severity, cause and
+    action. `acknowledged_by` is the name and role of whoever acknowledged it. Times are those of
+    the service's monotonic clock.
+    """
 
     id: str
     device: str
@@ -39,6 +45,11 @@ class LatchedFault:
     count: int = 1
     sequence: int = 0
     previous: bool = False
+    code: str = ""
+    severity: Severity = "warning"
+    acknowledged_by: str = ""
+    raised_mono_ns: str | None = None
+    cleared_mono_ns: str | None = None
 
 
 class FaultLatches:
@@ -46,6 +57,8 @@ class FaultLatches:
 
     def __init__(self) -> None:
         self._latches: dict[str, LatchedFault] = {}
+        self._code = ""
+        self._mono_ns: str | None = None
 
     def raise_fault(
         self, fault: str, sentence: str, device: str = "", *, sequence: int = 0
@@ -53,7 +66,17 @@ class FaultLatches:
         """Record a new or repeated fault."""
         known = self._latches.pop(fault, None)
         count = known.count + 1 if known else 1
-        self._latches[fault] = LatchedFault(fault, device, sentence, count=count, sequence=sequence)
+        entry = entry_of(self._code)
+        self._latches[fault] = LatchedFault(
+            fault,
+            device,
+            sentence,
+            count=count,
+            sequence=sequence,
+            code=self._code,
+            severity="warning" if entry is None else entry.severity,
+            raised_mono_ns=self._mono_ns,
+        )
         while len(self._latches) > FAULTS_MAX:
             del self._latches[next(iter(self._latches))]
 
@@ -65,15 +88,18 @@ class FaultLatches:
         if found.acknowledged:
             del self._latches[fault]
         else:
-            self._latches[fault] = replace(found, stands=False)
+            self._latches[fault] = replace(found, stands=False, cleared_mono_ns=self._mono_ns)
 
-    def acknowledge(self, fault: str) -> bool:
-        """Acknowledge a fault. A past fault is removed, an active one stays. False if unknown."""
+    def acknowledge(self, fault: str, by: str = "") -> bool:
+        """Acknowledge a fault. A past fault is removed, an active one stays. False if unknown.
+
+        `by` is the name and role of the person.
+        """
         found = self._latches.get(fault)
         if found is None:
             return False
         if found.stands:
-            self._latches[fault] = replace(found, acknowledged=True)
+            self._latches[fault] = replace(found, acknowledged=True, acknowledged_by=by)
         else:
             del self._latches[fault]
         return True
@@ -81,6 +107,9 @@ class FaultLatches:
     def apply(self, event: Mapping[str, Any], *, sequence: int = 0) -> None:
         """Raise or clear the faults that an event of the service implies."""
         kind, sentence = event.get("event"), str(event.get("sentence", ""))
+        self._code = code_of(event)
+        if event.get("mono_ns") is not None:
+            self._mono_ns = str(event["mono_ns"])
         if kind == "device":
             self._apply_device(event, sentence, sequence)
         elif kind == "disk-dropped":
@@ -116,9 +145,12 @@ class FaultLatches:
                 description = f"Flying without {absent}. Check it."
                 self.raise_fault(f"absent {absent}", description, str(absent), sequence=sequence)
         elif kind == "status":
-            if event.get("exposures_left"):
-                self.clear_fault("disk")
+            if event.get("exposures_left") and not event.get("is_disk_low"):
+                self.clear_fault_if_active("disk")
             self._clear_present(event)
+            self._clear_mirror(event)
+            if event.get("missing") == []:
+                self.clear_fault_if_active("override")
         elif kind == "previous-fault":
             latch = _latch(event)
             self.add_previous([latch] if latch else [], sequence=sequence)
@@ -130,6 +162,20 @@ class FaultLatches:
             for fault in [f for f in self._latches if f.startswith("absent ")]:
                 if fault not in still and self._latches[fault].stands:
                     self.clear_fault(fault)
+
+    def _clear_mirror(self, event: Mapping[str, Any]) -> None:
+        """Clear the fault of the mirror once both disks are in use."""
+        disks = event.get("disks")
+        if not isinstance(disks, list) or len(disks) < 2:
+            return
+        if all(isinstance(one, Mapping) and one.get("state") == "in use" for one in disks):
+            self.clear_fault_if_active("mirror")
+
+    def clear_fault_if_active(self, fault: str) -> None:
+        """Clear a fault that stands; a cleared one keeps the time at which it was cleared."""
+        found = self._latches.get(fault)
+        if found is not None and found.stands:
+            self.clear_fault(fault)
 
     def _apply_device(self, event: Mapping[str, Any], sentence: str, sequence: int) -> None:
         device, name = str(event.get("device")), event.get("name")
@@ -200,6 +246,28 @@ def previous_faults(latches: Iterable[LatchedFault]) -> list[dict[str, Any]]:
     ]
 
 
+def code_of(event: Mapping[str, Any]) -> str:
+    """The name of an event in the table of events; empty if it is not listed there.
+
+    Args:
+        event: an event of the service.
+
+    Returns:
+        The name that `syntopic explain` knows, for example "device/lost".
+
+    Example:
+        >>> code_of({"event": "device", "device": "SU02", "name": "lost"})
+        'device/lost'
+        >>> code_of({"event": "ready", "absent": ["trigger"]})
+        'device/absent'
+    """
+    kind = str(event.get("event", ""))
+    if kind == "ready":
+        return "device/absent"
+    name = f"device/{event.get('name')}" if kind == "device" else kind
+    return name if entry_of(name) is not None else ""
+
+
 _FAULT_OF_EVENT: Mapping[object, tuple[str, str]] = {
     "fault": ("service", "service"),
     "ledger": ("ledger", "service"),
@@ -212,7 +280,7 @@ _FAULT_OF_EVENT: Mapping[object, tuple[str, str]] = {
     "decisions": ("decisions", "service"),
 }
 """Faults and their device, by the event that raises them."""
-_KEYS = ("id", "device", "sentence", "count")
+_KEYS = ("id", "device", "sentence", "count", "code", "severity")
 
 
 class _SavedFault(BaseModel):
@@ -220,6 +288,8 @@ class _SavedFault(BaseModel):
     device: LongText
     sentence: LongText
     count: Ordinal = 1
+    code: LongText = ""
+    severity: Severity = "warning"
 
 
 def _latch(content: Mapping[str, Any]) -> LatchedFault | None:

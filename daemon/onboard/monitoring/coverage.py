@@ -175,6 +175,38 @@ class Coverage:
         return {line: (a, b) for line, (a, b) in unflown.items() if a < b}
 
     @property
+    def sun_limit_deg(self) -> float | None:
+        """Least elevation of the sun of the plan; None if it states none."""
+        return self._context.plan.specification.sun_deg if self._context else None
+
+    def first_place(self) -> tuple[float, float] | None:
+        """Latitude and longitude of the begin of the plan; None without a plan."""
+        self.update()
+        if self._context is None or not self._context.plan.lines:
+            return None
+        start = self._context.plan.lines[0].start
+        return start.latitude_deg, start.longitude_deg
+
+    def lines_left(self) -> dict[str, Any] | None:
+        """Lines and metres that are still to be flown for the first time; None without a plan."""
+        self.update()
+        context = self._context
+        if context is None:
+            return None
+        remaining = self._remaining(context)
+        lengths_m = [
+            math.hypot(*LocalPlane(line.start).flat(line.end)) for line in context.plan.lines
+        ]
+        latest = self._taken[max(self._taken)][0] if self._taken else ""
+        return {
+            "planned": len(lengths_m),
+            "left": len(remaining),
+            "current": latest,
+            "left_m": round(sum(end_m - begin_m for begin_m, end_m in remaining.values()), 1),
+            "planned_m": round(sum(lengths_m), 1),
+        }
+
+    @property
     def is_simulated(self) -> bool:
         return bool(self._state.brief()["simulated"])
 

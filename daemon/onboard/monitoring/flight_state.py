@@ -180,10 +180,10 @@ class FlightState:
                 self.sequence += 1
                 record |= {"sequence": self.sequence, "manual": summary_of(decision)}
 
-    def acknowledge(self, fault: str) -> bool:
+    def acknowledge(self, fault: str, by: str = "") -> bool:
         """Acknowledge a fault. A cleared one leaves the list; an active one stays."""
         self.sequence += 1
-        return self._latches.acknowledge(fault)
+        return self._latches.acknowledge(fault, by)
 
     def add_sealed(self, sealed: Mapping[str, Any], report: Mapping[str, Any] | None) -> None:
         """Add an earlier exposure from its files; received events take precedence."""

@@ -9,19 +9,22 @@ from fastapi import FastAPI, HTTPException, Path, Response
 from fastapi.params import Depends
 
 from daemon.onboard.monitoring.coverage import Coverage, advice_json
+from daemon.onboard.monitoring.flight_state import FlightState
+from daemon.onboard.monitoring.remaining import remaining_json
 from daemon.planning import reflight_files
 
-ReflightFile = Literal["fly-again.geojson", "fly-again.kml", "fly-again.waypoints"]
+ReflightFile = Literal["fly-again.geojson", "fly-again.kml", "fly-again.waypoints", "fly-again.csv"]
 KINDS = {
     "fly-again.geojson": "application/geo+json",
     "fly-again.kml": "application/vnd.google-earth.kml+xml",
     "fly-again.waypoints": "text/plain",
+    "fly-again.csv": "text/csv",
 }
 Number = Annotated[int, Path(ge=1, lt=10**9, description="of the exposure")]
 NO_PLAN = "this mission is flown without a plan ([plan] file)"
 
 
-def add_plan(app: FastAPI, coverage: Coverage, watcher: Depends) -> None:
+def add_plan(app: FastAPI, state: FlightState, coverage: Coverage, watcher: Depends) -> None:
     """Add the routes; `watcher` authorizes readers."""
 
     @app.get("/api/v1/plan", dependencies=[watcher], tags=["plan"])
@@ -36,6 +39,11 @@ def add_plan(app: FastAPI, coverage: Coverage, watcher: Depends) -> None:
         if found is None:
             raise HTTPException(404, f"exposure {number} has no place on a planned line")
         return {"number": number, "line": found[0], "at_m": round(found[1], 1)}
+
+    @app.get("/api/v1/remaining", dependencies=[watcher], tags=["plan"])
+    async def remaining() -> dict[str, Any]:
+        """Lines, distance and light that are left."""
+        return remaining_json(state, coverage)
 
     @app.get("/api/v1/advice", dependencies=[watcher], tags=["plan"])
     async def advice() -> dict[str, Any]:
@@ -55,7 +63,7 @@ def add_plan(app: FastAPI, coverage: Coverage, watcher: Depends) -> None:
         responses={200: {"content": {kind: {} for kind in KINDS.values()}}},
     )
     async def fly_again(file: ReflightFile) -> Response:
-        """The segments as a plan (GeoJSON), for maps (KML), or as a MAVLink mission."""
+        """The segments as a plan (GeoJSON), for maps (KML), as a MAVLink mission, or a table."""
         advice_task = coverage.advice_task()
         if advice_task is None:
             raise HTTPException(404, NO_PLAN)
@@ -69,6 +77,9 @@ def add_plan(app: FastAPI, coverage: Coverage, watcher: Depends) -> None:
             ),
             "fly-again.waypoints": lambda: reflight_files.mavlink_mission(
                 found.segments, height_m=coverage.height_m, distance_m=coverage.distance_m
+            ),
+            "fly-again.csv": lambda: reflight_files.table(
+                found.segments, simulated=coverage.is_simulated
             ),
         }
         return Response(texts[file](), media_type=KINDS[file])

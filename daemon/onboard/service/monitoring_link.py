@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from daemon.mission.exposure import Exposure, TemperatureRecord, navigation_to_json
+from daemon.mission.store.disk_space import DiskCapacity
 from daemon.onboard.flight.fault_latches import DELIVERING, FIXED, SEARCHING, UNAVAILABLE
 from daemon.onboard.service.guidance_feed import GuidanceFeed
 from daemon.onboard.service.messages import Answer, ServiceEvent
@@ -111,7 +112,8 @@ def status_event(
     *,
     phase: str,
     ledger: Mapping[str, Any],
-    exposures_left: int,
+    disk: DiskCapacity,
+    exposures_planned: int | None,
     position: NavSample | None,
     temperatures: Iterable[TemperatureRecord],
     temperature_stale_s: float,
@@ -125,6 +127,8 @@ def status_event(
     """The state of the flight that is sent every second, as plain JSON types.
 
     Args:
+        disk: free space of the mission's disk.
+        exposures_planned: exposures that are still planned; None without a planned number.
         time_now: GPS time at this moment, or None before it is known.
         queue: exposures waiting for the pipeline.
         missing: the missing prerequisites, with their actions.
@@ -151,7 +155,12 @@ def status_event(
         "mono_ns": str(now_ns),
         "phase": phase,
         "ledger": {key: value for key, value in ledger.items() if key != "heads"},
-        "exposures_left": exposures_left,
+        "exposures_left": disk.exposures,
+        "exposures_planned": exposures_planned,
+        "disk_free_bytes": disk.free_nbytes,
+        "disk_seconds": None if disk.seconds is None else round(disk.seconds, 1),
+        "exposure_bytes": disk.exposure_nbytes,
+        "is_disk_low": disk.is_low,
         "position": where,
         "temperatures_c": present_temperatures_c(temperatures, temperature_stale_s),
         "clock_sigma_ns": None if time_now is None else time_now.sigma_ns,

@@ -370,7 +370,8 @@ class Service:
         return status_event(
             phase=self.preflight.phase,
             ledger=sheet.as_json(),
-            exposures_left=self.line.guard.check().exposures,
+            disk=self.line.guard.check(),
+            exposures_planned=self.line.remaining,
             position=self.flight.track.last,
             temperatures=self.flight.temperatures.at(now_ns),
             temperature_stale_s=self.configuration.limits.temperature_stale_s,

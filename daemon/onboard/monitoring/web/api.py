@@ -150,7 +150,7 @@ def create_app(
         docs_url=None,
         redoc_url=None,
     )
-    app.middleware("http")(_add_security_headers)
+    app.middleware("http")(add_security_headers)
     app.add_exception_handler(StarletteHTTPException, _http_problem)
     app.add_exception_handler(RequestValidationError, _validation_problem)
     access = _AccessControl(settings, gateway, connections or Connections())
@@ -159,7 +159,7 @@ def create_app(
     _add_commands(app, state, gateway, access)
     _add_telemetry(app, state, access)
     add_guidance(app, state, access)
-    add_plan(app, coverage or Coverage(state), Depends(access.watch))
+    add_plan(app, state, coverage or Coverage(state), Depends(access.watch))
     _add_page(app)
     return app
 
@@ -359,7 +359,7 @@ def _add_commands(
         except AnswerTimeoutError as error:
             raise HTTPException(504, str(error)) from error
         if answer.done and name == "acknowledge" and given.fault is not None:
-            state.acknowledge(given.fault)
+            state.acknowledge(given.fault, f"{by.name} ({by.role})")
         if not answer.done:
             raise HTTPException(409, answer.sentence)
         return CommandResponse(done=True, sentence=answer.sentence)
@@ -435,7 +435,7 @@ def _documented_problem() -> dict[str, Any]:
     return {"description": "what is wrong", "content": {PROBLEM_JSON: {"schema": schema}}}
 
 
-async def _add_security_headers(
+async def add_security_headers(
     request: Request, call_next: Callable[[Request], Awaitable[Response]]
 ) -> Response:
     response = await call_next(request)

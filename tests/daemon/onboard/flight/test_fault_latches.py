@@ -93,7 +93,7 @@ def test_a_fault_that_was_just_raised_stands_once_and_nobody_has_seen_it() -> No
     assert LatchedFault("a", "b", "c") == LatchedFault("a", "b", "c", True, False, 1, 0, False)
     power, disk, mirror = latches.unhandled()
     assert power == LatchedFault("power", "power", "low", True, False, 1, 0, False)
-    assert disk == LatchedFault("disk", "disk", "full", True, False, 1, 0, False)
+    assert disk == LatchedFault("disk", "disk", "full", True, False, 1, 0, False, "disk")
     assert mirror == LatchedFault("mirror", "disk", "slow", False, False, 1, 0, True)
     assert "power" in latches and "clock" not in latches
     assert not latches.acknowledge("clock")
@@ -153,3 +153,36 @@ def test_what_was_absent_stands_until_the_status_no_longer_names_it() -> None:
     }
     latches.apply({"event": "status"})  # one that does not say changes nothing
     assert [one["id"] for one in latches.listed() if one["stands"]] == ["absent trigger"]
+
+
+def test_a_fault_has_the_code_and_severity_of_its_event_and_the_time_of_its_end() -> None:
+    raised = device("lost") | {"mono_ns": "5000000000"}
+    latches = latches_of(raised, device("checksum", of="gnss") | {"mono_ns": "6000000000"})
+    by_id = {fault["id"]: fault for fault in latches.listed()}
+    lost, checksum = by_id["device SU02"], by_id["checksum gnss"]
+    assert (lost["code"], lost["severity"]) == ("device/lost", "warning")
+    assert (checksum["code"], checksum["severity"]) == ("device/checksum", "caution")
+    assert (lost["raised_mono_ns"], lost["cleared_mono_ns"]) == ("5000000000", None)
+    latches.apply(device("recovered", fault=False) | {"mono_ns": "9000000000"})
+    (cleared,) = (fault for fault in latches.listed() if fault["id"] == "device SU02")
+    assert (cleared["stands"], cleared["cleared_mono_ns"]) == (False, "9000000000")
+
+
+def test_an_acknowledged_fault_names_who_acknowledged_it() -> None:
+    latches = latches_of(device("lost"))
+    assert latches.acknowledge("device SU02", "anna (operator)")
+    (fault,) = latches.listed()
+    assert (fault["acknowledged"], fault["acknowledged_by"]) == (True, "anna (operator)")
+
+
+def test_a_mirror_that_works_again_and_an_override_without_need_are_cleared() -> None:
+    latches = latches_of(
+        {"event": "mirror", "sentence": "one disk is unusable"},
+        {"event": "override", "sentence": "no position"},
+    )
+    one_disk = [{"disk": "root", "state": "in use"}, {"disk": "mirror", "state": "copying"}]
+    latches.apply({"event": "status", "disks": one_disk, "missing": ["no position"]})
+    assert all(fault["stands"] for fault in latches.listed())
+    both = [{"disk": name, "state": "in use"} for name in ("root", "mirror")]
+    latches.apply({"event": "status", "disks": both, "missing": []})
+    assert not any(fault["stands"] for fault in latches.listed())

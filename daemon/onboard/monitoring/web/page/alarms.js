@@ -141,8 +141,10 @@ function drawBar(alarms, feed) {
   const bar = by("alarm-bar");
   const due = alarms.filter((one) => !one.untilMs && (one.isActive || !one.isAcknowledged) && !(one.isPrevious && one.isAcknowledged));
   const [first] = due;
-  bar.hidden = !first;
-  if (!first) return;
+  // After an orderly end the alarms are part of the summary.
+  const hasEnded = !feed.isLinked && feed.flight.brief?.phase === "landed";
+  bar.hidden = !first || hasEnded;
+  if (bar.hidden) return;
   const isSounding = soundingOf(alarms).length > 0;
   redraw(bar, JSON.stringify([first.id, first.severity, first.isActive, first.isAcknowledged, first.detail, due.length, isSounding]), () => {
     bar.className = first.isActive ? first.severity : "info";
@@ -175,7 +177,8 @@ function draw(feed) {
   drawList(alarms, feed);
   drawBar(alarms, feed);
   setBadge("alarms", alarms.filter((one) => one.isActive && !one.untilMs).length);
-  soundFor(soundingOf(alarms).map((one) => one.severity));
+  const hasLanded = feed.flight.brief?.phase === "landed";
+  soundFor((hasLanded ? [] : soundingOf(alarms)).map((one) => one.severity));
 }
 
 export function start(_root, feed) {

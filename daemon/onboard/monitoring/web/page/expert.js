@@ -2,14 +2,42 @@
 
 import { by, element, redraw, text } from "./dom.js";
 import { t } from "./i18n.js";
-import { sigma, speed } from "./format.js";
+import { angle, number, percent, sigma, speed } from "./format.js";
+import { lastWhere } from "./feed.js";
 import { presentPosition } from "./lamps.js";
 import { drawCharts, fitCharts } from "./charts.js";
 
+const MARKS = { good: "●", caution: "▲", warning: "■" };
+const RANK = { refly: "warning", usable: "caution" };
+
+// Colour of a value from the finding of the last exposure that judges it.
+function judged(latest, ...flags) {
+  const found = (latest?.findings || []).filter((one) => flags.includes(one.flag));
+  const worst = found.some((one) => one.verdict === "refly") ? "refly" : found.some((one) => one.verdict === "usable") ? "usable" : "";
+  return worst ? { state: RANK[worst], limit: found[0].sentence } : { state: latest ? "good" : "", limit: "" };
+}
+
+// Code, text, flags that judge it, and id of each value. The texts explain each in one line.
 function values({ brief }) {
-  const status = brief.status || {};
+  const { status = {} } = brief;
+  const latest = lastWhere((one) => one.figures);
+  const f = latest?.figures || {};
+  const known = (value, shown) => value == null ? "–" : shown(value);
   return [
-    { code: "clock_sigma", shown: sigma(status.clock_sigma_ns), id: "sigma" },
+    ["clock_sigma", known(status.clock_sigma_ns, sigma), status.in_holdover ? { state: "caution", limit: "" } : judged(latest, "TIME_SIGMA", "TIME_HOLDOVER"), "sigma"],
+    ["time_sigma", known(latest?.mark_sigma_ns, sigma), judged(latest, "TIME_SIGMA")],
+    ["sigma0", known(f.sigma0_px, (value) => `${number(value, 3)} px`), judged(latest, "SIGMA0")],
+    ["dc", known(f.dc_k, (value) => `${number(value, 1)} K`), judged(latest, "DC_DISAGREEMENT", "TEMPERATURE_RANGE")],
+    ["tie_points", known(f.tie_points_pp, (value) => `${number(value)} + ${number(f.tie_points_pc ?? 0)}`), judged(latest, "TIE_POINTS")],
+    ["accuracy", known(f.stitched_sigma_px, (value) => `${number(value, 3)} px`), judged(latest, "DISPLACED_SENSOR")],
+    ["displaced", f.displaced_sensor || "–", judged(latest, "DISPLACED_SENSOR")],
+    ["saturated", known(f.saturated_fraction, (value) => percent(value, 2)), judged(latest, "OVEREXPOSED")],
+    ["tilt", known(f.tilt_deg, (value) => angle(value, 1)), judged(latest, "TILT")],
+    ["crab", known(f.crab_deg, (value) => angle(value, 1)), judged(latest, "DRIFT")],
+    ["overlap", known(f.forward_overlap, percent), judged(latest, "OVERLAP")],
+    ["gsd", known(f.gsd_m, (value) => `${number(100 * value, 1)} cm`), judged(latest, "GSD")],
+    ["sun", known(f.sun_deg, angle), judged(latest, "SUN")],
+    ["queue", known(status.queue, number), { state: status.queue > 5 ? "caution" : "good", limit: "" }],
   ];
 }
 
@@ -23,9 +51,10 @@ export function start(_root, feed) {
     text("triggers", status.ledger?.triggers?.triggers);
     text("lost", status.ledger?.triggers?.lost);
     const rows = values(feed.flight);
-    redraw(by("expert"), JSON.stringify(rows), () => rows.map(({ code, shown, id }) => element("div", {},
-      element("dt", {}, element("span", { textContent: t(`expert.${code}`) }), element("span", { id: id || "", textContent: shown })),
-      element("dd", { textContent: t(`expert.${code}.text`) }))));
+    redraw(by("expert"), JSON.stringify(rows), () => rows.map(([code, shown, { state, limit }, id]) => element("div", { className: state },
+      element("dt", {}, element("span", { textContent: t(`expert.${code}`) }),
+        element("span", { id: id || "", textContent: `${MARKS[state] || ""} ${shown}` })),
+      element("dd", { textContent: [t(`expert.${code}.text`), limit].filter(Boolean).join(" ") }))));
     if (isFirstRecord || !record || record.history) drawCharts();
     if (!record) fitCharts();
   });

@@ -66,12 +66,18 @@ function processing(flight) {
   return { state: waiting > QUEUE_CAUTION ? "caution" : "good", value: number(waiting) };
 }
 
-function link(_flight, feed) {
+function link(flight, feed) {
+  // The end of the service after landing is no fault.
+  if (!feed.isLinked && flight.brief.phase === "landed") return { state: "off", value: t("link.ended") };
   return { state: feed.isLinked ? "good" : "warning", value: t(feed.isLinked ? "lamp.live" : "lamp.lost") };
 }
 
 const LAMPS = { heads: [heads, "devices"], trigger: [trigger, "devices"], time: [time, "expert"], position: [position, "flight"],
   disk: [disk, "devices"], processing: [processing, "exposures"], link: [link, "alarms"] };
+
+// The state and value of each lamp.
+export const lampStates = (feed) =>
+  Object.fromEntries(Object.entries(LAMPS).map(([name, [compute]]) => [name, compute(feed.flight, feed)]));
 
 export function start(root, feed) {
   const lamps = Object.entries(LAMPS).map(([name, [compute, tab]]) => {

@@ -16,6 +16,10 @@ import * as verdict from "./verdict.js";
 import * as devices from "./devices.js";
 import * as exposure from "./exposure.js";
 import * as left from "./left.js";
+import * as checklist from "./checklist.js";
+import * as landing from "./landing.js";
+import * as wakeLock from "./wake_lock.js";
+import * as install from "./install.js";
 import * as expert from "./expert.js";
 import * as map from "./map.js";
 import * as plan from "./plan.js";
@@ -24,12 +28,20 @@ import * as quicklook from "./quicklook.js";
 // Each with the element that it fills. They start in this order.
 const MODULES = [
   [tabs, "tabs"], [keys, "settings"], [settings, "settings"], [lamps, "lamps"], [phase, "phase-actions"],
-  [alarms, "page-alarms"], [verdict, "verdict-panel"], [left, "left"], [devices, "page-devices"],
+  [alarms, "page-alarms"], [verdict, "verdict-panel"], [left, "left"], [checklist, "checklist"],
+  [landing, "landing"], [wakeLock, "settings"], [install, "settings"], [devices, "page-devices"],
   [exposure, "exposure-panel"], [map, "map-panel"], [plan, "reflights"], [quicklook, "image-panel"], [expert, "page-expert"],
 ];
 
 fill();
-for (const [module, id] of MODULES) module.start(by(id), feed);
+for (const [module, id] of MODULES) {
+  // A panel that cannot start leaves the others alive.
+  try {
+    module.start(by(id), feed);
+  } catch (error) {
+    console.error(error);
+  }
+}
 document.body.dataset.ready = "";
 
 const CLOCK_MS = 1000;
@@ -63,6 +75,7 @@ function showLink(isLinked) {
   by("connection-lost").hidden = isLinked || !(isLive || feed.flight.brief);
   isLive = isLinked;
   feed.drawLamps();
+  feed.drawAlarms();
 }
 
 connect(showLink, async () => {

@@ -11,6 +11,8 @@ export const flight = {
   settings: null,
 };
 
+const SILENCE_MS = 5000;
+const REFUSAL_TIMEOUT_MS = 5000;
 const listeners = new Set();
 
 export function onChange(listener) {
@@ -38,7 +40,7 @@ function merge(record, isFirstRecord) {
 
 async function isRefused() {
   try {
-    return (await fetch("/api/v1/brief", { headers: headers() })).status === 401;
+    return (await fetch("/api/v1/brief", { headers: headers(), signal: AbortSignal.timeout(REFUSAL_TIMEOUT_MS) })).status === 401;
   } catch {
     return false;
   }
@@ -56,23 +58,11 @@ export function connect(onLinkChange, requestToken) {
     // A browser sets no other header of a WebSocket; a token in the address would appear in logs.
     const protocols = token ? ["syntopic.v1", `bearer.${token}`] : ["syntopic.v1"];
     const socket = new WebSocket(`${scheme}://${location.host}/api/v1/telemetry?form=json`, protocols);
-    const restartTimeout = () => {
-      clearTimeout(silence);
-      silence = setTimeout(() => socket.close(), 5000);
-    };
-    socket.onopen = restartTimeout;
-    socket.onmessage = (message) => {
-      waitMs = 500;
-      restartTimeout();
-      // The first record is complete. The previous state may belong to another flight.
-      if (isFirstRecord) {
-        clear();
-        onLinkChange(true);
-      }
-      merge(JSON.parse(message.data), isFirstRecord);
-      isFirstRecord = false;
-    };
-    socket.onclose = async () => {
+    let hasEnded = false;
+    // Also called if the service is silent: a browser may wait long for the end of a dead connection.
+    const end = async () => {
+      if (hasEnded) return;
+      hasEnded = true;
       clearTimeout(silence);
       onLinkChange(false);
       if (isFirstRecord && await isRefused()) {
@@ -83,6 +73,29 @@ export function connect(onLinkChange, requestToken) {
       setTimeout(open, waitMs);
       waitMs = Math.min(waitMs * 2, 8000);
     };
+    const restartTimeout = () => {
+      clearTimeout(silence);
+      silence = setTimeout(() => {
+        socket.close();
+        end();
+      }, SILENCE_MS);
+    };
+    // Also while it opens.
+    restartTimeout();
+    socket.onopen = restartTimeout;
+    socket.onmessage = (message) => {
+      if (hasEnded) return;
+      waitMs = 500;
+      restartTimeout();
+      // The first record is complete. The previous state may belong to another flight.
+      if (isFirstRecord) {
+        clear();
+        onLinkChange(true);
+      }
+      merge(JSON.parse(message.data), isFirstRecord);
+      isFirstRecord = false;
+    };
+    socket.onclose = end;
   };
   open();
 }

@@ -11,4 +11,9 @@ const DRAWN = new Set([
 
 globalThis.trustedTypes?.createPolicy("default", {
   createHTML: (html) => DRAWN.has(html) ? html : html.replaceAll("&", "&amp;").replaceAll("<", "&lt;"),
+  // The one script that is named by an address: the service worker.
+  createScriptURL: (address) => {
+    if (address === "worker.js") return address;
+    throw new TypeError(`no script ${address}`);
+  },
 });

@@ -1,0 +1,82 @@
+// What a test measures on the operator's page. The value of the script is an object of functions.
+(() => {
+  const isSeen = (one) => one.checkVisibility({ checkOpacity: true, checkVisibilityCSS: true }) && one.getClientRects().length > 0;
+  const name = (one) => one.id || one.dataset.command || one.className || one.textContent.trim().slice(0, 30) || one.tagName;
+  const seen = (selector) => [...document.querySelectorAll(selector)].filter(isSeen);
+  const box = (one) => one.getBoundingClientRect();
+  const overlap = (a, b) => Math.min(Math.min(a.right, b.right) - Math.max(a.left, b.left), Math.min(a.bottom, b.bottom) - Math.max(a.top, b.top));
+
+  // The part of an element that its scrolling ancestors leave visible; null if there is none.
+  function shown(one) {
+    let area = box(one);
+    for (let up = one.parentElement; up; up = up.parentElement) {
+      if (getComputedStyle(up).overflow === "visible") continue;
+      const by = box(up);
+      area = { left: Math.max(area.left, by.left), right: Math.min(area.right, by.right), top: Math.max(area.top, by.top), bottom: Math.min(area.bottom, by.bottom) };
+      if (area.left >= area.right || area.top >= area.bottom) return null;
+    }
+    return area;
+  }
+
+  function outside() {
+    const primary = seen("#phase-button, #phase-second, #open-commands, .lamp, #alarm-bar button, #tabs button, #verdict, #left div, #open-settings");
+    return primary.filter((one) => {
+      const { left, top, right, bottom } = box(one);
+      return left < -0.5 || top < -0.5 || right > innerWidth + 0.5 || bottom > innerHeight + 0.5;
+    }).map(name);
+  }
+
+  function overlapping() {
+    const regions = seen("header, #alarm-bar, #connection-lost, #map-panel, #verdict-panel, .page, #tabs, #action-bar")
+      .filter((one) => !(one.id === "verdict-panel" && document.querySelector("#pages").contains(one)));
+    const controls = seen("button, input, select, summary, .files a").filter((one) => !one.closest(".leaflet-container") && shown(one));
+    const found = [];
+    for (const [many, area] of [[regions, box], [controls, shown]]) {
+      many.forEach((one, k) => many.slice(k + 1).forEach((other) => {
+        if (!one.contains(other) && !other.contains(one) && overlap(area(one), area(other)) > 1) found.push(`${name(one)} / ${name(other)}`);
+      }));
+    }
+    return found;
+  }
+
+  const smallTexts = () => seen("body *").filter((one) => [...one.childNodes].some((node) => node.nodeType === 3 && node.textContent.trim()))
+    .filter((one) => parseFloat(getComputedStyle(one).fontSize) < 12).map(name);
+
+  const smallTargets = () => seen("button, select, input, summary, .files a, #map-tools *, .leaflet-bar a").filter((one) => one.matches("button, select, input, summary, a"))
+    .filter((one) => box(one).width < 47.5 || box(one).height < 47.5).map((one) => `${name(one)} ${box(one).width}x${box(one).height}`);
+
+  const clipped = () => seen("#phase-button, #phase-second, #alarm-bar button:not(.what), .verdict .word, #tabs .label, .lamp .name")
+    .filter((one) => one.scrollWidth > one.clientWidth + 1).map((one) => `${name(one)}: ${one.textContent}`);
+
+  const channel = (value) => value / 255 <= 0.04045 ? value / 255 / 12.92 : ((value / 255 + 0.055) / 1.055) ** 2.4;
+  const rgb = (text) => text.match(/[\d.]+/g).map(Number);
+  const luminance = ([r, g, b]) => 0.2126 * channel(r) + 0.7152 * channel(g) + 0.0722 * channel(b);
+  function ground(one) {
+    for (let up = one; up; up = up.parentElement) {
+      const found = rgb(getComputedStyle(up).backgroundColor);
+      if (found.length < 4 || found[3] === 1) return found;
+    }
+    return [255, 255, 255];
+  }
+  function contrast(one) {
+    const [a, b] = [luminance(rgb(getComputedStyle(one).color)), luminance(ground(one))].sort((x, y) => y - x);
+    return (a + 0.05) / (b + 0.05);
+  }
+  const contrasts = () => Object.fromEntries(seen(".verdict .word, .verdict .which, #alarm-bar .what *, .faults li *, .lamp .name, .lamp .value, #phase-button, #left dd, #left dt")
+    .filter((one) => one.textContent.trim()).map((one) => [`${name(one)} ${one.textContent.slice(0, 20)}`, contrast(one)]).sort((a, b) => b[1] - a[1]));
+
+  const scrolls = () => document.documentElement.scrollHeight > innerHeight || document.documentElement.scrollWidth > innerWidth || scrollY !== 0;
+
+  window.measures = () => ({ outside: outside(), overlapping: overlapping(), smallTexts: smallTexts(), smallTargets: smallTargets(), clipped: clipped(),
+    weakest: Object.entries(contrasts()).at(-1), scrolls: scrolls() });
+  window.centre = (selector) => {
+    const one = seen(selector)[0];
+    if (!one) return null;
+    one.scrollIntoView({ block: "nearest" });
+    const { left, top, width, height } = box(one);
+    const [x, y] = [left + width / 2, top + height / 2];
+    const hit = document.elementFromPoint(x, y);
+    return one === hit || one.contains(hit) ? [x, y] : null;
+  };
+  return true;
+})()

@@ -1,0 +1,366 @@
+"""The operator's page through a whole flight, at three sizes and in both themes.
+
+One service and one browser for all states. With SYNTOPIC_PICTURES a folder, each state is
+pictured there.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import os
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from daemon.onboard.service.messages import ServiceEvent
+from processing.rig import shipped_rigs
+from tests.browser import Browser, chromium
+from tests.daemon.onboard.monitoring import flight_events
+from tests.daemon.onboard.monitoring.test_page import WITHIN_S, Service
+from tests.npm import npm_package
+
+SIZES = ((1280, 800), (2000, 1200), (390, 844))
+THEMES = ("", "dark")
+MEASURES = Path(__file__).with_name("cockpit_measures.js")
+CONTRAST = 7.0
+"""Of verdict, alarms, lamps and what is left, WCAG 2.2, 1.4.6."""
+DECIDED = {"color-contrast", "label-content-name-mismatch"}
+"""Rules of axe whose incomplete results are decided here: `contrasts` measures the first, where
+axe cannot see through a gradient or an overlap; the second cannot compare a glyph without letters
+with a name."""
+NOON_GPS_NS = 1_466_078_418_000_000_000
+EXPOSURES = ["good", "good", "usable", "good", "good", "refly", "good", "good", "good"]
+
+
+class Cockpit:
+    """A service, a browser on its page, and the present state of the flight."""
+
+    def __init__(self, service: Service, browser: Browser) -> None:
+        self.service, self.browser = service, browser
+        self.mono_s = 100.0
+
+    def emit(self, *events: dict[str, Any]) -> None:
+        for event in events:
+            self.mono_s += 0.1
+            stamped = event | {"mono_ns": str(int(self.mono_s * 1e9))}
+            while not self.service.child.try_send(ServiceEvent(stamped)):
+                time.sleep(0.02)
+
+    def status(self, phase: str, triggers: int = 0, left: int = 4120, **further: Any) -> None:
+        status = flight_events.status(phase, triggers, left)
+        position = status["position"] | {
+            "age_s": 0.2,
+            "satellites": 17,
+            "fix": "3d",
+            "height_m": 1395.0,
+        }
+        position["velocity_ned_mps"] = [55.0 if phase == "flying" else 0.0, 0.0, 0.0]
+        # 2026-06-21, 12:00 UTC and later: light until the evening.
+        disk: dict[str, Any] = {"gps_ns": str(NOON_GPS_NS + int(self.mono_s * 1e9))}
+        disk |= {"disk_free_bytes": left * 150_000_000, "exposure_bytes": 150_000_000}
+        disk |= {"disk_seconds": left * 2.4 if triggers else None, "is_disk_low": left < 100}
+        self.emit(status | {"position": position, "missing": []} | disk | further)
+
+    def resize(self, width: int, height: int, theme: str = "") -> None:
+        metrics = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 500}
+        self.browser.call("Emulation.setDeviceMetricsOverride", **metrics)
+        self.browser.evaluate(f"document.documentElement.dataset.theme = '{theme}'")
+        self.browser.evaluate(
+            "new Promise((r) => requestAnimationFrame(() => requestAnimationFrame(r)))"
+        )
+
+    def until(self, script: str) -> None:
+        self.browser.wait_for(script, WITHIN_S)
+
+    def touch(self, selector: str) -> None:
+        """One touch, where the centre of an element is seen and nothing covers it."""
+        place = self.browser.evaluate(f"centre({json.dumps(selector)})")
+        assert place is not None, f"{selector} is covered or not shown"
+        about = {"x": place[0], "y": place[1], "button": "left", "clickCount": 1}
+        for kind in ("mousePressed", "mouseReleased"):
+            self.browser.call("Input.dispatchMouseEvent", type=kind, **about)
+
+
+def lines() -> dict[str, Any]:
+    features = [
+        {
+            "type": "Feature",
+            "properties": {"id": f"A{k}", "strip": f"S{k}"},
+            "geometry": {
+                "type": "LineString",
+                "coordinates": [[15.43 + 0.004 * k, 47.07], [15.43 + 0.004 * k, 47.082]],
+            },
+        }
+        for k in range(5)
+    ]
+    return {"type": "FeatureCollection", "features": features, "specification": {"sun_deg": 20.0}}
+
+
+def picture_of(number: int) -> np.ndarray:
+    """Fields and a road, so that a picture of the page is not noise."""
+    random = np.random.default_rng(number)
+    fields = random.integers((60, 90, 60), (110, 150, 120), (6, 9, 3)).astype(np.uint8)
+    ground = cv2.resize(fields, (900, 600), interpolation=cv2.INTER_NEAREST)
+    cv2.line(ground, (0, 80 + 40 * number), (900, 300), (170, 170, 170), 9)
+    return ground
+
+
+@pytest.fixture(scope="module")
+def cockpit(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cockpit]:
+    chromium()
+    folder = tmp_path_factory.mktemp("cockpit")
+    mission = folder / "mission"
+    (mission / "L0").mkdir(parents=True)
+    (mission / "rig.toml").write_bytes(shipped_rigs()["ultracam-x-mini"].read_bytes())
+    (mission / "plan.geojson").write_text(json.dumps(lines()))
+    (mission / "service.toml").write_text("[plan]\nground_height_m = 395.0\n")
+    for number in range(1, len(EXPOSURES) + 1):
+        product = mission / f"L2/{number:06d}"
+        product.mkdir(parents=True)
+        cv2.imwrite(str(product / "quicklook.jpg"), picture_of(number))
+        (product / "histogram.json").write_text(
+            json.dumps({"SU00": [0] * 8 + [50] * 24 + [0] * 32})
+        )
+    service = Service(folder)
+    try:
+        with Browser(folder / "profile", width=1280, height=800) as browser:
+            cockpit = Cockpit(service, browser)
+            cockpit.emit(flight_events.mission(str(mission)))
+            for head in [f"SU{k:02d}" for k in range(13)]:
+                cockpit.emit({"event": "bound", "device": head, "kind": "head", "found": {}})
+            for device, kind in (
+                ("gnss", "navigator"),
+                ("trigger", "trigger"),
+                ("probes", "thermometer"),
+            ):
+                cockpit.emit({"event": "bound", "device": device, "kind": kind, "found": {}})
+            cockpit.status("idle")
+            browser.open(service.address)
+            browser.wait_for("document.querySelector('#link')?.innerText === 'connected'", WITHIN_S)
+            browser.evaluate(f"sessionStorage.setItem('token', {json.dumps(service.token)})")
+            yield cockpit
+    finally:
+        if service.child.process.is_alive():
+            service.end()
+
+
+def opened(*devices: str) -> list[dict[str, Any]]:
+    return [{"event": "device", "device": one, "name": "opened"} for one in devices]
+
+
+HEADS = [f"SU{k:02d}" for k in range(13)]
+
+
+def check(cockpit: Cockpit, state: str) -> None:
+    """Measure the page at each size and in each theme, and picture it."""
+    browser = cockpit.browser
+    browser.evaluate(MEASURES.read_text())
+    for turn, (width, height) in enumerate(SIZES):
+        for theme in THEMES:
+            cockpit.resize(width, height, theme)
+            found = browser.evaluate("measures()")
+            where = f"{state} at {width}x{height} {theme or 'light'}"
+            for fault in ("outside", "overlapping", "smallTexts", "smallTargets", "clipped"):
+                assert found[fault] == [], f"{where}: {fault} {found[fault]}"
+            assert not found["scrolls"], where
+            assert found["weakest"][1] >= CONTRAST, f"{where}: {found['weakest']}"
+            if theme == THEMES[turn % 2]:
+                findings = axe(browser)
+                assert findings == [], f"{where}: {findings}"
+        cockpit.resize(width, height, "dark" if state in ("between-lines", "link-lost") else "")
+        save_picture(browser, f"{state}-{width}")
+    cockpit.resize(1280, 800)
+
+
+def axe(browser: Browser) -> list[Any]:
+    """Violations, and incomplete results that are not decided here."""
+    if not browser.evaluate("typeof axe === 'object'"):
+        browser.call("Page.setBypassCSP", enabled=True)
+        browser.evaluate((npm_package("axe-core") / "axe.min.js").read_text())
+    found = browser.evaluate("axe.run(document, {resultTypes: ['violations', 'incomplete']})")
+    assert found["testEngine"]["name"] == "axe-core"
+    return [
+        (one["id"], [node["html"][:120] for node in one["nodes"]][:4])
+        for one in (*found["violations"], *found["incomplete"])
+        if one in found["violations"] or one["id"] not in DECIDED
+    ]
+
+
+def save_picture(browser: Browser, name: str) -> None:
+    if folder := os.environ.get("SYNTOPIC_PICTURES"):
+        browser.evaluate("new Promise((resolve) => setTimeout(resolve, 250))")
+        message = browser.call("Page.captureScreenshot", format="webp", quality=55)
+        path = Path(folder) / f"{name}.webp"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(base64.b64decode(message["data"]))
+
+
+def test_before_arming(cockpit: Cockpit) -> None:
+    cockpit.emit(*opened(*HEADS, "probes"), {"event": "device", "device": "gnss", "name": "fixed"})
+    settings = {"pan": {"exposure_time_us": 4000.0, "gain_db": 0.0, "tdi_shifts": 0}}
+    cockpit.emit(
+        {"event": "exposure-settings", "by": "service", "control": "manual", "settings": settings}
+    )
+    cockpit.status("ready", missing=["no position (check the antenna of the receiver)"])
+    cockpit.until("document.querySelector('#phase').innerText === 'not ready'")
+    cockpit.until("document.querySelector('[data-check=plan].good') !== null")
+    for event in flight_events.exposure(1, "good"):
+        cockpit.emit(event)
+    cockpit.status("ready", triggers=1, missing=["no position (check the antenna of the receiver)"])
+    # Counts end at half of full scale: the test exposure asks for half as much time again.
+    cockpit.until("document.querySelector('#exposure-suggestion').innerText.includes('6000 µs')")
+    cockpit.until("document.querySelector('[data-check=test].good') !== null")
+    assert cockpit.browser.text("#phase-button") == "Arm"
+    check(cockpit, "before-arming")
+
+
+def test_on_a_line(cockpit: Cockpit) -> None:
+    for number, verdict in enumerate(EXPOSURES[1:6], start=2):
+        for event in flight_events.exposure(number, verdict, line="A0", north_m=68.0 * number):
+            cockpit.emit(event)
+    cockpit.status("flying", triggers=6)
+    cockpit.until("document.querySelector('#phase-button').innerText === 'Stop line'")
+    cockpit.until("document.querySelector('#left-lines').innerText.includes('of 5')")
+    cockpit.until("document.querySelector('#left-light').innerText.includes('until 16:')")
+    cockpit.until("/^\\d/.test(document.querySelector('#left-end dd').innerText)")
+    assert "GB" in cockpit.browser.text("#left-disk")
+    assert "min" in cockpit.browser.text("#left-disk") or " h " in cockpit.browser.text(
+        "#left-disk"
+    )
+    check(cockpit, "on-a-line")
+
+
+def test_between_lines(cockpit: Cockpit) -> None:
+    for number, verdict in enumerate(EXPOSURES[6:], start=7):
+        for event in flight_events.exposure(number, verdict, line="A0", north_m=68.0 * number):
+            cockpit.emit(event)
+    cockpit.status("armed", triggers=9)
+    cockpit.until("document.querySelector('#phase-button').innerText === 'Start line'")
+    assert cockpit.browser.text("#phase-second") == "Land"
+    check(cockpit, "between-lines")
+
+
+def test_degraded_with_many_faults(cockpit: Cockpit) -> None:
+    cockpit.emit(flight_events.lost("SU03"), flight_events.lost("gnss"))
+    for number in range(30):
+        name = ("checksum", "frames-missing", "kernel-drops")[number % 3]
+        sentence = (
+            f"Head SU{number % 13:02d} reports a problem of its link. Check cable and network."
+        )
+        cockpit.emit(flight_events.device_event(f"SU{number % 13:02d}", name, sentence, fault=True))
+    cockpit.emit({"event": "disk", "sentence": "The disk is low: room for 40 exposures, 1 min."})
+    cockpit.status("flying", triggers=9, left=40)
+    cockpit.until("document.querySelectorAll('#faults > li').length > 20")
+    for lamp, state in (("heads", "warning"), ("disk", "caution"), ("trigger", "good")):
+        cockpit.until(f"document.querySelector('#lamp-{lamp}').classList.contains('{state}')")
+    assert cockpit.browser.evaluate("document.body.dataset.sounding") == "warning"
+    check(cockpit, "degraded")
+
+
+def test_the_tasks_of_an_operator_take_three_touches_at_most(cockpit: Cockpit) -> None:
+    browser = cockpit.browser
+    tasks: dict[str, tuple[dict[int, list[str]], str]] = {
+        "see the minutes of disk": ({1280: [], 390: []}, "min"),
+        "silence": ({1280: ["#silence"], 390: ["#silence"]}, "sounding"),
+        "shelve an alarm": (
+            {1280: ["#alarm-bar .what", ".shelve"], 390: ["#alarm-bar .what", ".shelve"]},
+            "shelved",
+        ),
+        "find exposure 7": (
+            {
+                1280: ["#tab-exposures", "#rows tr:nth-child(3) button"],
+                390: [
+                    "#tab-more",
+                    "#more-tabs button:nth-child(1)",
+                    "#rows tr:nth-child(3) button",
+                ],
+            },
+            "exposure 7",
+        ),
+        "see which head is lost": ({1280: ["#lamp-heads"], 390: ["#lamp-heads"]}, "SU03"),
+        "stop the line": ({1280: ["#phase-button"], 390: ["#phase-button"]}, "stop"),
+    }
+    done = {
+        "min": "document.querySelector('#left-disk').innerText.includes('min')",
+        "sounding": "document.body.dataset.sounding === ''",
+        "shelved": "document.querySelector('#faults').innerText.includes('shelved until')",
+        "exposure 7": "document.querySelector('#image-which').innerText === '7'",
+        "SU03": "document.querySelector('#devices li.lost').checkVisibility()",
+    }
+    for width, height in (SIZES[0], SIZES[2]):
+        cockpit.resize(width, height)
+        for task, (touches, outcome) in tasks.items():
+            assert len(touches[width]) <= 3, task
+            before = len(cockpit.service.commands)
+            for selector in touches[width]:
+                cockpit.touch(selector)
+            if outcome == "stop":
+                cockpit.service.until(lambda n=before: len(cockpit.service.commands) > n)
+                assert cockpit.service.commands[-1].name == "stop"
+            else:
+                cockpit.until(done[outcome])
+        # A new fault sounds again, although the others are silenced.
+        cockpit.emit(flight_events.lost(f"SU{width // 100:02d}"))
+        cockpit.until("document.body.dataset.sounding === 'warning'")
+        browser.evaluate("sessionStorage.removeItem('shelved')")
+        cockpit.touch("#tab-flight")
+        browser.evaluate("document.activeElement.blur()")
+
+
+def test_an_alarm_is_acknowledged_by_name_and_reports_the_end_of_its_cause(
+    cockpit: Cockpit,
+) -> None:
+    item = "document.querySelector('[data-fault=\"device gnss\"]')"
+    cockpit.until(f"{item} !== null")
+    cockpit.browser.evaluate(f"{item}.querySelector('.acknowledge').click()")
+    cockpit.service.until(lambda: cockpit.service.commands[-1].name == "acknowledge")
+    cockpit.until(f"{item}.innerText.includes('acknowledged by operator (administrator)')")
+    item = "document.querySelector('[data-fault=\"device SU03\"]')"
+    cockpit.emit(flight_events.recovered("SU03"))
+    cockpit.until(f"{item}.innerText.includes('cause is gone')")
+
+
+def test_the_link_is_lost_and_comes_back_by_itself(cockpit: Cockpit) -> None:
+    pid = cockpit.service.child.process.pid
+    assert pid is not None
+    os.kill(pid, signal.SIGSTOP)
+    try:
+        cockpit.until("document.body.classList.contains('connection-lost')")
+        assert "Connection lost" in cockpit.browser.text("#connection-lost")
+        assert "warning" in cockpit.browser.evaluate(
+            "document.querySelector('#lamp-link').className"
+        )
+        check(cockpit, "link-lost")
+    finally:
+        os.kill(pid, signal.SIGCONT)
+    cockpit.until("!document.body.classList.contains('connection-lost')")
+    cockpit.until("document.querySelector('#lamp-link').classList.contains('good')")
+
+
+def test_after_landing_the_summary_stays_without_an_alarm(cockpit: Cockpit) -> None:
+    cockpit.emit({"event": "phase", "phase": "landed"})
+    cockpit.status("landed", triggers=9)
+    browser = cockpit.browser
+    cockpit.until("document.querySelectorAll('[data-file]').length === 4")
+    cockpit.service.end()
+    cockpit.until("document.body.classList.contains('flight-ended')")
+    assert not browser.evaluate("document.body.classList.contains('connection-lost')")
+    lamp = browser.evaluate("document.querySelector('#lamp-link').className")
+    assert "off" in lamp
+    assert browser.evaluate("document.querySelector('#alarm-bar').hidden")
+    assert browser.text("#connection-lost").startswith("Landed. The service ended ")
+    summary = browser.text("#landing")
+    for expected in ("● 7 ▲ 1 ■ 1", "GeoJSON", "KML", "MAVLink", "CSV", "GPS 1466078"):
+        assert expected in summary, expected
+    csv = browser.evaluate("(async () => (await import('/landing.js')).textOf('fly-again.csv'))()")
+    assert csv.startswith("line,strip,kind,from_m")
+    check(cockpit, "after-landing")
+    outside = [url for url in browser.requested if not url.startswith(("data:", "blob:"))]
+    assert all(url.replace("ws:", "http:").startswith(cockpit.service.address) for url in outside)
