@@ -20,7 +20,7 @@ from daemon.onboard.monitoring.client.telemetry_client import (
     ServiceAddress,
     telemetry_records,
 )
-from daemon.onboard.monitoring.web.api import PAGE, add_security_headers
+from daemon.onboard.monitoring.web.page_files import PAGE, add_security_headers
 
 BYTES_PER_S = 4000.0
 """Budget of each link: the brief state each second, and little besides."""

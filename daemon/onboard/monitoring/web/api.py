@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import math
 import time
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -46,10 +46,10 @@ from daemon.onboard.monitoring.web.connections import (
     ConnectionUse,
     source_of,
 )
+from daemon.onboard.monitoring.web.page_files import PAGE, add_security_headers
 from daemon.onboard.monitoring.web.request_body import COMMAND_OPENAPI, command_body
 from daemon.onboard.monitoring.web.request_filter import CONNECTION, bearer_token
 
-PAGE = Path(__file__).parent / "page"
 PROBLEM_JSON = "application/problem+json"
 TELEMETRY_TICK_S = 0.05
 SEND_TIMEOUT_S = 5.0
@@ -69,11 +69,6 @@ IMAGES = {
     "histogram.json": "application/json",
     "quality.json": "application/json",
 }
-CONTENT_SECURITY_POLICY = (
-    "default-src 'self'; img-src 'self' data: blob:; style-src 'self' 'unsafe-inline'; "
-    "connect-src 'self'; frame-ancestors 'none'; base-uri 'none'; form-action 'none'; "
-    "object-src 'none'; require-trusted-types-for 'script'; trusted-types default"
-)
 PRODUCT_POLICY = "sandbox; default-src 'none'; style-src 'unsafe-inline'; img-src data:"
 """Headers of a file from a mission, so that no browser treats it as a page."""
 
@@ -433,19 +428,6 @@ def _add_page(app: FastAPI) -> None:
 def _documented_problem() -> dict[str, Any]:
     schema = Problem.model_json_schema()
     return {"description": "what is wrong", "content": {PROBLEM_JSON: {"schema": schema}}}
-
-
-async def add_security_headers(
-    request: Request, call_next: Callable[[Request], Awaitable[Response]]
-) -> Response:
-    response = await call_next(request)
-    response.headers.setdefault("Content-Security-Policy", CONTENT_SECURITY_POLICY)
-    response.headers["Cross-Origin-Resource-Policy"] = "same-origin"
-    response.headers["Cross-Origin-Opener-Policy"] = "same-origin"
-    response.headers["X-Content-Type-Options"] = "nosniff"
-    response.headers["Referrer-Policy"] = "no-referrer"
-    response.headers["Cache-Control"] = "no-cache"
-    return response
 
 
 async def _http_problem(_request: Request, error: Exception) -> Response:

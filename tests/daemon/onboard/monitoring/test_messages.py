@@ -10,7 +10,7 @@ import pytest
 
 from daemon.onboard.flight.event_table import TABLE, entry_of
 from daemon.onboard.flight.flag_table import FLAG_TABLE
-from daemon.onboard.monitoring.web.api import PAGE
+from daemon.onboard.monitoring.web.page_files import PAGE
 
 LANGUAGES = ("en", "de", "fr", "es", "zh")
 CATALOGS = ("page", "map", "alarm")
