@@ -11,7 +11,7 @@ from rich.progress import Progress
 
 from daemon.cli.exit_status import exit_if_failed
 from daemon.cli.export_block import BLOCK_HELP, block
-from daemon.cli.export_gnss import RINEX_HELP, rinex
+from daemon.cli.export_gnss import RINEX_HELP, TRAJECTORY_HELP, rinex, trajectory
 from daemon.cli.options import AsJson
 from daemon.terminal.console import Console, light_table
 from drivers.base.extras import require
@@ -67,6 +67,7 @@ def export() -> None:
 
 app.command("block", help=BLOCK_HELP)(block)
 app.command("rinex", help=RINEX_HELP)(rinex)
+app.command("trajectory", help=TRAJECTORY_HELP)(trajectory)
 
 
 @app.command()

@@ -1,8 +1,9 @@
-"""`syntopic export rinex`: recorded observations of a receiver for post-processing."""
+"""`syntopic export rinex` and `trajectory`: observations and positions for other programs."""
 
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Annotated
 
@@ -78,3 +79,70 @@ def rinex(
         if count:
             console.print(f"{count} {what}", style="yellow", soft_wrap=True)
     exit_if_failed(done.failures)
+
+
+TRAJECTORY_HELP = """Export a trajectory as SBET, as CSV, or as positions of RTKLIB.
+
+The source is the navigation of the flight or a post-processed trajectory. SBET and CSV require
+attitude, .pos requires standard deviations; other samples are left out and counted. SMRMSG is
+written next to an SBET with --attitude-sigma. `about.json` states coordinate system, time and
+point.
+
+Examples: `syntopic export trajectory MISSION --as sbet --attitude-sigma 5 5 8`,
+`syntopic export trajectory MISSION --as csv --trajectory sbet.out`
+"""
+
+
+def trajectory(
+    mission: Annotated[Path, typer.Argument(help="Mission folder.")],
+    kind: Annotated[str, typer.Option("--as", help="Format: sbet, csv or pos.")] = "sbet",
+    source: Annotated[
+        Path | None,
+        typer.Option("--trajectory", help="Post-processed trajectory: SBET, .csv or .pos."),
+    ] = None,
+    receiver: Annotated[str | None, typer.Option(help="Navigator, if there are several.")] = None,
+    attitude_sigma: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(help="Standard deviation of roll, pitch, heading in mdeg."),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    from daemon.mission.layout import Mission
+    from daemon.postflight.export.trajectory_export import (
+        FORMATS,
+        TrajectoryExportError,
+        export_trajectory,
+    )
+
+    if kind not in FORMATS:
+        raise TrajectoryExportError(f"--as is {kind!r}; {', '.join(FORMATS)} are right")
+    sigma_rad = None
+    if attitude_sigma is not None:
+        roll, pitch, heading = (math.radians(value * 1e-3) for value in attitude_sigma)
+        sigma_rad = (roll, pitch, heading)
+    folder = Mission.open(mission)
+    with folder.held():
+        done = export_trajectory(
+            folder,
+            kind,
+            trajectory_file=source,
+            receiver=receiver,
+            attitude_sigma_rad=sigma_rad,
+        )
+    if as_json:
+        content = {
+            "folder": str(done.folder),
+            "files": list(done.files),
+            "samples": done.samples,
+            "left_out": done.left_out,
+            "trajectory": done.trajectory,
+        }
+        typer.echo(json.dumps(content))
+        return
+    console = Console()
+    console.print(
+        f"{done.samples} samples of {done.trajectory} in {done.folder}: {', '.join(done.files)}",
+        soft_wrap=True,
+    )
+    if done.left_out:
+        console.print(f"{done.left_out} samples do not have what {kind} requires", style="yellow")
