@@ -21,8 +21,10 @@ from typing import Any
 import pytest
 
 from daemon.cli.exit_status import ExitStatus
+from tests.documents.test_document_examples import blocks, page_of
 
 ROOT = Path(__file__).parents[2]
+TUTORIAL = "tutorials/your-own-hardware.md"
 BUILD_TIMEOUT_S = 300.0
 COMPILED_HERE = "radiometry"
 """The package of `processing` whose kernels the installation compiles itself."""
@@ -127,6 +129,43 @@ def test_the_wheel_has_page_templates_tables_units_and_the_manual_page(
 
 def _version(installed: Installation) -> str:
     return installed.wheels["syntopic"].name.split("-")[1]
+
+
+def test_the_tutorial_installs_the_wheel_as_it_states(
+    installed: Installation, tmp_path: Path
+) -> None:
+    """The block of the tutorial as it stands, but for the packages of the system.
+
+    The dependencies are on the path, so that pip finds them there and needs no index.
+    """
+    block = next(b for b in blocks(page_of(TUTORIAL)) if b.options.get("needs") == "wheel")
+    lines = [line for line in block.text.splitlines() if "apt-get" not in line]
+    assert len(lines) == 3, lines
+    (tmp_path / "dist").symlink_to(installed.wheels["syntopic"].parent)
+    dependencies = tmp_path / "dependencies"
+    dependencies.mkdir()
+    for entry in Path(sysconfig.get_path("purelib")).iterdir():
+        if "syntopic" not in entry.name and entry.suffix != ".pth":
+            (dependencies / entry.name).symlink_to(entry)
+    done = subprocess.run(
+        ["bash", "-euc", "\n".join([*lines, "command -v syntopic", "syntopic --version"])],
+        cwd=tmp_path,
+        env={
+            "PATH": f"{Path(sys.base_prefix) / 'bin'}:{os.environ['PATH']}",
+            "HOME": str(tmp_path),
+            "PYTHONPATH": str(dependencies),
+            "PIP_NO_INDEX": "1",
+            "PIP_NO_COMPILE": "1",
+        },
+        capture_output=True,
+        text=True,
+        timeout=BUILD_TIMEOUT_S,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    program, version = done.stdout.splitlines()[-2:]
+    assert program == str(tmp_path / ".venv/bin/syntopic")
+    assert version == f"syntopic {_version(installed)}"
 
 
 def test_the_command_prints_version_and_help(installed: Installation) -> None:
