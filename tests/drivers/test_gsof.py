@@ -186,7 +186,8 @@ def test_fields_that_newer_firmware_appends_are_left() -> None:
 
 
 @pytest.mark.parametrize(
-    ("offset_s", "flags", "leap"), [(18, 3, 18), (18, 1, None), (-18, 3, None), (101, 3, None)]
+    ("offset_s", "flags", "leap"),
+    [(18, 3, 18), (18, 1, None), (-18, 3, None), (101, 3, None), (0, 3, None)],
 )
 def test_leap_seconds_are_taken_while_they_are_valid(
     offset_s: int, flags: int, leap: int | None
@@ -312,6 +313,12 @@ def test_other_packets_other_records_and_damage_are_left() -> None:
         bad = decoder.bad_messages
         assert decoder.feed(packet(page), MONO_NS) == []
         assert decoder.bad_messages == bad + 1
+
+
+def test_an_empty_page_is_no_bad_record() -> None:
+    decoder = GsofDecoder("bd")
+    assert decoder.feed(packet(bytes((1, 0, 0))), MONO_NS) == []
+    assert decoder.bad_messages == 0
 
 
 @settings(max_examples=100, deadline=None)

@@ -152,6 +152,19 @@ def test_a_mode_of_exposure_in_the_makers_own_words_is_kept() -> None:
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
+        (
+            TEXT.replace(
+                '<Enumeration Name="TriggerSource"><EnumEntry Name="Software"><Value>0<',
+                '<Enumeration Name="TriggerSource"><ImposedAccessMode>RO</ImposedAccessMode>'
+                '<EnumEntry Name="Other"><Value>0</Value></EnumEntry>'
+                '<EnumEntry Name="Software"><Value>9<',
+            ),
+            "its trigger source is fixed at Other",
+        ),
+        (
+            TEXT.replace('"Continuous"><Value>0', '"Permanent"><Value>0'),
+            "the mode Continuous is needed",
+        ),
         (without("TriggerSoftware"), 'no command TriggerSoftware, set trigger_source = "line"'),
         (without("PayloadSize"), "the head has no feature PayloadSize"),
         (without("Width"), "the head has no feature Width"),
@@ -179,8 +192,8 @@ def test_a_mode_of_exposure_in_the_makers_own_words_is_kept() -> None:
             "its exposure time is fixed, set exposure_time_us = 5000",
         ),
     ],
-    ids=["software", "payload", "width", "start", "burst-of-two", "burst-endless", "line", "bzip2",
-         "encoding", "cycle", "fixed-exposure"],
+    ids=["source", "acquisition", "software", "payload", "width", "start", "burst-of-two",
+         "burst-endless", "line", "bzip2", "encoding", "cycle", "fixed-exposure"],
 )  # fmt: skip
 def test_it_is_refused_with_the_true_reason(text: str | bytes, expected: str) -> None:
     found = refusal_of(text)
@@ -195,7 +208,7 @@ def test_a_gain_that_is_fixed_is_refused_with_its_value_and_accepted_at_it() -> 
         "0x1001C</Address><Length>4</Length><AccessMode>RW",
         "0x1001C</Address><Length>4</Length><AccessMode>RO",
     )
-    assert "its gain is fixed, set gain_db = 3" in refusal_of(text, gain_db=6.0)
+    assert "its gain cannot be set; set gain_db = 3" in refusal_of(text, gain_db=6.0)
     with head(text, gain_db=3.0) as (_, driver, _memory):
         driver.bind()
 

@@ -264,8 +264,9 @@ class HeadConfiguration:
         if name is not None:
             self.gain_feature = name
             hint, held = "choose a gain within the head's bounds", features.number(name)
-            if not features.is_writable(name) and held is not None:
-                hint = f"its gain is fixed, set gain_db = {held:g}"
+            if not features.is_writable(name):
+                hint = "its gain cannot be set"
+                hint += "" if held is None else f"; set gain_db = {held:g}"
             self._writer.set("gain_db", name, self._gain_value(gain_db), hint)
             return
         if gain_db:
@@ -310,5 +311,5 @@ class HeadConfiguration:
     def _write_acquisition_mode(self) -> None:
         if self._features.entries("AcquisitionMode"):
             self._writer.set(
-                "acquisition", "AcquisitionMode", "Continuous", "the head takes single frames only"
+                "acquisition", "AcquisitionMode", "Continuous", "the mode Continuous is needed"
             )

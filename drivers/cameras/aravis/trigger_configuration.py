@@ -67,7 +67,10 @@ def write_trigger(writer: FeatureWriter, settings: AravisSettings) -> None:
         features.set("TriggerSource", source)
     writer.set("trigger_source", "TriggerMode", "On", "the head cannot be triggered")
     offered = ", ".join(features.entries("TriggerSource")) or "no trigger source"
-    writer.set(key, "TriggerSource", source, f"the head has {offered}")
+    held = features.text("TriggerSource")
+    is_fixed = held != source and held and not features.is_writable("TriggerSource")
+    hint = f"its trigger source is fixed at {held}" if is_fixed else f"the head has {offered}"
+    writer.set(key, "TriggerSource", source, hint)
     if settings.trigger_source == "line":
         _write_line(writer, settings)
     delay = features.first_available(TRIGGER_DELAYS)

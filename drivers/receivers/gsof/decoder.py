@@ -96,7 +96,7 @@ class GsofDecoder(MessageDecoder):
     def _on_utc(self, record: GsofRecord) -> None:
         _, _, offset_s, flags = record.values
         self._leap = None
-        if flags & UTC_OFFSET_VALID and 0 <= offset_s <= MAX_LEAP_SECONDS:
+        if flags & UTC_OFFSET_VALID and 0 < offset_s <= MAX_LEAP_SECONDS:
             self._leap = offset_s
 
     def _on_time(self, record: GsofRecord, mono_ns: int) -> None:
