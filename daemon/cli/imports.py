@@ -99,3 +99,64 @@ def dbat(
         f"{counts['image_points']} image points in {out}"
     )
     console.print(f"Next: syntopic adjust {out}")
+
+
+BLOCK_HELP = """Import cameras, orientations and points of another program for `syntopic adjust`.
+
+Programs: colmap (folder of a text model), opensfm (reconstruction.json), metashape (cameras.xml),
+bundler (bundle.out) and bal (problem file). Distortion is converted to the ten parameters by fit
+and refused above 0.02 px. Without --position-sigma the project is a free network.
+
+Examples: `syntopic import block sparse/0 --from colmap --out block`,
+`syntopic import block bundle.out --from bundler --out block --image-sigma 0.3`
+"""
+
+
+@app.command("block", help=BLOCK_HELP)
+def block(
+    path: Annotated[Path, typer.Argument(help="File or folder of the program.")],
+    program: Annotated[
+        str, typer.Option("--from", help="Program: colmap, opensfm, metashape, bundler or bal.")
+    ],
+    out: Annotated[Path, typer.Option(help="Folder for the adjustment project; must be new.")],
+    image_sigma: Annotated[
+        float, typer.Option(help="Standard deviation of image coordinates in px.", min=1e-3)
+    ] = 0.5,
+    position_sigma: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(help="Standard deviation of positions in m: x y z (default: free network)."),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    from daemon.configuration.model import ConfigurationError
+    from daemon.postflight.exchange.block_project import READERS, import_block
+
+    if program not in READERS:
+        raise ConfigurationError([f"--from is {program!r}; {', '.join(READERS)} are right"])
+    if position_sigma is not None and not all(0.0 < sigma < 1e6 for sigma in position_sigma):
+        raise ConfigurationError(["--position-sigma has three positive numbers, in metres"])
+    done = import_block(path, program, out, sigma_px=image_sigma, position_sigma_m=position_sigma)
+    block = done.block
+    counts = {
+        "images": len(block.images),
+        "cameras": len(block.cameras),
+        "object_points": len(block.points.names),
+        "image_points": len(block.points.image),
+    }
+    frame = None if block.frame is None else block.frame.name
+    if as_json:
+        content = {"project": str(out), **counts, "residuals_px": dict(done.residuals_px)}
+        typer.echo(json.dumps(content | {"frame": frame, "notes": list(block.notes)}))
+        return
+    console = Console()
+    worst = max(done.residuals_px.values(), default=0.0)
+    console.print(
+        f"{counts['images']} images of {counts['cameras']} cameras, {counts['object_points']} "
+        f"object points, {counts['image_points']} image points in {out}; distortion carried over "
+        f"within {worst:.4f} px",
+        soft_wrap=True,
+    )
+    for note in block.notes:
+        console.print(note, style="yellow", markup=False)
+    console.print(f"Coordinates: {frame or 'a frame that the file does not state'}")
+    console.print(f"Next: syntopic adjust {out}")

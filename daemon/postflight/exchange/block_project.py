@@ -1,0 +1,223 @@
+"""An adjustment project of an imported block: cameras, orientations, object and image points.
+
+Distortion of the other program is converted to the ten parameters by fit. Without standard
+deviations of positions the project is a free network.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon.postflight.adjustment.project import CheckPoints
+from daemon.postflight.adjustment.project_file import AdjustSection, CameraSection, ProjectFile
+from daemon.postflight.adjustment.project_writer import write_project
+from daemon.postflight.exchange.block import FIT_LIMIT_PX, Block, BlockCamera, BlockError
+from daemon.postflight.exchange.bundler import read_bal, read_bundler
+from daemon.postflight.exchange.colmap import read_colmap
+from daemon.postflight.exchange.metashape import read_metashape
+from daemon.postflight.exchange.opensfm import read_opensfm
+from processing.bundle.network import (
+    INTERIOR,
+    Attitudes,
+    CameraModel,
+    Gnss,
+    ImagePoints,
+    Images,
+    Network,
+    Points,
+    Stations,
+    no_gnss,
+)
+from processing.geometry.forward_distortion import rays_from_measured_px
+from processing.geometry.lens import lens_correction
+from processing.rig import Lens
+
+Array = NDArray[np.float64]
+
+READERS: Mapping[str, Callable[[Path], Block]] = {
+    "colmap": read_colmap,
+    "opensfm": read_opensfm,
+    "metashape": read_metashape,
+    "bundler": read_bundler,
+    "bal": read_bal,
+}
+NOMINAL_PITCH_MM = 1e-3
+"""Of cameras whose file states no pixel size: a residual in um is one in px."""
+_TERMS = ("k1", "k2", "k3", "p1", "p2", "b1", "b2")
+_GRID = 25
+
+
+@dataclass(frozen=True)
+class ImportedBlock:
+    """The block as read, and the largest residual of each camera's fit, px."""
+
+    block: Block
+    residuals_px: Mapping[str, float]
+
+
+def import_block(
+    path: Path,
+    program: str,
+    out: Path,
+    *,
+    sigma_px: float = 0.5,
+    position_sigma_m: tuple[float, float, float] | None = None,
+) -> ImportedBlock:
+    """Write an adjustment project of another program's files.
+
+    Args:
+        path: file or folder of the program.
+        program: key of `READERS`.
+        out: folder of the project; it must be new.
+        sigma_px: standard deviation of image coordinates.
+        position_sigma_m: of the projection centres as observations, x, y, z; None: free network.
+
+    Raises:
+        BlockError: files that cannot be read, or a distortion that cannot be converted.
+        ProjectError: `out` holds a project.
+    """
+    block = READERS[program](path)
+    pitches = [camera.pitch_mm or NOMINAL_PITCH_MM for camera in block.cameras]
+    fits = [_lens_of(c, pitch) for c, pitch in zip(block.cameras, pitches, strict=True)]
+    network = _network(block, pitches, [lens for lens, _ in fits], sigma_px, position_sigma_m)
+    file = ProjectFile(
+        format=1,
+        name=f"{block.name}, imported from {program}",
+        adjust=AdjustSection(robust=True, minimum_norm=position_sigma_m is None),
+        camera=tuple(
+            _section(camera, pitch, lens)
+            for camera, pitch, (lens, _) in zip(block.cameras, pitches, fits, strict=True)
+        ),
+    )
+    none = CheckPoints((), np.zeros((0, 3)), np.zeros((0, 3)))
+    write_project(out, file, network, none)
+    residuals = {c.name: worst for c, (_, worst) in zip(block.cameras, fits, strict=True)}
+    return ImportedBlock(block, residuals)
+
+
+def _lens_of(camera: BlockCamera, pitch_mm: float) -> tuple[Lens, float]:
+    """The lens that corrects what the model distorts, about its principal point."""
+    model = camera.model
+    lens = Lens(f_mm=model.fy_px * pitch_mm)
+    if model.is_pinhole and model.fx_px == model.fy_px:
+        return lens, 0.0
+    columns, rows = np.meshgrid(
+        np.linspace(-0.5, camera.width_px - 0.5, _GRID),
+        np.linspace(-0.5, camera.height_px - 0.5, _GRID),
+    )
+    pixels = np.stack([columns.ravel(), rows.ravel()], axis=1)
+    rays = rays_from_measured_px(model, pixels)
+    if not np.isfinite(rays).all():
+        raise BlockError(
+            f"camera {camera.name}: its distortion has no inverse over the whole image; crop the "
+            "images, or adjust it in the other program with fewer parameters"
+        )
+    up = np.array([pitch_mm, -pitch_mm])
+    measured = (pixels - [model.cx_px, model.cy_px]) * up
+    delta = rays * [lens.f_mm, -lens.f_mm] - measured
+    design = np.stack(
+        [lens_correction(_with(lens, {name: 1.0}), measured).ravel() for name in _TERMS], axis=1
+    )
+    size = np.linalg.norm(design, axis=0)
+    solution, *_ = np.linalg.lstsq(design / size, delta.ravel(), rcond=None)
+    values = dict(zip(_TERMS, (float(v) for v in solution / size), strict=True))
+    lens = _with(lens, values)
+    worst_px = float(np.abs(lens_correction(lens, measured) - delta).max()) / pitch_mm
+    if worst_px > FIT_LIMIT_PX:
+        raise BlockError(
+            f"camera {camera.name}: its distortion fits the ten parameters within {worst_px:.3f} "
+            f"px, {FIT_LIMIT_PX:g} px is the limit; import undistorted images"
+        )
+    return lens, worst_px
+
+
+def _with(lens: Lens, values: Mapping[str, float]) -> Lens:
+    changed: dict[str, Any] = dict(values)
+    return replace(lens, **changed)
+
+
+def _principal_point_mm(camera: BlockCamera, pitch_mm: float) -> tuple[float, float]:
+    model = camera.model
+    return (
+        (model.cx_px - (camera.width_px - 1) / 2.0) * pitch_mm,
+        ((camera.height_px - 1) / 2.0 - model.cy_px) * pitch_mm,
+    )
+
+
+def _section(camera: BlockCamera, pitch_mm: float, lens: Lens) -> CameraSection:
+    xp_mm, yp_mm = _principal_point_mm(camera, pitch_mm)
+    return CameraSection(
+        name=camera.name,
+        f_mm=lens.f_mm,
+        xp_mm=xp_mm,
+        yp_mm=yp_mm,
+        pixel_um=pitch_mm * 1e3,
+        width_px=camera.width_px,
+        height_px=camera.height_px,
+    )
+
+
+def _network(
+    block: Block,
+    pitches: list[float],
+    lenses: list[Lens],
+    sigma_px: float,
+    position_sigma_m: tuple[float, float, float] | None,
+) -> Network:
+    names = tuple(image.name.replace(" ", "_") for image in block.images)
+    n, points = len(names), block.points
+    cameras = []
+    for camera, pitch, lens in zip(block.cameras, pitches, lenses, strict=True):
+        xp_mm, yp_mm = _principal_point_mm(camera, pitch)
+        interior = np.array([getattr(lens, _FIELDS.get(key, key)) for key in INTERIOR])
+        cameras.append(
+            CameraModel(camera.name, lens.f_mm, xp_mm, yp_mm, interior=interior, pixel_mm=pitch)
+        )
+    place = np.array([image.centre_m for image in block.images])
+    of = np.array([image.camera for image in block.images], dtype=np.int64)
+    seen = np.bincount(points.point, minlength=len(points.xyz_m))
+    kept = np.flatnonzero(seen >= 2)
+    renumbered = np.full(len(points.xyz_m), -1)
+    renumbered[kept] = np.arange(len(kept))
+    used = renumbered[points.point] >= 0
+    image = points.image[used]
+    pitch_of = np.array(pitches)[of[image]] if len(image) else np.zeros(0)
+    half = np.array([((c.width_px - 1) / 2.0, (c.height_px - 1) / 2.0) for c in block.cameras])
+    about = (points.px[used] - half[of[image]]) * np.array([1.0, -1.0]) if len(image) else points.px
+    every = np.arange(n)
+    gnss = no_gnss()
+    if position_sigma_m is not None:
+        gnss = Gnss(
+            every, every, place, np.tile(position_sigma_m, (n, 1)), np.zeros((n, 3)),
+            np.full(n, -1), np.zeros(n),
+        )  # fmt: skip
+    return Network(
+        cameras=tuple(cameras),
+        stations=Stations(names, place, np.zeros(n, bool)),
+        attitudes=Attitudes(
+            names, np.array([one.rotation for one in block.images]), np.zeros(n, bool)
+        ),
+        images=Images(names, every, every, of, np.full(n, -1)),
+        points=Points(
+            tuple(points.names[k] for k in kept),
+            points.xyz_m[kept],
+            np.full((len(kept), 3), np.nan),
+            np.zeros(len(kept), bool),
+        ),
+        image_points=ImagePoints(
+            image,
+            renumbered[points.point[used]],
+            about * pitch_of[:, None],
+            np.repeat(sigma_px * pitch_of[:, None], 2, axis=1),
+        ),
+        gnss=gnss,
+    )
+
+
+_FIELDS = {"dx0": "dx0_mm", "dy0": "dy0_mm", "df": "df_mm"}

@@ -1,0 +1,183 @@
+"""Blocks of other programs become projects that `syntopic adjust` brings to their truth."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
+
+from daemon.cli import app
+from daemon.postflight.adjustment.project import read_project
+from daemon.postflight.exchange.block import Block, BlockCamera, BlockImage, BlockPoints
+from daemon.postflight.exchange.colmap import colmap_texts
+from processing.geometry.forward_distortion import ForwardDistortion
+
+RUN = CliRunner()
+F, K1, K2 = 1500.0, -0.05, 0.01
+SIZE = (1600, 1200)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """Nine nadir images over uneven ground, and their measurements with 0.3 px of noise.
+
+    Projection is written here: vision axes, f, k1, k2 about the middle.
+    """
+    random = np.random.default_rng(4)
+    points = np.column_stack([random.uniform(-150, 150, (120, 2)), random.uniform(-20, 20, 120)])
+    centres, turns = [], []
+    for k in range(9):
+        centres.append(np.array([60.0 * (k % 3 - 1), 60.0 * (k // 3 - 1), 200.0 + random.normal()]))
+        tilt = Rotation.from_euler(
+            "xyz", random.normal(0, 2, 3) + np.array([0, 0, 30 * k]), degrees=True
+        )
+        turns.append((tilt * Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))).as_matrix())
+    seen = []
+    for k in range(9):
+        x, y, z = ((points - centres[k]) @ turns[k]).T
+        x, y = x / z, y / z
+        r2 = x * x + y * y
+        radial = 1 + K1 * r2 + K2 * r2 * r2
+        u, v = F * x * radial, F * y * radial
+        seen += [
+            (k, p, float(u[p] + random.normal(0, 0.3)), float(v[p] + random.normal(0, 0.3)))
+            for p in np.flatnonzero((np.abs(u) < 795) & (np.abs(v) < 595)).tolist()
+        ]
+    return points, centres, turns, seen
+
+
+def colmap(scene, folder: Path) -> Path:
+    points, centres, turns, seen = scene
+    flip = np.diag([1.0, -1.0, -1.0])
+    middle = ((SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2)
+    model = ForwardDistortion(F, F, *middle, k1=K1, k2=K2)
+    block = Block(
+        "scene",
+        (BlockCamera("camera1", *SIZE, model),),
+        tuple(
+            BlockImage(f"{k}.jpg", 0, k, c, t @ flip)
+            for k, (c, t) in enumerate(zip(centres, turns, strict=True))
+        ),
+        points=BlockPoints(
+            points,
+            tuple(str(k + 1) for k in range(len(points))),
+            np.array([k for k, *_ in seen]),
+            np.array([p for _, p, *_ in seen]),
+            np.array([(u + middle[0], v + middle[1]) for *_, u, v in seen]),
+        ),
+    )
+    texts, _ = colmap_texts(block, None)
+    folder.mkdir()
+    for name, text in texts.items():
+        (folder / name).write_text(text)
+    return folder
+
+
+def bundler(scene, folder: Path) -> Path:
+    points, centres, turns, seen = scene
+    rows = ["# Bundle file v0.3", f"9 {len(points)}"]
+    for centre, turn in zip(centres, turns, strict=True):
+        r = (turn @ np.diag([1.0, -1.0, -1.0])).T  # looks along -z, y up
+        rows += [f"{F} {K1} {K2}", *(" ".join(map(repr, row)) for row in r.tolist())]
+        rows.append(" ".join(map(repr, (-r @ centre).tolist())))
+    for p, point in enumerate(points):
+        rows += [" ".join(map(repr, point.tolist())), "128 128 128"]
+        own = [(k, u, v) for k, q, u, v in seen if q == p]
+        rows.append(" ".join([str(len(own)), *(f"{k} 0 {u!r} {-v!r}" for k, u, v in own)]))
+    folder.mkdir()
+    (folder / "bundle.out").write_text("\n".join(rows))
+    return folder / "bundle.out"
+
+
+def bal(scene, folder: Path) -> Path:
+    points, centres, turns, seen = scene
+    rows = [f"9 {len(points)} {len(seen)}"]
+    rows += [f"{k} {p} {float(u)!r} {float(-v)!r}" for k, p, u, v in seen]
+    for centre, turn in zip(centres, turns, strict=True):
+        r = (turn @ np.diag([1.0, -1.0, -1.0])).T
+        values = [*Rotation.from_matrix(r).as_rotvec(), *(-r @ centre), F, K1, K2]
+        rows += [repr(float(v)) for v in values]
+    rows += [repr(float(v)) for v in points.ravel()]
+    folder.mkdir()
+    (folder / "problem.txt").write_text("\n".join(rows) + "\n")
+    return folder / "problem.txt"
+
+
+@pytest.mark.parametrize(
+    ("program", "write"), [("colmap", colmap), ("bundler", bundler), ("bal", bal)]
+)
+def test_an_imported_block_adjusts_to_the_truth(scene, tmp_path, program, write) -> None:
+    path = write(scene, tmp_path / "in")
+    done = RUN.invoke(
+        app,
+        ["import", "block", str(path), "--from", program, "--out", str(tmp_path / "project"),
+         "--image-sigma", "0.3", "--position-sigma", "0.05", "0.05", "0.05", "--json"],
+    )  # fmt: skip
+    assert done.exit_code == 0, done.output + str(done.exception)
+    content = json.loads(done.stdout)
+    assert content["images"] == 9 and 0.0 < content["residuals_px"]["camera1"] < 0.02
+    adjusted = RUN.invoke(app, ["adjust", str(tmp_path / "project"), "--json"])
+    assert adjusted.exit_code == 0, adjusted.output + str(adjusted.exception)
+    report = json.loads(adjusted.stdout)
+    assert report["sigma0"] == pytest.approx(1.0, abs=0.1), "0.3 px of noise, stated as 0.3 px"
+    project = read_project(tmp_path / "project/project.toml")
+    assert np.abs(project.network.stations.position_m - np.array(scene[1])).max() < 1e-6
+
+
+def test_all_three_give_the_same_project(scene, tmp_path) -> None:
+    found = []
+    for program, write in (("colmap", colmap), ("bundler", bundler), ("bal", bal)):
+        out = tmp_path / f"{program}-project"
+        path = write(scene, tmp_path / program)
+        done = RUN.invoke(app, ["import", "block", str(path), "--from", program, "--out", str(out)])
+        assert done.exit_code == 0, done.output + str(done.exception)
+        network = read_project(out / "project.toml").network
+        table = network.image_points
+        order = np.lexsort((table.point, table.image))
+        found.append((network, table.xy_mm[order]))
+    for other, xy_mm in found[1:]:
+        assert np.allclose(xy_mm, found[0][1], atol=1e-8)
+        assert np.allclose(other.attitudes.rotation, found[0][0].attitudes.rotation, atol=1e-9)
+        assert np.allclose(other.points.xyz_m, found[0][0].points.xyz_m, atol=1e-9)
+
+
+def test_a_shift_of_half_a_pixel_is_seen_in_the_principal_point(scene, tmp_path) -> None:
+    """A file whose pixel centres are at whole numbers, against COLMAP's definition."""
+    path = colmap(scene, tmp_path / "in")
+    found = []
+    for shift in (0.0, -0.5):
+        lines = (path / "cameras.txt").read_text().splitlines()
+        words = lines[1].split()
+        words[6], words[7] = str(float(words[6]) + shift), str(float(words[7]) + shift)
+        (path / "cameras.txt").write_text("\n".join([lines[0], " ".join(words)]) + "\n")
+        out = tmp_path / f"project{shift}"
+        RUN.invoke(app, ["import", "block", str(path), "--from", "colmap", "--out", str(out)])
+        (camera,) = read_project(out / "project.toml").network.cameras
+        found.append((camera.xp_mm / 1e-3, camera.yp_mm / 1e-3))
+    assert np.allclose(found, [(0.0, 0.0), (-0.5, 0.5)], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("program", "write", "old", "new", "sentence"),
+    [
+        ("bundler", bundler, "# Bundle file v0.3", "# Bundle", "does not begin with"),
+        ("bundler", bundler, "1500.0", "inf", "finite number"),
+        ("bal", bal, "9 120 ", "9 120000 ", "ends before its last number|an observation"),
+        ("bal", bal, "\n0 ", "\n99 ", "an observation of image 99"),
+    ],
+)
+def test_damaged_bundles_are_refused(scene, tmp_path, program, write, old, new, sentence) -> None:
+    path = write(scene, tmp_path / "in")
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+    done = RUN.invoke(
+        app, ["import", "block", str(path), "--from", program, "--out", str(tmp_path / "p")]
+    )
+    assert done.exit_code != 0 and not (tmp_path / "p").exists()
+    assert re.search(sentence, str(done.exception))
