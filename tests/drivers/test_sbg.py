@@ -254,3 +254,23 @@ def test_noise_raises_nothing_and_costs_no_later_log(data: bytes, cut: int) -> N
     assert [r.gps_ns for r in records if isinstance(r, EventMark)][-1:] == [
         START_GPS_NS + 1_000_000
     ]
+
+
+def test_an_unknown_number_of_satellites_is_absent_and_of_another_log_is_not_taken() -> None:
+    unknown = sbg.gps1_pos(0, START_GPS_NS, STATE, ReceiverAccuracy(), 255)
+    assert [s.satellites for s in samples(UTC, unknown, euler(0), nav(0))] == [None]
+    known = sbg.gps1_pos(0, START_GPS_NS, STATE, ReceiverAccuracy(), 7)
+    assert [s.satellites for s in samples(UTC, known, unknown, euler(0), nav(0))] == [7]
+
+
+def test_the_poles_are_places_and_what_is_beyond_them_is_none() -> None:
+    def at(latitude: float, longitude: float) -> bytes:
+        state = replace(STATE, latitude_deg=latitude, longitude_deg=longitude)
+        return sbg.ekf_nav(0, state, ReceiverAccuracy())
+
+    for place in ((90.0, 0.0), (-90.0, 360.0)):
+        (sample,) = samples(UTC, euler(0), at(*place))
+        assert (sample.latitude_deg, sample.longitude_deg) == place
+    for place in ((90.0001, 0.0), (0.0, 360.0001)):
+        decoder, records = decode(UTC, euler(0), at(*place))
+        assert (records, decoder.bad_messages) == ([], 1)

@@ -262,3 +262,24 @@ def test_noise_raises_nothing_and_costs_no_later_message(data: bytes, cut: int) 
         r for at in range(0, len(stream), cut) for r in decoder.feed(stream[at : at + cut], 0)
     ]
     assert [r.count for r in records if isinstance(r, EventMark)][-1:] == [3]
+
+
+@pytest.mark.parametrize(
+    ("status", "leap", "found"),
+    [(7, 18, 18), (3, 18, None), (7, 99, 99), (7, 100, None), (7, -1, None), (7, 0, 0)],
+)
+def test_leap_seconds_are_taken_while_utc_is_valid(
+    status: int, leap: int, found: int | None
+) -> None:
+    message = vectornav.output({3: {12: struct.pack("<Bb", status, leap)}})
+    decoder, _ = decode(message)
+    assert decoder.leap_seconds == found
+
+
+def test_what_names_no_group_or_a_second_byte_of_groups_is_no_message() -> None:
+    extended = bytearray(vectornav.output({0: {1: struct.pack("<Q", START_GPS_NS)}}))
+    extended[1] |= 0x80
+    extended[-2:] = struct.pack(">H", vectornav.crc16(bytes(extended[1:-2])))
+    for start in (bytes(extended), b"\xfa\x00\x00\x00"):
+        framer = vectornav_framer()
+        assert framer.feed(start + nav()) == [nav()]

@@ -15,6 +15,8 @@ from drivers.receivers.xsens.decoder import XsensDecoder
 from drivers.receivers.xsens.framing import data_of
 from drivers.timescales.gps_time import SECOND_NS, WEEK_NS, UtcFields, utc_ns
 from sim_hw.receivers import xsens_messages
+from sim_hw.receivers.emulated_receiver import ReceiverAccuracy
+from tests.sim_hw.receiver_state import START_GPS_NS, STATE
 
 # Recorded from an MTi-G-710 by Einride AB, xsens-go, testdata/1/messages.golden, MIT licence;
 # what their own decoder reads is in testdata/1/output.client.golden.
@@ -289,3 +291,58 @@ def test_the_emulator_encodes_what_was_recorded_byte_by_byte() -> None:
 def test_the_emulator_writes_fixed_point_as_the_manual_defines_it() -> None:
     # MT0101P: the fraction as an unsigned number of 32 bits, then the signed whole number.
     assert xsens_messages.fixed_point(1.5, -0.25) == bytes.fromhex("800000000001c0000000ffff")
+
+
+def test_a_solution_comes_out_in_si_units() -> None:
+    pvt = xsens_messages.gnss_pvt(START_GPS_NS, STATE, ReceiverAccuracy(), 15, 18)
+    times = xsens_messages.utc_time(START_GPS_NS, 18), xsens_messages.sample_time_fine(7)
+    status = xsens_messages.status_word()
+    solution = xsens_messages.message(*times, *xsens_messages.navigation(STATE), status)
+    decoder, (sample,) = decode(xsens_messages.message(pvt), solution)
+    assert isinstance(sample, NavSample)
+    assert (sample.gps_ns, sample.fix, sample.satellites) == (START_GPS_NS, "3d", 15)
+    assert sample.latitude_deg == pytest.approx(STATE.latitude_deg, abs=1e-9)
+    assert sample.longitude_deg == pytest.approx(STATE.longitude_deg, abs=1e-9)
+    assert sample.height_m == pytest.approx(STATE.height_m, abs=1e-9)
+    assert sample.velocity_ned_mps == pytest.approx(STATE.velocity_ned_mps, abs=1e-9)
+    assert sample.roll_rad == pytest.approx(math.radians(STATE.roll_deg), abs=1e-9)
+    assert sample.pitch_rad == pytest.approx(math.radians(STATE.pitch_deg), abs=1e-9)
+    assert sample.heading_rad == pytest.approx(math.radians(STATE.heading_deg), abs=1e-9)
+    assert sample.horizontal_sigma_m == pytest.approx(0.02)
+    assert sample.vertical_sigma_m == pytest.approx(0.03)
+    assert sample.speed_sigma_mps == pytest.approx(0.03)
+    assert (sample.time_valid, decoder.leap_seconds, sample.leap_source) == (True, 18, "receiver")
+
+
+@pytest.mark.parametrize("left_out", ["height", "velocity", "position"])
+def test_sigmas_are_absent_without_their_values(left_out: str) -> None:
+    pvt = xsens_messages.gnss_pvt(START_GPS_NS, STATE, ReceiverAccuracy(), 15, 18)
+    angles, height, place, velocity = xsens_messages.navigation(STATE)
+    data = [xsens_messages.utc_time(START_GPS_NS, 18), angles, place]
+    data += [] if left_out == "height" else [height]
+    data += [] if left_out == "velocity" else [velocity]
+    data.append(xsens_messages.status_word(0 if left_out == "position" else NAVIGATING))
+    (sample,) = samples(xsens_messages.message(pvt), xsens_messages.message(*data))
+    assert (sample.vertical_sigma_m is None) == (left_out in ("height", "position"))
+    assert (sample.speed_sigma_mps is None) == (left_out in ("velocity", "position"))
+    assert (sample.horizontal_sigma_m is None) == (left_out == "position")
+    assert (sample.longitude_deg is None) == (left_out == "position")
+
+
+def test_leap_seconds_are_not_taken_from_a_time_that_is_not_resolved() -> None:
+    kind, content = xsens_messages.gnss_pvt(START_GPS_NS, STATE, ReceiverAccuracy(), 15, 18)
+    for flags, leap in ((7, 18), (3, None)):
+        changed = content[:11] + bytes([flags]) + content[12:]
+        assert decode(xsens_messages.message((kind, changed)))[0].leap_seconds == leap
+
+
+def test_a_datum_whose_head_is_cut_is_bad_and_an_empty_one_is_passed_over() -> None:
+    def raw(body: bytes) -> bytes:
+        covered = b"\xff\x36" + bytes([len(body)]) + body
+        return b"\xfa" + covered + bytes([-sum(covered) & 0xFF])
+
+    for cut in (b"\x00", b"\x00\x10"):
+        decoder, records = decode(raw(cut))
+        assert (records, decoder.bad_messages) == ([], 1)
+    decoder, records = decode(raw(b"\x00\x10\x00"))
+    assert (records, decoder.bad_messages) == ([], 0)
