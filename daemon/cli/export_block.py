@@ -17,11 +17,13 @@ from daemon.terminal.console import Console
 if TYPE_CHECKING:
     from daemon.postflight.exchange.mission_block import ImageKind
     from daemon.postflight.exchange.mission_export import Program, RigChoice
+    from daemon.postflight.exchange.photogrammetry import Angles, Unit
 
 BLOCK_HELP = """Export oriented images with cameras, accuracies and rig for another program.
 
 Programs: colmap (text model and, with --database, position priors with covariance), opensfm (also
-OpenDroneMap's geo.txt and image_groups.txt), metashape (cameras.xml), pix4d, nerfstudio. The folder
+OpenDroneMap's geo.txt and image_groups.txt), metashape (cameras.xml), pix4d, nerfstudio, bingo,
+patb, bluh, imagestation, inpho (project with its camera). The folder
 also has the images as JPEG with EXIF and XMP, and `about.json` with the local frame, the rig and
 the residuals.
 
@@ -37,7 +39,7 @@ Examples: `syntopic export block MISSION --to colmap --trajectory sbet.out --dat
 def block(
     mission: Annotated[Path, typer.Argument(help="Mission folder.")],
     program: Annotated[
-        str, typer.Option("--to", help="Program: colmap, opensfm, metashape, pix4d or nerfstudio.")
+        str, typer.Option("--to", help="Program, such as colmap, metashape or inpho.")
     ],
     images: Annotated[
         str, typer.Option(help="Images: perspective (Level-2) or raw (Level-0).")
@@ -49,6 +51,16 @@ def block(
     copies: Annotated[
         bool, typer.Option("--copies/--no-copies", help="Copies of the images as JPEG.")
     ] = True,
+    angles: Annotated[
+        str | None,
+        typer.Option(
+            help="Order: omega-phi-kappa, phi-omega-kappa or heading-roll-pitch "
+            "(default: the program's own)."
+        ),
+    ] = None,
+    unit: Annotated[
+        str | None, typer.Option(help="Unit of angles: deg or gon (default: the program's own).")
+    ] = None,
     position_sigma: Annotated[
         tuple[float, float, float] | None,
         typer.Option(
@@ -66,14 +78,19 @@ def block(
     from daemon.mission.layout import Mission
     from daemon.postflight.exchange.mission_block import KINDS, block_of_mission
     from daemon.postflight.exchange.mission_export import PROGRAMS, export_block
+    from daemon.postflight.exchange.photogrammetry import ANGLES, UNITS
 
     for option, value, known in (
         ("--to", program, PROGRAMS),
         ("--images", images, KINDS),
         ("--rig", rig, ("auto", "yes", "no")),
+        ("--angles", angles, (None, *ANGLES)),
+        ("--unit", unit, (None, *UNITS)),
     ):
         if value not in known:
-            raise ConfigurationError([f"{option} is {value!r}; {', '.join(known)} are right"])
+            raise ConfigurationError(
+                [f"{option} is {value!r}; {', '.join(filter(None, known))} are right"]
+            )
     if database and program != "colmap":
         raise ConfigurationError([f"--database is COLMAP's; --to is {program}"])
     if position_sigma is not None and not all(0.0 < sigma < 1e4 for sigma in position_sigma):
@@ -97,6 +114,8 @@ def block(
             rig=cast("RigChoice", rig),
             database=database,
             images=copies,
+            angles=cast("Angles | None", angles),
+            unit=cast("Unit | None", unit),
             progress=lambda count: progress.update(task, completed=count),
         )
     if as_json:

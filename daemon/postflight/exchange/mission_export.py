@@ -9,7 +9,7 @@ import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from daemon.mission.layout import Mission
 from daemon.mission.store.direct_io import create_file
@@ -31,11 +31,29 @@ from daemon.postflight.exchange.metashape import metashape_texts
 from daemon.postflight.exchange.mission_block import MissionBlock
 from daemon.postflight.exchange.nerfstudio import nerfstudio_texts
 from daemon.postflight.exchange.opensfm import opensfm_texts
+from daemon.postflight.exchange.photogrammetry import (
+    DEFAULTS,
+    Angles,
+    Unit,
+    photogrammetry_texts,
+)
 from daemon.postflight.exchange.pix4d import pix4d_texts
 from daemon.postflight.export.level2_export import Level2Image, jpeg_with_metadata, metadata_of
 
-Program = Literal["colmap", "opensfm", "metashape", "pix4d", "nerfstudio"]
-PROGRAMS: tuple[Program, ...] = ("colmap", "opensfm", "metashape", "pix4d", "nerfstudio")
+Program = Literal[
+    "colmap",
+    "opensfm",
+    "metashape",
+    "pix4d",
+    "nerfstudio",
+    "bingo",
+    "patb",
+    "bluh",
+    "imagestation",
+    "inpho",
+]
+PROGRAMS: tuple[Program, ...] = get_args(Program)
+WITHOUT_RIG = ("pix4d", "nerfstudio", *DEFAULTS)
 RigChoice = Literal["auto", "yes", "no"]
 RIG_LIMIT_PX = 0.1
 """Change of attitude between heads, at most, for a rig that is chosen automatically."""
@@ -64,6 +82,8 @@ def export_block(
     rig: RigChoice = "auto",
     database: bool = False,
     images: bool = True,
+    angles: Angles | None = None,
+    unit: Unit | None = None,
     progress: Callable[[int], None] = lambda _done: None,
 ) -> ExportedBlock:
     """Write a block for a program, in place of an earlier one.
@@ -72,6 +92,8 @@ def export_block(
         read: the block of the mission.
         rig: whether heads share a rig; "auto" where attitudes hardly change between them.
         database: COLMAP's database as well, with position priors.
+        angles: order of angles for programs that read angles; None is the program's own.
+        unit: of these angles; None is the program's own.
         images: copies of the images as JPEG with EXIF and XMP.
         progress: called with the number of images written.
 
@@ -81,7 +103,13 @@ def export_block(
         OSError: the disk refused.
     """
     block, chosen, reason = _rigged(read, rig, program)
-    texts, residuals = _texts(program, block, chosen)
+    if program in DEFAULTS:
+        texts = photogrammetry_texts(program, block, SUFFIX, angles, unit)
+        residuals = {camera.name: 0.0 for camera in block.cameras}
+    elif angles is not None or unit is not None:
+        raise BlockError(f"{program} has angles of its own; leave --angles and --unit out")
+    else:
+        texts, residuals = _texts(program, block, chosen)
     about = _about(read, block, program, chosen, reason, residuals)
     folder = mission.export_dir / "block" / program
     priors = 0
@@ -129,7 +157,7 @@ def _rigged(
     if choice == "no" or len(block.cameras) == 1:
         reason = "one camera" if len(block.cameras) == 1 else "not requested"
         return block, None, reason
-    if program in ("pix4d", "nerfstudio"):
+    if program in WITHOUT_RIG:
         return block, None, f"{program} has no rig in this file"
     reference = _reference(read)
     try:
