@@ -8,6 +8,7 @@ from __future__ import annotations
 import base64
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import timedelta
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -23,7 +24,9 @@ from daemon.mission.store.level0_folder import read_sealed
 from daemon.mission.store.level2 import read_report
 from daemon.planning.mission_coverage import coverage_of
 from daemon.postflight.displacements import flight_displacements, write_displacements
+from daemon.products.exposure_conditions import GPS_EPOCH
 from daemon.terminal.console import visible_value
+from drivers.timescales.leap_seconds import leap_seconds_at
 from processing.quality.band_levels import level_steps
 from processing.quality.figures import QualityFigures
 from processing.quality.figures.circumstances import DcFigures
@@ -143,6 +146,7 @@ def _exposure(mission: Mission, number: int) -> tuple[dict[str, Any], list[Expos
         "shown": figures.as_json(),
         "findings": report.get("findings", []),
         "gps": _gps_text(record.get("mark_gps_ns")),
+        "utc": _utc_text(record.get("mark_gps_ns")),
         "worst_time_sigma_ns": _worst_time_sigma(record),
         "quicklook": readable(lambda: _data_uri(level2 / "quicklook.jpg", "image/jpeg"), None),
         "residuals": readable(lambda: _data_uri(level2 / "residuals.svg", "image/svg+xml"), None),
@@ -162,6 +166,15 @@ def _gps_text(gps_ns: str | None) -> str:
     seconds, nanoseconds = divmod(int(gps_ns), 1_000_000_000)
     week, second = divmod(seconds, 604_800)
     return f"week {week}, {second}.{nanoseconds:09d} s"
+
+
+def _utc_text(gps_ns: str | None) -> str:
+    """UTC to the millisecond, by the table of leap seconds."""
+    if gps_ns is None:
+        return "unknown"
+    leap = timedelta(seconds=leap_seconds_at(int(gps_ns)))
+    utc = GPS_EPOCH + timedelta(microseconds=int(gps_ns) // 1000) - leap
+    return utc.strftime("%Y-%m-%d %H:%M:%S.") + f"{utc.microsecond // 1000:03d}"
 
 
 def _worst_time_sigma(record: Mapping[str, Any]) -> int | None:

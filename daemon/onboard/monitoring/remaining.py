@@ -14,10 +14,9 @@ from typing import Any
 from daemon.onboard.monitoring.coverage import Coverage
 from daemon.onboard.monitoring.flight_state import FlightState
 from daemon.planning.light_window import DEFAULT_ELEVATION_DEG, light_window
+from drivers.timescales.leap_seconds import leap_seconds_at
 
 GPS_EPOCH_UNIX_S = 315_964_800.0
-LEAP_SECONDS = 18.0
-"""Since 2017-01-01; light does not change noticeably in a second."""
 
 
 def remaining_json(
@@ -53,10 +52,10 @@ def remaining_json(
 
 
 def _now_unix_s(state: FlightState) -> float:
-    """UTC by the receiver, within the change of leap seconds; else by this computer."""
+    """UTC by the receiver; else by this computer."""
     gps_ns = state.brief()["status"].get("gps_ns")
     if isinstance(gps_ns, str) and gps_ns.isdecimal():
-        return GPS_EPOCH_UNIX_S + int(gps_ns) * 1e-9 - LEAP_SECONDS
+        return GPS_EPOCH_UNIX_S + int(gps_ns) * 1e-9 - leap_seconds_at(int(gps_ns))
     return time.time()
 
 

@@ -21,6 +21,7 @@ def test_the_report_shows_what_a_time_is_unsure_by_and_the_ledger_of_every_head(
     record = final_record(stored)
     budget = {"clock": 900, "trigger": 24_000, "delay": 1_000, "head": 1_500}
     frames = tuple(replace(frame, time_sigma_ns=24_084) for frame in record.frames)
+    record = replace(record, mark_gps_ns=(2445 * 604_800 + 345_600) * 10**9 + 250_000_000)
     record = replace(record, mark_source="pps", time_budget_ns=budget, frames=frames)
     writer.seal(record)
     writer.close()
@@ -30,4 +31,7 @@ def test_the_report_shows_what_a_time_is_unsure_by_and_the_ledger_of_every_head(
     page = write_report(mission.path, ledger=ledger.sheet().as_json()).path.read_text()
     cells = re.findall(r"<td>(.*?)</td>", page.split("<h2>Time</h2>")[1].split("</table>")[0])
     assert cells == ["1", "pps", "24084", "–", "900", "24000", "1000", "1500", "–"]
+    instant = re.search(r"<td>week 2445, 345600.250000000 s</td><td>([^<]*)</td>", page)
+    assert instant is not None
+    assert instant[1] == "2026-11-18 23:59:42.250"
     assert re.search(rf"<tr><td>{SENSORS[0]}</td><td>1</td><td>0</td><td>0</td><td>1</td>", page)
