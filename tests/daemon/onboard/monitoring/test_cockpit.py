@@ -264,8 +264,87 @@ def test_degraded_with_many_faults(cockpit: Cockpit) -> None:
     check(cockpit, "degraded")
 
 
+def test_no_text_is_missing_from_the_catalogs_and_none_is_clipped(cockpit: Cockpit) -> None:
+    """The pseudo-locale brackets every text of the catalogs and makes it a third longer."""
+    browser = cockpit.browser
+    browser.open(f"{cockpit.service.address}?lang=qps")
+    cockpit.until("document.querySelector('#phase-button')?.innerText.startsWith('[')")
+    cockpit.until("document.querySelectorAll('#faults > li').length > 20")
+    browser.evaluate(MEASURES.read_text())
+    for width, height in SIZES:
+        cockpit.resize(width, height)
+        found = browser.evaluate("measures()")
+        assert found["outside"] == [], f"{width}: {found['outside']}"
+        assert found["overlapping"] == [], f"{width}: {found['overlapping']}"
+        assert not found["scrolls"]
+    untranslated = browser.evaluate(
+        "[...document.querySelectorAll('button, h2, dt, label, th, .lamp .name, .label')]"
+        ".filter((one) => !one.closest('#image-panel, #strip, .leaflet-container'))"
+        ".map((one) => one.textContent.trim()).filter((text) => /[a-z]{3}/i.test(text)"
+        " && !text.includes('['))"
+    )
+    allowed = {"GeoJSON", "KML"}
+    assert [text for text in untranslated if text not in allowed] == []
+
+
+@pytest.mark.parametrize(
+    ("language", "stop"),
+    [
+        ("de", "Linie stoppen"),
+        ("fr", "Arrêter la ligne"),
+        ("es", "Parar línea"),
+        ("zh", "停止航线"),
+    ],
+)
+def test_each_language_fits_the_page(cockpit: Cockpit, language: str, stop: str) -> None:
+    browser = cockpit.browser
+    browser.open(f"{cockpit.service.address}?lang={language}")
+    cockpit.until(f"document.querySelector('#phase-button')?.innerText === '{stop}'")
+    assert browser.evaluate("document.documentElement.lang") == language
+    cockpit.until("document.querySelector('.faults .active')?.innerText.length > 20")
+    browser.evaluate(MEASURES.read_text())
+    for width, height in (SIZES[0], SIZES[2]):
+        cockpit.resize(width, height)
+        found = browser.evaluate("measures()")
+        for fault in ("outside", "overlapping", "clipped"):
+            assert found[fault] == [], f"{language} {width}: {fault} {found[fault]}"
+
+
+def test_the_page_is_worked_by_keys_and_units_are_chosen(cockpit: Cockpit) -> None:
+    browser = cockpit.browser
+    browser.open(cockpit.service.address)
+    cockpit.until("document.querySelector('#phase-button')?.innerText === 'Stop line'")
+    cockpit.resize(1280, 800)
+    for key, page in (("a", "page-alarms"), ("x", "page-expert"), ("d", "page-devices")):
+        browser.call("Input.dispatchKeyEvent", type="keyDown", key=key, text=key)
+        assert browser.evaluate(f"!document.querySelector('#{page}').hidden"), key
+        browser.call("Input.dispatchKeyEvent", type="keyUp", key=key)
+    assert "Standard deviation" in browser.text("#expert")
+    assert browser.text("#speed") == "107 kn"
+    browser.evaluate(
+        "import('/format.js').then((format) => format.setUnit('speed', 'km/h'))"
+        ".then(() => import('/feed.js')).then(({feed}) => feed.refresh())"
+    )
+    cockpit.until("document.querySelector('#speed').textContent === '198 km/h'")
+
+
+def test_the_page_can_be_installed_and_opens_without_the_service(cockpit: Cockpit) -> None:
+    browser = cockpit.browser
+    found = browser.call("Page.getAppManifest")
+    assert found["errors"] == []
+    manifest = json.loads(found["data"])
+    assert (manifest["display"], manifest["start_url"]) == ("standalone", "./")
+    cockpit.until("navigator.serviceWorker.controller !== null")
+    kept = (
+        "caches.open('syntopic-page').then((cache) => cache.keys())"
+        ".then((all) => all.map((one) => new URL(one.url).pathname))"
+    )
+    assert not [path for path in browser.evaluate(kept) if path.startswith("/api/")]
+
+
 def test_the_tasks_of_an_operator_take_three_touches_at_most(cockpit: Cockpit) -> None:
     browser = cockpit.browser
+    browser.evaluate(MEASURES.read_text())
     tasks: dict[str, tuple[dict[int, list[str]], str]] = {
         "see the minutes of disk": ({1280: [], 390: []}, "min"),
         "silence": ({1280: ["#silence"], 390: ["#silence"]}, "sounding"),

@@ -3,7 +3,7 @@
 import { by, element } from "./dom.js";
 import { t } from "./i18n.js";
 
-const FIELDS = "input, select, textarea, dialog, [role=tablist]";
+const FIELDS = "input, select, textarea, dialog";
 
 export function start(_root, feed) {
   document.addEventListener("keydown", (event) => {
