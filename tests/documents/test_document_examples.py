@@ -68,6 +68,7 @@ NOT_RUN: Final[Mapping[tuple[str, str], str]] = {
     ("how-to/flight/tls.md", "root"): "writes to /etc; the tests of TLS run the command elsewhere",
     ("how-to/flight/tls.md", "camera"): "needs a camera computer on the network",
     ("how-to/flight/watching.md", "service"): "needs a service that is armed, with a fault",
+    ("how-to/flight/watching.md", "aircraft"): "needs two services; test_fleet.py gathers several",
     ("how-to/processing/midas.md", "block"): "needs a measured block; its tests make one",
     (
         "how-to/processing/midas.md",
