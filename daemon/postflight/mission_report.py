@@ -6,6 +6,7 @@ It draws what the records and quality reports say; nothing is computed here that
 from __future__ import annotations
 
 import base64
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import timedelta
@@ -22,6 +23,7 @@ from daemon.mission.operator_decisions import manual_verdicts, read_decisions
 from daemon.mission.store.durable import make_directories, replace_file
 from daemon.mission.store.level0_folder import read_sealed
 from daemon.mission.store.level2 import read_report
+from daemon.onboard.flight.flag_table import FLAG_TABLE
 from daemon.planning.mission_coverage import coverage_of
 from daemon.postflight.displacements import flight_displacements, write_displacements
 from daemon.products.exposure_conditions import GPS_EPOCH
@@ -95,6 +97,7 @@ def write_report(
         displaced=_displaced(exposures),
         tested=len(_series(exposures, _displacement_test)),
         flight_sentences=[*displacements["sentences"], *_level_steps(exposures)],
+        tips=_tips(exposures),
         unreadable=failures,
         ledger=ledger,
         geometry=geometry,
@@ -110,6 +113,21 @@ def write_report(
     make_directories(path.parent)
     replace_file(path, html.encode("utf-8"))
     return WrittenReport(path, tuple(failures))
+
+
+def _tips(exposures: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """What to do about each flag of the flight, the most frequent flag first."""
+    counts = Counter(
+        flag
+        for exposure in exposures
+        for flag in dict.fromkeys(exposure["report"].get("flags", []))
+    )
+    known = {entry.name: entry for entry in FLAG_TABLE}
+    return [
+        {"flag": flag, "count": count, "cause": known[flag].cause, "action": known[flag].action}
+        for flag, count in counts.most_common()
+        if flag in known
+    ]
 
 
 def _coverage(mission: Path) -> dict[str, Any] | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -35,3 +36,20 @@ def test_the_report_shows_what_a_time_is_unsure_by_and_the_ledger_of_every_head(
     assert instant is not None
     assert instant[1] == "2026-11-18 23:59:42.250"
     assert re.search(rf"<tr><td>{SENSORS[0]}</td><td>1</td><td>0</td><td>0</td><td>1</td>", page)
+
+
+def test_the_report_advises_on_each_flag_of_the_flight(tmp_path: Path) -> None:
+    mission = new_mission(tmp_path)
+    writer = Level0Writer(mission)
+    for number, flags in ((1, ["TILT"]), (2, ["TILT", "BLUR"])):
+        writer.seal(final_record(store_one(writer, number)))
+        folder = mission.path / f"L2/{number:06d}"
+        folder.mkdir(parents=True, exist_ok=True)
+        report = {"verdict": "usable", "flags": flags, "findings": [], "figures": {}}
+        (folder / "quality.json").write_text(json.dumps(report))
+    writer.close()
+    page = write_report(mission.path).path.read_text()
+    advice = page.split("<h2>What to do</h2>")[1].split("</table>")[0]
+    rows = re.findall(r"<tr><td>(\w+)</td><td>(\d)</td>", advice)
+    assert rows == [("TILT", "2"), ("BLUR", "1")]
+    assert "Fly straight and level" in advice

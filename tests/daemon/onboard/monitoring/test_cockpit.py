@@ -391,6 +391,8 @@ def test_the_tasks_of_an_operator_take_three_touches_at_most(cockpit: Cockpit) -
         browser.evaluate("sessionStorage.removeItem('shelved')")
         cockpit.touch("#tab-flight")
         browser.evaluate("document.activeElement.blur()")
+    # A browser plays after the first touch: the tones were generated.
+    assert int(browser.evaluate("document.body.dataset.sounded ?? '0'")) >= 1
 
 
 def test_an_alarm_is_acknowledged_by_name_and_reports_the_end_of_its_cause(
@@ -441,5 +443,8 @@ def test_after_landing_the_summary_stays_without_an_alarm(cockpit: Cockpit) -> N
     csv = browser.evaluate("(async () => (await import('/landing.js')).textOf('fly-again.csv'))()")
     assert csv.startswith("line,strip,kind,from_m")
     check(cockpit, "after-landing")
+    browser.open(cockpit.service.address)
+    cockpit.until("document.querySelector('#phase-button')?.innerText === 'Starting'")
+    cockpit.until("document.querySelector('#lamp-link .name')?.innerText === 'Link'")
     outside = [url for url in browser.requested if not url.startswith(("data:", "blob:"))]
     assert all(url.replace("ws:", "http:").startswith(cockpit.service.address) for url in outside)
