@@ -60,8 +60,8 @@ def test_earlier_exposures_are_reported_and_received_events_take_precedence(
     assert state.brief()["verdicts"] == {"good": 1, "usable": 0, "refly": MANY - 4}
     assert state.brief()["last_number"] == MANY
     assert [one["sigma0_px"] for one in state.changed("history", 0)] == [0.01, *[0.02] * (MANY - 4)]
-    # What the state may forget is gathered before it does.
-    assert len(on_batch) == 2
+    # What the state may forget is gathered before it does; once more after the manual verdicts.
+    assert len(on_batch) == 3
 
 
 def test_a_folder_that_is_no_mission_costs_only_what_was_before(tmp_path: Path) -> None:
