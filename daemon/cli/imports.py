@@ -91,13 +91,15 @@ def dbat(
         "image_points": len(network.image_points.image),
     }
     if as_json:
-        typer.echo(json.dumps({"project": str(out), **counts}))
+        typer.echo(json.dumps({"project": str(out), **counts, "notes": list(imported.notes)}))
         return
     console = Console()
     console.print(
         f"{counts['images']} images, {counts['object_points']} object points, "
         f"{counts['image_points']} image points in {out}"
     )
+    for note in imported.notes:
+        console.print(note, style="yellow", markup=False)
     console.print(f"Next: syntopic adjust {out}")
 
 

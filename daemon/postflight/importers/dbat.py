@@ -10,7 +10,9 @@ Data with the Damped Bundle Adjustment Toolbox, 2019, and the example script tha
 
 from __future__ import annotations
 
+import math
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,7 +24,9 @@ from daemon.mission.foreign_xml import XmlError, parse_xml
 from daemon.postflight.adjustment.csv_tables import ProjectError
 from daemon.postflight.adjustment.project import CheckPoints
 from daemon.postflight.adjustment.project_file import AdjustSection, CameraSection, ProjectFile
+from daemon.postflight.importers.dbat_settings import filtered, read_settings
 from processing.bundle.network import (
+    INTERIOR,
     Attitudes,
     CameraModel,
     ImagePoints,
@@ -31,13 +35,12 @@ from processing.bundle.network import (
     Points,
     Stations,
 )
+from processing.geometry.rotation import rotation_matrix
 
 Array = NDArray[np.float64]
 
 _MAX_BYTES = 100_000_000
 ELEMENTS_MAX = 10_000
-_FREE = ("dx0", "dy0", "df", "k1", "k2", "k3", "p1", "p2", "b1")
-"""Everything but skew, as its calibration scripts estimate."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +50,7 @@ class ImportedProject:
     file: ProjectFile
     network: Network
     checks: CheckPoints
+    notes: tuple[str, ...] = ()
 
 
 def import_dbat(script: Path) -> ImportedProject:
@@ -70,9 +74,10 @@ def _imported(script: Path, root: ElementTree.Element) -> ImportedProject:
     given = root.find("input")
     if given is None:
         raise ProjectError([f"{script.name}: no input section; a DBAT script has one"])
-    camera = given.find("cameras/camera")
-    if camera is None or len(given.findall("cameras/camera")) != 1:
-        raise ProjectError([f"{script.name}: one camera can be imported"])
+    settings = read_settings(script.name, root)
+    camera = _camera(script, given)
+    if _text(script, camera, "unit") != "mm":
+        raise ProjectError([f"{script.name}: a camera in {camera.findtext('unit')} is not read"])
     width, height = (int(v) for v in _text(script, camera, "image").split(","))
     sensor = _text(script, camera, "sensor").split(",")
     pixel_mm = float(sensor[1]) / height
@@ -91,90 +96,200 @@ def _imported(script: Path, root: ElementTree.Element) -> ImportedProject:
         pixel_um=pixel_mm * 1e3,
         width_px=width,
         height_px=height,
-        free=_FREE,
+        free=settings.free,
     )
+    if settings.io_is_loaded:
+        section = section.model_copy(update=_loaded(script, camera))
     name = root.findtext("meta/name") or script.stem
     file = ProjectFile(
         format=1, name=name.strip(), camera=(section,),
-        adjust=AdjustSection(image_sigma_um=0.1 * pixel_mm * 1e3),
+        adjust=AdjustSection(
+            image_sigma_um=0.1 * pixel_mm * 1e3, minimum_norm=given.find("ctrl_pts") is None
+        ),
     )  # fmt: skip
     network, checks = _network(script, given, section, pixel_mm)
-    return ImportedProject(file, network, checks)
+    return ImportedProject(file, network, checks, settings.notes)
+
+
+def _camera(script: Path, given: ElementTree.Element) -> ElementTree.Element:
+    """The one camera, in the script or in a file of its own."""
+    found = given.findall("cameras/camera")
+    for file in given.findall("cameras/file"):
+        path = _within(script, (file.text or "").strip())
+        found += _parsed(path).findall("cameras/camera")
+    if len(found) != 1:
+        raise ProjectError([f"{script.name}: one camera can be imported"])
+    return found[0]
+
+
+def _loaded(script: Path, camera: ElementTree.Element) -> dict[str, float]:
+    """Calibrated values of a camera in place of its nominal ones."""
+    values: dict[str, float] = {}
+    for key, names in (("cc", ("f_mm",)), ("pp", ("xp_mm", "yp_mm")), ("P", ("p1", "p2"))):
+        if text := camera.findtext(key):
+            numbers = [float(v) for v in text.split(",")]
+            if len(numbers) != len(names):
+                raise ProjectError(
+                    [f"{script.name}: <{key}> has {len(numbers)} values; {len(names)} are right"]
+                )
+            values |= dict(zip(names, numbers, strict=True))
+    radial = [float(v) for v in (camera.findtext("K") or "0").split(",")]
+    if len(radial) > 3 and any(radial[3:]):
+        raise ProjectError([f"{script.name}: <K> has {len(radial)} coefficients; three are read"])
+    values |= dict(zip(("k1", "k2", "k3"), radial[:3], strict=False))
+    if "yp_mm" in values:
+        # Scripts have it negative as y of the image plane is, DBAT's results positive.
+        values["yp_mm"] = -abs(values["yp_mm"])
+    for key, neutral in (("skew", 0.0), ("aspect", 1.0)):
+        if float(camera.findtext(key) or neutral) != neutral:
+            raise ProjectError([f"{script.name}: <{key}> other than {neutral:g} is not read"])
+    return values
 
 
 def _network(
     script: Path, given: ElementTree.Element, section: CameraSection, pixel_mm: float
 ) -> tuple[Network, CheckPoints]:
-    images = _rows(script, given, "images", "id,path")
-    seen = _rows(script, given, "image_pts", "im,id,x,y,sxy")
-    control = _control(script, given)
-    image_names = [row[0] for row in images]
-    point_names = list(dict.fromkeys([*control, *(row[1] for row in seen)]))
+    images = _tables(script, given, "images", ("id", "path"))
+    seen = _tables(script, given, "image_pts", ("im", "id", "x", "y"), ("sxy", "sx", "sy"))
+    control, check = _points(script, given, "ctrl_pts"), _points(script, given, "check_pts")
+    prior = _prior_orientations(script, given)
+    if not control and not prior:
+        raise ProjectError([f"{script.name}: no control points; four are needed to begin"])
+    image_names = [row["id"] for row in images]
+    point_names = list(dict.fromkeys([*control, *(row["id"] for row in seen)]))
     image_at = {name: k for k, name in enumerate(image_names)}
     point_at = {name: k for k, name in enumerate(point_names)}
-    missing = sorted({row[0] for row in seen} - set(image_names))
+    missing = sorted({row["im"] for row in seen} - set(image_names))
     if missing:
         raise ProjectError([f"{script.name}: image points of images {missing[:5]} not listed"])
-    uv = np.array([[float(row[2]), float(row[3])] for row in seen])
-    sigma = np.array([float(row[4]) for row in seen]) * pixel_mm
+    uv = np.array([[float(row["x"]), float(row["y"])] for row in seen])
+    sigma = np.array([_image_sigma(script, row) for row in seen]).reshape(-1, 2) * pixel_mm
     xyz, known = np.full((len(point_names), 3), np.nan), np.full((len(point_names), 3), np.nan)
     for name, (place, spread) in control.items():
         xyz[point_at[name]], known[point_at[name]] = place, spread
     n = len(image_names)
     index = np.arange(n)
+    station, rotation = np.full((n, 3), np.nan), np.full((n, 3, 3), np.nan)
+    for name, (at, turn) in prior.items():
+        if name in image_at:
+            station[image_at[name]], rotation[image_at[name]] = at, turn
+    interior = np.array([getattr(section, name) for name in INTERIOR])
     network = Network(
         cameras=(
             CameraModel(
                 section.name, section.f_mm, section.xp_mm, section.yp_mm, "centred",
-                free=frozenset(section.free), pixel_mm=pixel_mm,
+                interior=interior, free=frozenset(section.free), pixel_mm=pixel_mm,
             ),
         ),
-        stations=Stations(tuple(image_names), np.full((n, 3), np.nan), np.zeros(n, bool)),
-        attitudes=Attitudes(tuple(image_names), np.full((n, 3, 3), np.nan), np.zeros(n, bool)),
+        stations=Stations(tuple(image_names), station, np.zeros(n, bool)),
+        attitudes=Attitudes(tuple(image_names), rotation, np.zeros(n, bool)),
         images=Images(tuple(image_names), index, index, np.zeros(n, np.int64), np.full(n, -1)),
         points=Points(tuple(point_names), xyz, known, np.zeros(len(point_names), bool)),
         image_points=ImagePoints(
-            np.array([image_at[row[0]] for row in seen]),
-            np.array([point_at[row[1]] for row in seen]),
+            np.array([image_at[row["im"]] for row in seen]),
+            np.array([point_at[row["id"]] for row in seen]),
             uv * np.array([pixel_mm, -pixel_mm]),
-            np.stack([sigma, sigma], axis=1),
+            sigma,
         ),
     )  # fmt: skip
-    return network, CheckPoints((), np.zeros((0, 3)), np.zeros((0, 3)))
+    named = {name: value for name, value in check.items() if name in point_at}
+    places = np.array([place for place, _ in named.values()]).reshape(-1, 3)
+    spreads = np.array([spread for _, spread in named.values()]).reshape(-1, 3)
+    return network, CheckPoints(tuple(named), places, spreads)
 
 
-def _control(script: Path, given: ElementTree.Element) -> dict[str, tuple[list[float], float]]:
-    element = given.find("ctrl_pts/file")
-    if element is None:
-        raise ProjectError([f"{script.name}: no control points; four are needed to begin"])
-    kind = (element.get("format") or "").replace(" ", "")
+def _image_sigma(script: Path, row: Mapping[str, str]) -> tuple[float, float]:
+    if "sxy" in row:
+        return float(row["sxy"]), float(row["sxy"])
+    if "sx" in row and "sy" in row:
+        return float(row["sx"]), float(row["sy"])
+    raise ProjectError(
+        [f"{script.name}: image points have no standard deviation; give a column or attribute sxy"]
+    )
+
+
+def _points(
+    script: Path, given: ElementTree.Element, what: str
+) -> dict[str, tuple[list[float], list[float]]]:
+    """Control or check points by id: place and standard deviations, 0 where held."""
+    if given.find(what) is None:
+        return {}
+    rows = _tables(
+        script, given, what, ("id", "x", "y", "z"), ("label", "sx", "sy", "sz", "sxy", "sxyz")
+    )
     found = {}
-    for row in _rows(script, given, "ctrl_pts", kind):
-        if kind == "id,label,x,y,z":
-            found[row[0]] = ([float(v) for v in row[2:5]], 0.0)
-        elif kind == "id,label,x,y,z,sxyz":
-            found[row[0]] = ([float(v) for v in row[2:5]], float(row[5]))
-        else:
-            raise ProjectError([f"{script.name}: control points of format {kind!r} are not read"])
-    return found
+    for row in rows:
+        common = row.get("sxyz", "0")
+        plane = row.get("sxy", common)
+        spread = [row.get("sx", plane), row.get("sy", plane), row.get("sz", common)]
+        found[row["id"]] = ([float(row[k]) for k in "xyz"], [float(v) for v in spread])
+    return filtered(script.name, given.findall(f"{what}/filter"), found)
 
 
-def _rows(script: Path, given: ElementTree.Element, what: str, kind: str) -> list[list[str]]:
-    element = given.find(f"{what}/file")
-    if element is None or not element.text:
+def _prior_orientations(
+    script: Path, given: ElementTree.Element
+) -> dict[str, tuple[list[float], Array]]:
+    """Initial orientations by image: R = Rx(omega) Ry(phi) Rz(kappa), camera to object."""
+    if given.find("prior_eo") is None:
+        return {}
+    units = {(file.get("units") or "").strip() for file in given.findall("prior_eo/file")}
+    if units - {"degrees", "radians"}:
+        raise ProjectError([f"{script.name}: prior_eo in {units}; degrees or radians are right"])
+    scale = math.pi / 180.0 if units == {"degrees"} else 1.0
+    names = ("id", "x", "y", "z", "omega", "phi", "kappa")
+    return {
+        row["id"]: (
+            [float(row[k]) for k in "xyz"],
+            rotation_matrix(*(float(row[k]) * scale for k in names[4:])),
+        )
+        for row in _tables(script, given, "prior_eo", names)
+    }
+
+
+def _tables(
+    script: Path,
+    given: ElementTree.Element,
+    what: str,
+    needed: Sequence[str],
+    optional: Sequence[str] = (),
+) -> list[dict[str, str]]:
+    """Rows of all files of a kind, by the column names of their formats, in any order.
+
+    An attribute of a file that names a column (`sxy`) holds for all of its rows.
+    """
+    rows = []
+    files = given.findall(f"{what}/file")
+    if not files:
         raise ProjectError([f"{script.name}: no file of {what}"])
-    if (element.get("format") or "").replace(" ", "") != kind:
-        raise ProjectError([f"{script.name}: {what} are read in the format {kind!r} only"])
-    path = _within(script, element.text.strip())
-    width = kind.count(",") + 1
+    for element in files:
+        if not element.text:
+            raise ProjectError([f"{script.name}: no file of {what}"])
+        columns = [c.strip() for c in (element.get("format") or "").split(",")]
+        constant = {k: v for k, v in element.attrib.items() if k not in ("format", "units")}
+        unknown = [c for c in (*columns, *constant) if c not in (*needed, *optional)]
+        absent = [c for c in needed if c not in (*columns, *constant)]
+        if unknown or absent or len(set(columns)) < len(columns):
+            raise ProjectError(
+                [
+                    f"{script.name}: {what} of format {element.get('format')!r} are not read: "
+                    f"unknown {unknown}, missing {absent}"
+                ]
+            )
+        rows += _rows(_within(script, element.text.strip()), columns, constant)
+    return rows
+
+
+def _rows(path: Path, columns: Sequence[str], constant: Mapping[str, str]) -> list[dict[str, str]]:
     rows = []
     for number, line in enumerate(_text_of(path).splitlines(), 1):
         if not line.strip() or line.lstrip().startswith("#"):
             continue
         cells = [cell.strip() for cell in line.split(",")]
-        if len(cells) != width:
-            raise ProjectError([f"{path.name}:{number}: {len(cells)} values; {width} are right"])
-        rows.append(cells)
+        if len(cells) != len(columns):
+            raise ProjectError(
+                [f"{path.name}:{number}: {len(cells)} values; {len(columns)} are right"]
+            )
+        rows.append({**constant, **dict(zip(columns, cells, strict=True))})
     return rows
 
 

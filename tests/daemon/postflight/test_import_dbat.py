@@ -1,0 +1,147 @@
+"""Scripts of DBAT in the forms of its examples: columns in any order, filters, cameras in files.
+
+The measurements are those of the camera calibration that `test_adjusting` compares with its result.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from daemon.postflight.adjustment.csv_tables import ProjectError
+from daemon.postflight.importers.dbat import import_dbat
+from processing.geometry.rotation import rotation_matrix
+from tests.daemon.postflight.test_adjusting import FOLDER
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """The example with measurements as id, image, x, y, and the camera in its own file."""
+    for name in ("images/images.txt", "reference/camcal-weighted.txt"):
+        target = tmp_path / name
+        target.parent.mkdir(parents=True)
+        target.write_bytes((FOLDER / name).read_bytes())
+    rows = [
+        [cell.strip() for cell in line.split(",")]
+        for line in (FOLDER / "measurements/markpts.txt").read_text().splitlines()
+        if line.strip() and not line.startswith("#")
+    ]
+    (tmp_path / "marks.txt").write_text("".join(f"{p},{i},{x},{y}\n" for i, p, x, y, _ in rows))
+    camera = (FOLDER / "result/c4040z.xml").read_text()
+    # The result has an affinity, which a camera that begins an adjustment does not.
+    camera = re.sub(r"<sensor>.*</sensor>", "<sensor>auto,5.43764</sensor>", camera)
+    camera = re.sub(r"<aspect>.*</aspect>", "<aspect>1</aspect>", camera, count=1)
+    (tmp_path / "camera.xml").write_text(camera)
+    (tmp_path / "script.xml").write_text(SCRIPT)
+    return tmp_path
+
+
+SCRIPT = """<document dbat_script_version="1.0">
+  <input base_dir="$HERE">
+    <ctrl_pts>
+      <file format="id,label,x,y,z,sxyz">reference/camcal-weighted.txt</file>
+      <filter id="1003">remove</filter>
+    </ctrl_pts>
+    <check_pts>
+      <file format="id,label,x,y,z,sxyz">reference/camcal-weighted.txt</file>
+      <filter id="1003">keep</filter>
+    </check_pts>
+    <images><file format="id,path">images/images.txt</file></images>
+    <image_pts><file format="id,im,x,y" sxy="0.5">marks.txt</file></image_pts>
+    <cameras><file>camera.xml</file></cameras>
+  </input>
+  <operations>
+    <operation min_rays="2">check_ray_count</operation>
+    <operation><set_initial_values><io>loaded</io><op>loaded</op></set_initial_values></operation>
+    <operation><set_bundle_estimate_params>
+      <io><all>true</all><skew>false</skew><K3>false</K3></io>
+      <eo><all>true</all></eo><op><all>default</all></op>
+    </set_bundle_estimate_params></operation>
+    <operation>bundle_adjustment</operation>
+  </operations>
+</document>
+"""
+
+
+def test_columns_filters_camera_files_and_estimates_are_honoured(folder: Path) -> None:
+    done = import_dbat(folder / "script.xml")
+    plain = import_dbat(FOLDER / "camcaldemo.xml")
+    (camera,), (other,) = done.network.cameras, plain.network.cameras
+    assert camera.free == other.free - {"k3"} and "b2" not in camera.free
+    assert camera.f_mm == pytest.approx(7.45699532)
+    assert (camera.xp_mm, camera.yp_mm) == pytest.approx((3.61546240, -2.61329280))
+    assert camera.interior[3] == pytest.approx(4.58860663e-3)
+    table, expected = done.network.image_points, plain.network.image_points
+    assert np.allclose(table.sigma_mm, 5.0 * expected.sigma_mm)
+    order = [
+        np.lexsort((np.array(n.points.names)[n.image_points.point], n.image_points.image))
+        for n in (done.network, plain.network)
+    ]
+    assert np.allclose(table.xy_mm[order[0]], expected.xy_mm[order[1]])
+    known = dict(zip(done.network.points.names, done.network.points.sigma_m, strict=True))
+    assert np.isnan(known["1003"]).all() and np.isfinite(known["1004"]).all()
+    assert done.checks.names == ("1003",)
+
+
+def test_prior_orientations_begin_a_block_without_control(folder: Path) -> None:
+    ids = [
+        line.split(",")[0].strip()
+        for line in (folder / "images/images.txt").read_text().splitlines()
+        if line.strip() and not line.startswith("#")
+    ]
+    (folder / "eo.txt").write_text("".join(f"{k},1.5,2.5,{k},10,-20,30\n" for k in ids))
+    start, end = SCRIPT.index("    <ctrl_pts>"), SCRIPT.index("    <images>")
+    prior = (
+        '<prior_eo><file format="id,x,y,z,omega,phi,kappa" units="degrees">eo.txt</file></prior_eo>'
+    )
+    text = SCRIPT[:start] + prior + SCRIPT[end:]
+    datum = '<operation><set_datum ref_cam="1">depend</set_datum></operation></operations>'
+    (folder / "script.xml").write_text(text.replace("</operations>", datum))
+    done = import_dbat(folder / "script.xml")
+    assert done.file.adjust.minimum_norm
+    assert done.notes == ("set_datum depend: imported as a free network (minimum norm)",)
+    assert np.allclose(done.network.stations.position_m[0], [1.5, 2.5, float(ids[0])])
+    expected = rotation_matrix(*np.radians([10.0, -20.0, 30.0]))
+    assert np.allclose(done.network.attitudes.rotation[0], expected)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [
+        ("<cameras>", "<prior_op/><cameras>", "input <prior_op> is not read"),
+        ('sxy="0.5"', 'weight="0.5"', "unknown ..weight.."),
+        (' sxy="0.5"', "", "no standard deviation"),
+        ('format="id,im,x,y"', 'format="id,im,x,x"', "are not read"),
+        ('<filter id="1003">remove', '<filter id="77">remove', "77.*not there"),
+        ('<filter id="1003">remove', '<filter id="1003">half', "'half' by"),
+        ("<K3>false</K3>", "<K4>false</K4>", "io K4 'false' is not read"),
+        ("<eo><all>true", "<eo><all>false", "eo all 'false' is not read"),
+        ("<io>loaded</io>", "<io>random</io>", "initial values of io"),
+        (">bundle_adjustment<", ">helmert<", "operation helmert is not read"),
+        ('base_dir="$HERE"', 'base_dir="/data"', "base_dir /data is not read"),
+    ],
+)
+def test_what_is_not_honoured_is_refused_by_name(folder: Path, old, new, sentence) -> None:
+    assert old in SCRIPT
+    (folder / "script.xml").write_text(SCRIPT.replace(old, new, 1))
+    with pytest.raises(ProjectError, match=sentence):
+        import_dbat(folder / "script.xml")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [
+        ("<unit>mm", "<unit>px", "camera in px"),
+        ("<skew>0", "<skew>0.1", "<skew> other than 0"),
+        ("<cc>", "<cc>1,", "<cc> has 2 values"),
+    ],
+)
+def test_cameras_that_are_not_carried_are_refused(folder: Path, old, new, sentence) -> None:
+    text = (folder / "camera.xml").read_text()
+    assert old in text
+    (folder / "camera.xml").write_text(text.replace(old, new, 1))
+    with pytest.raises(ProjectError, match=sentence):
+        import_dbat(folder / "script.xml")
