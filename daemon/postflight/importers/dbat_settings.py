@@ -1,7 +1,7 @@
 """Settings of a DBAT script: what is estimated, initial values, filters. What is not honoured is
 refused by its name.
 
-Source: Boerlin et al. (2019), and the example scripts of DBAT (camera calibration, Rome,
+Source: the example scripts of DBAT (camera calibration, Rome,
 Strasbourg).
 """
 
