@@ -258,7 +258,12 @@ def test_degraded_with_many_faults(cockpit: Cockpit) -> None:
     cockpit.emit({"event": "disk", "sentence": "The disk is low: room for 40 exposures, 1 min."})
     cockpit.status("flying", triggers=9, left=40)
     cockpit.until("document.querySelectorAll('#faults > li').length > 20")
-    for lamp, state in (("heads", "warning"), ("disk", "caution"), ("trigger", "good")):
+    for lamp, state in (
+        ("heads", "warning"),
+        ("disk", "caution"),
+        ("position", "caution"),
+        ("trigger", "good"),
+    ):
         cockpit.until(f"document.querySelector('#lamp-{lamp}').classList.contains('{state}')")
     assert cockpit.browser.evaluate("document.body.dataset.sounding") == "warning"
     check(cockpit, "degraded")

@@ -49,7 +49,9 @@ function position(flight) {
   if (!known) return { state: isUnavailable(devicesOf(flight, "navigator")[0] || {}) ? "warning" : "off", value: "–" };
   if (!present) return { state: "warning", value: t("lamp.old", { s: number(known.age_s) }) };
   if (present.fix === "none") return { state: "caution", value: t("lamp.no_fix") };
-  return { state: "good", value: present.satellites == null ? "OK" : `${number(present.satellites)} SV` };
+  // A receiver that is lost is no longer good, although its last position is not old yet.
+  const isLosing = devicesOf(flight, "navigator").some(isUnavailable);
+  return { state: isLosing ? "caution" : "good", value: present.satellites == null ? "OK" : `${number(present.satellites)} SV` };
 }
 
 function disk(flight) {
