@@ -186,3 +186,13 @@ def test_a_mirror_that_works_again_and_an_override_without_need_are_cleared() ->
     both = [{"disk": name, "state": "in use"} for name in ("root", "mirror")]
     latches.apply({"event": "status", "disks": both, "missing": []})
     assert not any(fault["stands"] for fault in latches.listed())
+
+
+@pytest.mark.parametrize(("status", "stands"), [({"is_disk_low": True}, True), ({}, False)])
+def test_a_low_disk_is_cleared_only_when_it_is_no_longer_low(
+    status: dict[str, Any], stands: bool
+) -> None:
+    latches = latches_of({"event": "disk", "sentence": "low"})
+    latches.apply({"event": "status", "exposures_left": 40} | status)
+    (fault,) = latches.listed()
+    assert fault["stands"] is stands
