@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from daemon.cli import (
+    calibrate_board,
     calibrate_boresight,
     calibrate_head,
     calibrate_lab,
@@ -29,7 +30,8 @@ if TYPE_CHECKING:
 
 HELP = """Compute calibrations from laboratory series and flown missions, each as a new, dated file.
 
-Examples: `syntopic calibrate lab SERIES`, `syntopic calibrate thermal MISSION...`
+Examples: `syntopic calibrate board PICTURES --rig rig.toml --board charuco:11x8:30mm:22mm`,
+`syntopic calibrate lab SERIES`, `syntopic calibrate thermal MISSION...`
 """
 
 app = typer.Typer(help=HELP, no_args_is_help=True, rich_markup_mode="markdown")
@@ -62,6 +64,7 @@ def calibrate() -> None:
 app.command(name="radiometric", help=calibrate_radiometric.HELP)(calibrate_radiometric.radiometric)
 app.command(name="head", help=calibrate_head.HELP)(calibrate_head.head)
 app.command(name="lab", help=calibrate_lab.HELP)(calibrate_lab.lab)
+app.command(name="board", help=calibrate_board.HELP)(calibrate_board.board)
 app.command(name="boresight", help=calibrate_boresight.HELP)(calibrate_boresight.boresight)
 app.command(name="rig", help=calibrate_rig.HELP)(calibrate_rig.rig)
 app.command(name="platform", help=calibrate_platform.HELP)(calibrate_platform.platform)

@@ -1,0 +1,485 @@
+"""The report of a calibration from a board: parameters, covariance, coverage, plots."""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from numpy.typing import NDArray
+
+from daemon.postflight.calibration.board.findings import BoardFindings, bend_mm
+from daemon.postflight.calibration.calibration_report import (
+    CalibrationReport,
+    Plot,
+    Previous,
+    Quantity,
+    ReportTable,
+    changes_between,
+    serial_warnings,
+)
+from daemon.postflight.calibration.laboratory.laboratory_series import part_serials
+from daemon.postflight.calibration.rig_writer import rig_toml
+from daemon.postflight.plots import Curve, chart_svg, histogram_svg, svg_of, vectors_svg
+from processing.bundle.adjustment_results import image_residuals_mm
+from processing.bundle.network import INTERIOR
+from processing.calibration.board.adjustment import BoardCalibration
+from processing.calibration.board.network import LENS_KEYS
+from processing.geometry.rotation import angles_by_rotation_vector, rotation_matrix
+from processing.rig import Cone, Rig
+
+Array = NDArray[np.float64]
+
+KIND: Final = "board"
+HIGH_CORRELATION: Final = 0.9
+_MAX_PAIRS: Final = 30
+_UNITS: Final = {
+    "k1": "mm^-2",
+    "k2": "mm^-4",
+    "k3": "mm^-6",
+    "p1": "mm^-1",
+    "p2": "mm^-1",
+    "b1": "1",
+    "b2": "1",
+}
+
+
+@dataclass(frozen=True)
+class BoardParameter:
+    """One number with its column: its derivative by the column's unknown is `sign`.
+
+    Values are in mm, rad and ones.
+    """
+
+    where: str
+    what: str
+    unit: str
+    value: float
+    before: float
+    column: int
+    sign: float = 1.0
+
+
+def estimated_parameters(found: BoardCalibration) -> list[BoardParameter]:
+    """Lenses, sensor places, and small rotations and offsets of heads, as the rig file has them."""
+    result, rows = found.adjustment, []
+    for k, name in enumerate(found.heads):
+        new, old = found.rig.cone(name), found.before.cone(name)
+        columns = result.layout.interior[k]
+        named = {
+            "dx0": ("x", new.sensors[0].x_mm, old.sensors[0].x_mm + old.lens.dx0_mm, 1.0),
+            "dy0": ("y", new.sensors[0].y_mm, old.sensors[0].y_mm + old.lens.dy0_mm, 1.0),
+            # A larger df is a shorter principal distance.
+            "df": ("f", new.lens.f_mm, _distance(old), -1.0),
+        }
+        for j, parameter in enumerate(INTERIOR):
+            if columns[j] < 0:
+                continue
+            what, value, before, sign = named.get(
+                parameter,
+                (
+                    parameter,
+                    float(getattr(new.lens, LENS_KEYS[parameter])),
+                    float(getattr(old.lens, LENS_KEYS[parameter])),
+                    1.0,
+                ),
+            )
+            unit = _UNITS.get(parameter, "mm")
+            rows.append(BoardParameter(name, what, unit, value, before, int(columns[j]), sign))
+    for k, head in enumerate(result.network.heads):
+        if head.name not in found.relative.mountings:
+            continue
+        new, old = found.rig.cone(head.name), found.before.cone(head.name)
+        for axis, what in enumerate(("omega", "phi", "kappa")):
+            rows.append(
+                BoardParameter(
+                    head.name,
+                    what,
+                    "rad",
+                    new.rotation_rad[axis],
+                    old.rotation_rad[axis],
+                    int(result.layout.head_rotation[k, axis]),
+                )
+            )
+        # Offsets are in the axes of the reference camera: right, forward, up.
+        for axis, (what, place, sign) in enumerate(
+            (("right", 1, 1e3), ("forward", 0, 1e3), ("down", 2, -1e3))
+        ):
+            rows.append(
+                BoardParameter(
+                    head.name,
+                    what,
+                    "mm",
+                    new.position_mm[place],
+                    old.position_mm[place],
+                    int(result.layout.head_offset[k, axis]),
+                    sign,
+                )
+            )
+    return rows
+
+
+def _distance(cone: Cone) -> float:
+    return cone.lens.f_mm / (1.0 + cone.lens.df_mm / cone.lens.f_mm)
+
+
+def covariance_of(found: BoardCalibration, rows: Sequence[BoardParameter]) -> Array:
+    """Covariance (n, n), in mm, rad and ones; rotations are small ones about the head's axes.
+
+    Offsets are along the axes of the reference camera.
+    """
+    columns = np.array([r.column for r in rows])
+    sign = np.array([r.sign for r in rows])
+    cofactor = found.adjustment.cofactor[np.ix_(columns, columns)]
+    return np.asarray(cofactor * sign[:, None] * sign)
+
+
+def covariance_bytes(found: BoardCalibration) -> bytes:
+    """`covariance.npz`: names, values and covariance in mm, rad and ones."""
+    rows = estimated_parameters(found)
+    stream = io.BytesIO()
+    np.savez(
+        stream,
+        names=np.array([f"{r.where} {r.what}" for r in rows]),
+        values=np.array([r.value for r in rows]),
+        covariance=covariance_of(found, rows),
+    )
+    return stream.getvalue()
+
+
+def quantities_of(found: BoardCalibration) -> list[Quantity]:
+    """Everything estimated, angles in degrees of omega, phi, kappa."""
+    rows = estimated_parameters(found)
+    covariance = covariance_of(found, rows)
+    sigma = np.sqrt(np.diag(covariance))
+    angles: dict[str, Array] = {}
+    for k, row in enumerate(rows):
+        if row.what == "omega":
+            cone = found.rig.cone(row.where)
+            by = angles_by_rotation_vector("XYZ", rotation_matrix(*cone.rotation_rad))
+            own = by @ covariance[k : k + 3, k : k + 3] @ by.T
+            angles[row.where] = np.sqrt(np.diag(own))
+    quantities = []
+    for row, s in zip(rows, sigma.tolist(), strict=True):
+        if row.unit == "rad":
+            axis = ("omega", "phi", "kappa").index(row.what)
+            degrees = math.degrees(float(angles[row.where][axis]))
+            quantities.append(
+                Quantity(row.where, row.what, "deg", math.degrees(row.value), degrees)
+            )
+        else:
+            quantities.append(Quantity(row.where, row.what, row.unit, row.value, s))
+    return quantities
+
+
+def board_report(
+    found: BoardCalibration,
+    findings: BoardFindings,
+    *,
+    calibration_id: str,
+    date: str,
+    source: str,
+    stays_uncalibrated: bool,
+    previous: Previous | None,
+) -> CalibrationReport:
+    """Build the report."""
+    quantities = quantities_of(found)
+    rows = estimated_parameters(found)
+    serials = part_serials(found.rig, {found.rig.cone(h).sensors[0].name for h in found.heads})
+    warnings = [*findings.blocking, *findings.warnings]
+    if previous is not None:
+        warnings += serial_warnings(previous, serials)
+    bend, bend_sigma = bend_mm(found)
+    return CalibrationReport(
+        kind=KIND,
+        title=f"Calibration of {found.rig.name} from pictures of a board",
+        calibration_id=calibration_id,
+        date=date,
+        facts=[
+            ("pictures", source),
+            ("board", found.board.text),
+            ("rig", f"{found.before.name}, calibration {found.before.calibration_id}"),
+            ("heads", ", ".join(found.heads)),
+            ("relative orientation", ", ".join(found.relative.mountings) or "none"),
+            ("state", "uncalibrated" if stays_uncalibrated else "calibrated"),
+        ],
+        serials=serials,
+        quantities=quantities,
+        figures={
+            "sigma_px": found.sigma_px,
+            "sigma_px_alone": dict(found.single_sigma_px),
+            "redundancy": found.adjustment.redundancy,
+            "unknowns": found.adjustment.unknowns,
+            "observations": found.adjustment.observations,
+            "views": {h: c.views for h, c in findings.coverage.items()},
+            "corners": {h: c.corners for h, c in findings.coverage.items()},
+            "missing": {h: list(c.missing) for h, c in findings.coverage.items()},
+            "left_out": list(found.left_out),
+            "common_exposures": {f"{a} {b}": n for (a, b), n in found.relative.common.items()},
+            "unconnected": list(found.relative.unconnected),
+            "board_bend_mm": bend,
+            "board_bend_sigma_mm": bend_sigma,
+            "stays_uncalibrated": stays_uncalibrated,
+            "near_focus": {
+                h: {
+                    "distance_m": f.distance_m,
+                    "f_mm": f.f_mm,
+                    "shift_mm": f.shift_mm,
+                    "shift_px": f.shift_px,
+                    "blur_px": f.blur_px,
+                }
+                for h, f in findings.focus.items()
+            },
+        },
+        verdicts=_verdicts(found, findings, quantities, stays_uncalibrated=stays_uncalibrated),
+        warnings=warnings,
+        tables=[
+            _parameters(rows, quantities),
+            _correlated(rows, covariance_of(found, rows)),
+            _coverage(findings),
+            _focus(findings),
+        ],
+        plots=_plots(found, findings),
+        previous=None if previous is None else previous.calibration_id,
+        changes=() if previous is None else changes_between(previous.quantities, quantities),
+    )
+
+
+def _verdicts(
+    found: BoardCalibration,
+    findings: BoardFindings,
+    quantities: Sequence[Quantity],
+    *,
+    stays_uncalibrated: bool,
+) -> list[str]:
+    sentences = [
+        f"{len(found.views)} pictures, redundancy {found.adjustment.redundancy}; standard "
+        "deviation "
+        f"of a corner's coordinate {found.sigma_px:.4f} px."
+    ]
+    sigma = {(q.where, q.what): q.sigma or 0.0 for q in quantities}
+    for name in found.heads:
+        cone = found.rig.cone(name)
+        sentence = (
+            f"{name}: principal distance {cone.lens.f_mm:.4f} \u00b1 {sigma[name, 'f']:.4f} mm, "
+            f"principal point \u00b1 {1e3 * max(sigma[name, 'x'], sigma[name, 'y']):.2f} um"
+        )
+        if name in found.relative.mountings:
+            worst = max(sigma[name, what] for what in ("omega", "phi", "kappa"))
+            sentence += f"; angles against {found.reference} \u00b1 {worst:.5f} deg"
+        sentences.append(f"{sentence}.")
+    for name, focus in findings.focus.items():
+        sentences.append(
+            f"{name}: a lens of {focus.f_mm:.3f} mm that is focused at {focus.distance_m:.2f} m "
+            "has a "
+            f"principal distance longer by {focus.shift_mm:.3f} mm than one focused at infinity "
+            f"({focus.shift_px:.1f} px at the corner). Focus as in flight, fix the focus ring, and "
+            f"do not touch it afterwards; focused at infinity the board is blurred by "
+            f"{focus.blur_px:.1f} px at this aperture."
+        )
+    sentences.append(
+        "The rig stays uncalibrated: products are usable at best, with the flag UNCALIBRATED."
+        if stays_uncalibrated
+        else "Every head has a calibrated lens and orientation: the flag UNCALIBRATED is gone. The "
+        "boresight against the inertial unit is another calibration (syntopic calibrate boresight)."
+    )
+    return sentences
+
+
+def calibrated_rig(
+    found: BoardCalibration,
+    findings: BoardFindings,
+    *,
+    date: str,
+    temperature_c: float | None,
+    focused_m: float | None,
+) -> tuple[Rig, bool]:
+    """The new rig, and whether it stays uncalibrated.
+
+    A rig that was calibrated stays so with new values of the heads that took part. One without a
+    calibration becomes calibrated when every head has a lens and an orientation.
+    """
+    cones = []
+    for cone in found.rig.cones:
+        if cone.name in found.heads:
+            if focused_m is not None:
+                focus = findings.focus[cone.name]
+                ppm = math.hypot(cone.lens.f_sigma_ppm, 2e5 * focus.shift_mm / focus.f_mm)
+                lens = replace(cone.lens, f_mm=focus.f_mm, f_sigma_ppm=round(ppm, 3))
+                cone = replace(cone, lens=lens)
+            if temperature_c is not None:
+                sensor = replace(cone.sensors[0], calibration_c=temperature_c)
+                cone = replace(cone, calibration_c=temperature_c, sensors=(sensor,))
+        cones.append(cone)
+    rig = replace(found.rig, cones=tuple(cones))
+    stays_uncalibrated = bool(findings.blocking) and not (
+        rig.is_calibrated and focused_m is None and not found.relative.unconnected
+    )
+    return replace(rig, calibration_date="" if stays_uncalibrated else date), stays_uncalibrated
+
+
+def rig_file(rig: Rig, found: BoardCalibration, *, date: str, blocking: Sequence[str]) -> bytes:
+    """The new rig file; it states its origin and what is still provisional."""
+    lines = [
+        f"{rig.name}, lenses of {', '.join(found.heads)} by `syntopic calibrate board` on {date},",
+        f"in place of calibration {found.before.calibration_id}.",
+        "It counts only where it is configured. Standard deviations and correlations:",
+        "calibration.json and covariance.npz next to it.",
+    ]
+    if not rig.is_calibrated:
+        lines += ["The rig is uncalibrated, there is no [calibration]:", *blocking]
+    return rig_toml(rig, remark="\n".join(lines))
+
+
+def _parameters(rows: Sequence[BoardParameter], quantities: Sequence[Quantity]) -> ReportTable:
+    def in_unit(row: BoardParameter, value: float) -> float:
+        return math.degrees(value) if row.unit == "rad" else value
+
+    return ReportTable(
+        "Parameters",
+        ("head", "what", "value", "sigma", "unit", "in the rig file"),
+        [
+            (
+                q.where,
+                q.what,
+                float(f"{q.value:.9g}"),
+                float(f"{q.sigma or 0.0:.3g}"),
+                q.unit,
+                float(f"{in_unit(r, r.before):.9g}"),
+            )
+            for r, q in zip(rows, quantities, strict=True)
+        ],
+        "x, y: centre of the sensor about the principal point; f: principal distance; the others "
+        "after Heier et al. (2002), eq. 5.1, ideal from measured.",
+    )
+
+
+def _correlated(rows: Sequence[BoardParameter], covariance: Array) -> ReportTable:
+    spread = np.sqrt(np.diag(covariance))
+    correlation = covariance / spread[:, None] / spread
+    i, j = np.triu_indices(len(rows), 1)
+    order = np.argsort(-np.abs(correlation[i, j]))
+    high = [k for k in order.tolist() if abs(correlation[i[k], j[k]]) > HIGH_CORRELATION]
+    return ReportTable(
+        f"Correlations beyond {HIGH_CORRELATION:g}",
+        ("one", "other", "correlation"),
+        [
+            (
+                f"{rows[i[k]].where} {rows[i[k]].what}",
+                f"{rows[j[k]].where} {rows[j[k]].what}",
+                f"{correlation[i[k], j[k]]:+.3f}",
+            )
+            for k in high[:_MAX_PAIRS]
+        ],
+        f"{len(high)} of {len(i)} pairs; all of them are in covariance.npz.",
+    )
+
+
+def _coverage(findings: BoardFindings) -> ReportTable:
+    return ReportTable(
+        "Coverage",
+        ("head", "views", "corners", "corners by part of the image", "missing"),
+        [
+            (
+                head,
+                c.views,
+                c.corners,
+                " | ".join(" ".join(str(n) for n in row) for row in c.cells),
+                "; ".join(c.missing) or "nothing",
+            )
+            for head, c in findings.coverage.items()
+        ],
+        "Nine parts of the image, upper row first.",
+    )
+
+
+def _focus(findings: BoardFindings) -> ReportTable:
+    return ReportTable(
+        "Near focus",
+        ("head", "distance m", "f at infinity mm", "f longer by mm", "px at the corner", "blur px"),
+        [
+            (head, f.distance_m, f.f_mm, f.shift_mm, f.shift_px, f.blur_px)
+            for head, f in findings.focus.items()
+        ],
+        "1/f = 1/s + 1/s': by how much a focus at this distance lengthens the principal distance, "
+        "and the blur of the board where the lens is focused at infinity.",
+    )
+
+
+def _plots(found: BoardCalibration, findings: BoardFindings) -> list[Plot]:
+    result, plots = found.adjustment, []
+    residual = image_residuals_mm(result)
+    of_image = result.network.images.camera[result.network.image_points.image]
+    for k, name in enumerate(found.heads):
+        cone = found.rig.cone(name)
+        sensor, own = cone.sensors[0], of_image == k
+        half = (sensor.width_px * sensor.pitch_mm / 2.0, sensor.height_px * sensor.pitch_mm / 2.0)
+        middle = np.array([sensor.x_mm, sensor.y_mm])
+        rms = float(np.sqrt(np.mean(residual[own] ** 2))) / sensor.pitch_mm
+        plots.append(
+            Plot(
+                f"{name}: residuals",
+                vectors_svg(
+                    f"{name}: residuals of {int(own.sum())} corners, RMS {rms:.4f} px",
+                    result.network.image_points.xy_mm[own] - middle,
+                    residual[own] / sensor.pitch_mm,
+                    half=half,
+                    unit=("px", 1.0),
+                ),
+            )
+        )
+        plots.append(Plot(f"{name}: coverage", _coverage_svg(found, name, findings)))
+        r = np.linspace(0.0, math.hypot(*half), 60)
+        radial = 1e3 * r**3 * (cone.lens.k1 + r**2 * (cone.lens.k2 + r**2 * cone.lens.k3))
+        title = f"{name}: radial distortion"
+        plots.append(
+            Plot(title, chart_svg(title, ("radius mm", "correction um"), [Curve("", r, radial)]))
+        )
+    pitch = np.array([found.rig.cone(h).sensors[0].pitch_mm for h in found.heads])[of_image]
+    plots.append(
+        Plot(
+            "Residuals of coordinates",
+            histogram_svg(
+                "residuals of image coordinates", "px", residual / pitch[:, None], bins=60
+            ),
+        )
+    )
+    return plots
+
+
+def _coverage_svg(found: BoardCalibration, head: str, findings: BoardFindings) -> str:
+    """Corners of all views in the image, and where the board was tilted to."""
+    sensor = found.rig.cone(head).sensors[0]
+    own = [(v, p) for v, p in zip(found.views, found.poses, strict=True) if v.head == head]
+
+    def draw(figure: Figure) -> None:
+        image, tilts = figure.subplots(1, 2, width_ratios=(2.0, 1.2))
+        for view, _ in own:
+            image.plot(*view.corners.px.T, ".", markersize=2.5)
+        image.add_patch(Rectangle((0, 0), sensor.width_px, sensor.height_px, fill=False))
+        image.set(
+            xlim=(0, sensor.width_px), ylim=(sensor.height_px, 0), aspect="equal",
+            xticks=[k * sensor.width_px / 3 for k in (1, 2)],
+            yticks=[k * sensor.height_px / 3 for k in (1, 2)],
+            xticklabels=[], yticklabels=[],
+        )  # fmt: skip
+        image.set_title(f"{head}: {findings.coverage[head].corners} corners, {len(own)} views")
+        for _, pose in own:
+            angle = math.radians(pose.towards_deg)
+            tilt, roll = pose.tilt_deg, math.radians(pose.roll_deg)
+            x, y = tilt * math.cos(angle), tilt * math.sin(angle)
+            ends = 5.0 * np.array([math.cos(roll), math.sin(roll)])
+            tilts.plot([x, x + ends[0]], [y, y + ends[1]], "-", linewidth=1.2)
+            tilts.plot([x], [y], "o", markersize=3.5, color=tilts.lines[-1].get_color())
+        for radius in (15.0, 55.0):
+            circle: Any = np.linspace(0.0, 2.0 * math.pi, 80)
+            tilts.plot(radius * np.cos(circle), radius * np.sin(circle), ":", color="#8a97a5")
+        tilts.set(xlim=(-60, 60), ylim=(-60, 60), aspect="equal")
+        tilts.set_title("tilt, degrees; roll as a line")
+
+    return svg_of(draw, (7.6, 3.8))
