@@ -156,6 +156,18 @@ def test_priors_of_the_database_have_the_stated_covariance_once_a_frame(oblique)
         assert np.abs(prior.position - image.projection_center()).max() < 1e-6
 
 
+def test_a_frame_without_the_image_of_the_master_keeps_its_places(oblique, tmp_path) -> None:
+    mission = Path(shutil.copytree(oblique.path, tmp_path / "mission"))
+    (mission / "L2/000003/nadir.tif").unlink()
+    lost = FlownBlock(mission, oblique.rig, oblique.trajectory, oblique.marks)
+    about, folder = export(lost)
+    assert about["missing"] == ["000003 nadir"] and about["rig"]["reference"] == "nadir"
+    model = pycolmap.Reconstruction(folder / "sparse")
+    assert (len(model.images), len(model.frames)) == (19, 4)
+    worst_px, worst_m = worst_reprojection(lost, model, about, raw=False)
+    assert worst_px < 0.001 and worst_m < 0.001
+
+
 def test_export_import_export_is_byte_identical(oblique, tmp_path: Path) -> None:
     from daemon.postflight.exchange.block import rig_of
     from daemon.postflight.exchange.colmap import colmap_texts
