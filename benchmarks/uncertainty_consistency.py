@@ -98,8 +98,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="syntopic-honest-") as folder:
         samples = render(options.rendered, Path(folder))
     errors = matching_errors(samples)
-    if options.keep_errors is not None:
-        matching_errors(samples[: options.kept]).save(options.keep_errors)
+    if options.save_errors is not None:
+        matching_errors(samples[: options.save_exposures]).save(options.save_errors)
     pools = {
         f"rendered, {name}": pooled(normalized_errors)
         for name, normalized_errors in normalize_samples(samples).items()

@@ -38,6 +38,7 @@ from processing.mosaic.datum import (
     mounting_constraints,
 )
 from processing.mosaic.model import MosaicModel, build_model, placement_at, vip_and_design
+from processing.mosaic.moving_objects import one_sided_shifts, shifted_cofactor
 from processing.mosaic.weights import (
     CLASSES,
     MosaicSettings,
@@ -75,8 +76,9 @@ class Mosaic:
     """The outcome of an adjustment; placements in the virtual image and how good they are.
 
     `values` (u,) are accumulated corrections against the start, `covariance` (u, u) theirs, a
-    posteriori, both in the unknowns' own units (see `MosaicModel`); correlated neighbours are
-    down-weighted (`processing.mosaic.clusters`). `residuals_px` (n, 2) is place
+    posteriori, both in the unknowns' own units (see `MosaicModel`); correlated neighbours
+    (`processing.mosaic.clusters`) and moving objects (`processing.mosaic.moving_objects`) are in
+    it. `residuals_px` (n, 2) is place
     of a minus place of b in the VIP after the adjustment, (x right, y up), for all tie points,
     outliers included; `redundancy_numbers` (n, 2) likewise; `outliers` (n,) marks points not used.
     `sigma0` has no unit; `sigma0_px` is that of one coordinate difference of a P/P pair.
@@ -377,6 +379,8 @@ def _mosaic(
             sigma0,
             pitch_mm=model.pitch_mm,
         )
+        shifts = one_sided_shifts(groups, settings)
+        cofactor = cofactor + shifted_cofactor(groups, blocks, solution.cofactor, scales, shifts)
     ratio = class_scale[PAN_TO_COLOUR] / class_scale[PAN_TO_PAN]
     pitch_um = model.pitch_mm * 1e3
     sigma0_px = sigma0 * settings.sigma_pp_px * class_scale[PAN_TO_PAN]

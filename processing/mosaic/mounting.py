@@ -56,6 +56,9 @@ Array = NDArray[np.float64]
 FAMILY_ALPHA: Final = 1e-5
 """Probability of calling a healthy platform expired: it changes the verdict."""
 MIN_SHIFT_PX: Final = 0.01
+SHIFT_SIGMAS: Final = 6.0
+"""Of a shift that the adjustment left. The sigma of it is that of independent points, those of
+correlated neighbours are up to 1.8 times as large, and every exposure has two for each head."""
 MIN_POINTS: Final = 24
 SCALED_PPM: Final = 100.0
 ALTERNATIVE_SHARE: Final = 0.5
@@ -148,8 +151,8 @@ def verified_mosaic(rig: Rig, mosaic: Mosaic, tie_points: TiePoints) -> Mosaic:
     """The mosaic with residual shifts of its heads turned into small angle increments.
 
     Each head's tie points are compared with its neighbours' by an affine transformation; as a rule
-    the adjustment has left no shift. Where one is left (over three standard deviations and
-    `MIN_SHIFT_PX`), the head goes half of the way: its neighbour is found as far off.
+    the adjustment has left no shift. Where one is left (over `SHIFT_SIGMAS` standard deviations
+    and `MIN_SHIFT_PX`), the head goes half of the way: its neighbour is found as far off.
 
     Args:
         rig: the camera.
@@ -168,7 +171,7 @@ def verified_mosaic(rig: Rig, mosaic: Mosaic, tie_points: TiePoints) -> Mosaic:
         moved = False
         for name, first in mosaic.model.mountings.items():
             shift, sigma, _, points = _affine_shift(rig, mosaic, tie_points, name)
-            significant = np.abs(shift) > np.maximum(3.0 * sigma, MIN_SHIFT_PX)
+            significant = np.abs(shift) > np.maximum(SHIFT_SIGMAS * sigma, MIN_SHIFT_PX)
             if points >= MIN_POINTS and significant.any():
                 middle = _middle_mm(rig, mosaic, name)
                 jacobian = small_rotation_design(middle, mosaic.model.f_mm)[:, :2, 0]

@@ -18,6 +18,7 @@ from processing.mosaic.calibration_support import (
     supported_mosaic,
     weakly_determined_sensors,
 )
+from processing.mosaic.confirmed_points import unconfirmed
 from processing.mosaic.fixed_mosaic import fixed_mosaic
 from processing.mosaic.free_mosaic import Mosaic, MosaicSettings, free_mosaic
 from processing.mosaic.model import residuals_px
@@ -81,6 +82,7 @@ def stitch(
         if method == "pan-only":
             mosaic = verified_mosaic(rig, mosaic, tie_points)
         return Stitching(tie_points, mosaic, mosaic, mosaic, None, ())
+    tie_points = tie_points.only(~unconfirmed(rig, start, tie_points))
     mosaic = free_mosaic(rig, start, tie_points, settings=settings)
     tie_points, mosaic, slips = _without_slips(rig, start, tie_points, mosaic, settings)
     validity = evaluate_master(rig, mosaic, temperatures_c)

@@ -46,7 +46,7 @@ class MosaicSettings:
     sigma_pc_px: float = 0.3
     parallax_px: float = 0.0
     outlier_limit: float = 4.0
-    max_iterations: int = 12
+    max_iterations: int = 20
     min_iterations: int = 3
     converged_px: float = 1e-3
     min_class_redundancy: float = 30.0
@@ -285,21 +285,37 @@ def weight_factors(
 
     Source: docs/explanation/mathematics/mosaicking.md#weights.
     """
-    normalised = []
-    for group in groups:
-        unit = group.sigma[:, None] * np.sqrt(np.maximum(group.redundancy, 1e-3))
-        middle = np.median(group.difference, axis=0) if soft else 0.0
-        normalised.append(np.abs(group.difference - middle) / unit)
-    spread = {}
-    for kind in CLASSES:
-        every = [n.ravel() for n, g in zip(normalised, groups, strict=True) if g.kind == kind]
-        if every:
-            spread[kind] = max(_MAD_TO_SIGMA * float(np.median(np.concatenate(every))), 1e-9)
     factors = []
-    for w, group in zip(normalised, groups, strict=True):
-        largest = w.max(axis=1) / spread[group.kind]
+    for w in normalised_residuals(groups, soft=soft):
+        largest = np.abs(w).max(axis=1)
         if soft:
             factors.append(np.minimum(1.0, _HUBER / np.maximum(largest, 1e-12)))
         else:
             factors.append((largest <= settings.outlier_limit).astype(np.float64))
     return factors
+
+
+def normalised_residuals(groups: Sequence[TiePointGroup], *, soft: bool) -> list[Array]:
+    """Residuals over their standard deviation and the robust spread of their class.
+
+    Args:
+        groups: points with differences and redundancies of an adjustment.
+        soft: whether residuals count from the group's median.
+
+    Returns:
+        x and y, (m, 2) for each group.
+
+    Source: docs/explanation/mathematics/mosaicking.md#weights.
+    """
+    normalised = []
+    for group in groups:
+        unit = group.sigma[:, None] * np.sqrt(np.maximum(group.redundancy, 1e-3))
+        middle = np.median(group.difference, axis=0) if soft else 0.0
+        normalised.append((group.difference - middle) / unit)
+    spread = {}
+    for kind in CLASSES:
+        every = [n.ravel() for n, g in zip(normalised, groups, strict=True) if g.kind == kind]
+        if every:
+            typical = float(np.median(np.abs(np.concatenate(every))))
+            spread[kind] = max(_MAD_TO_SIGMA * typical, 1e-9)
+    return [n / spread[g.kind] for n, g in zip(normalised, groups, strict=True)]

@@ -103,6 +103,19 @@ def test_heads_without_a_significant_shift_stay_where_the_adjustment_put_them() 
     np.testing.assert_array_equal(verified.values, mosaic.values)
 
 
+@pytest.mark.parametrize(("sigmas", "moved"), [(4.5, False), (9.0, True)])
+def test_only_a_shift_far_beyond_its_sigma_turns_heads(sigmas: float, moved: bool) -> None:
+    mosaic, points = adjusted()
+    name, number = "2", points.names.index("P2")
+    shift, sigma, _, _ = _affine_shift(DMC, mosaic, points, name)
+    sign = (points.sensor_b == number) * 1.0 - (points.sensor_a == number) * 1.0
+    wanted = np.array([sigmas, 0.0]) * sigma - shift
+    residuals = mosaic.residuals_px + sign[:, None] * wanted
+    shifted = dataclasses.replace(mosaic, residuals_px=residuals)
+    verified = verified_mosaic(DMC, shifted, points)
+    assert bool(np.any(verified.values != mosaic.values)) is moved
+
+
 def test_heads_that_tie_points_leave_open_are_not_compared() -> None:
     mosaic, points = adjusted()
     every = check_platform(DMC, mosaic, points, {})
