@@ -29,6 +29,9 @@ MIN_STEP: Final = 0.055
 BANDING_STEP: Final = 0.03
 BANDING_LINES: Final = 16
 """Of the signal: of one line, and of so many lines of a frame. Edges of clouds reach 0.046."""
+MAX_BLUR: Final = 0.2
+"""Of the step, beyond the usual change, in the lines before and after it: read-out steps from one
+line to the next, a lens spreads rows of plants and eaves and leaves 0.35 and more."""
 MAX_FRAMES: Final = 2
 """Steps in more frames of one exposure are rows of plants or roofs along the track."""
 MIN_STEP_DN: Final = 6.0
@@ -132,7 +135,14 @@ def _largest(
     shared = np.abs(middle) * (np.abs(common) > 0.5 * np.abs(middle))
     if not np.any(shared > np.maximum(BANDING_STEP, least)):
         return None
-    noise = np.maximum(SIGMAS * _spread(means), least)
+    slope, spread = _usual_change(means)
+    noise = np.maximum(SIGMAS * spread, least)
+    candidates = np.flatnonzero(shared > np.maximum(BANDING_STEP, noise))
+    is_sharp = np.zeros(len(lines), np.bool_)
+    is_sharp[candidates] = _are_sharp(
+        means, lines[candidates], middle[candidates] - slope, slope, spread
+    )
+    shared = np.where(is_sharp, shared, 0.0)
     steps = shared > np.maximum(BANDING_STEP, noise)
     if np.count_nonzero(steps) < BANDING_LINES:
         steps = shared > np.maximum(MIN_STEP, noise)
@@ -143,11 +153,25 @@ def _largest(
     return SignalStep(sensor, axis, int(lines[best]) + offset, float(middle[best]), stepping)
 
 
-def _spread(means: Array) -> float:
-    """Standard deviation of the usual relative change between lines, by its median."""
+def _are_sharp(means: Array, lines: Array, steps: Array, slope: float, spread: float) -> Array:
+    """Whether the signal changes between these lines and the next alone, not around them too."""
+    allowed = MAX_BLUR * np.abs(steps) + spread
+    is_sharp = np.ones(len(lines), np.bool_)
+    for side in (-1, 1):
+        neighbours = lines + side
+        inside = (neighbours >= 0) & (neighbours < means.shape[1] - 1)
+        around = np.full(len(lines), slope)
+        around[inside] = _medians(means, neighbours[inside])
+        is_sharp &= np.abs(around - slope) <= allowed
+    return is_sharp
+
+
+def _usual_change(means: Array) -> tuple[float, float]:
+    """Median of the relative change between lines, and its standard deviation by the median."""
     count = means.shape[1]
     usual = _medians(means, np.arange(0, count - 1, 1 if count < ALL else count // SAMPLES))
-    return _MAD_TO_SIGMA * float(np.median(np.abs(usual - np.median(usual))))
+    middle = float(np.median(usual))
+    return middle, _MAD_TO_SIGMA * float(np.median(np.abs(usual - middle)))
 
 
 @njit(cache=True, nogil=True)

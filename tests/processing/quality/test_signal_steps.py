@@ -103,6 +103,30 @@ def test_a_step_exceeds_eight_standard_deviations_of_lines(
     assert (largest(means(changes)) is not None) == found
 
 
+@pytest.mark.parametrize("period", [4, 6, 8, 12])
+@pytest.mark.parametrize("amplitude", [0.1, 0.4])
+def test_rows_of_plants_over_a_third_of_the_frame_are_no_banding(
+    period: int, amplitude: float
+) -> None:
+    changes = np.zeros(LINES - 1)
+    changes[30:63] = amplitude * np.sin(2 * np.pi * np.arange(33) / period + 0.3)
+    assert largest(means(changes)) is None
+
+
+@pytest.mark.parametrize("at", [0, 40, LINES - 2])
+@pytest.mark.parametrize("side", [-1, 1])
+@pytest.mark.parametrize(("share", "found"), [(0.19, True), (0.21, False)])
+def test_an_edge_that_a_lens_spreads_is_no_step(
+    at: int, side: int, share: float, found: bool
+) -> None:
+    changes = one_step(0.1, at)
+    if not 0 <= at + side < LINES - 1:
+        assert largest(means(changes)) is not None
+        return
+    changes[:, at + side] = share * 0.1
+    assert (largest(means(changes)) is not None) == found
+
+
 def test_a_slope_over_the_frame_is_no_noise() -> None:
     changes = np.full(LINES - 1, 0.02)
     changes[40] = 0.07
