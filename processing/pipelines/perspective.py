@@ -41,6 +41,7 @@ from processing.pipelines.synthetic_frames import synthetic_head_frames
 from processing.quality.figures import FigureGroup
 from processing.quality.frame_signal import signal_figures
 from processing.quality.readout import blank_unread, unread_figures
+from processing.quality.repeated_lines import repeated_line_figures
 from processing.quality.report import QualityReport
 from processing.quality.signal_steps import signal_steps, step_figures
 from processing.quality.valid_area import ValidArea, area_of_rasters, grid_of
@@ -235,7 +236,11 @@ class HeadPipeline(
                 unread = statistics[sensor.name].unread_fraction
                 blank_unread(sensor, frames[sensor.name], unread, *planes[cone.name].values())
         unread_fraction = {name: seen.unread_fraction for name, seen in statistics.items()}
-        figures = unread_figures(unread_fraction), word_format_figures(self.rig, frames)
+        figures = (
+            unread_figures(unread_fraction),
+            word_format_figures(self.rig, frames),
+            repeated_line_figures(self.rig, frames),
+        )
         return _CorrectedHeads(level1, statistics, planes, figures)
 
     def _adjust(self, exposure: ExposureInput, corrected: _CorrectedHeads) -> _Lattices:

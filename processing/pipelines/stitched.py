@@ -70,6 +70,7 @@ from processing.pipelines.synthetic_frames import synthetic_frames
 from processing.quality.clipping import clipping_figures
 from processing.quality.frame_identity import FixedPatterns, heads_by_pattern
 from processing.quality.readout import blank_unread, unread_figures
+from processing.quality.repeated_lines import repeated_line_figures
 from processing.quality.report import QualityReport
 from processing.quality.valid_area import Mask, area_of, gap_cells, grid_of
 from processing.quality.word_format import word_format_figures
@@ -185,6 +186,7 @@ class Pipeline(
             figures = (
                 unread_figures({n: seen.unread_fraction for n, seen in statistics.items()}),
                 word_format_figures(rig, frames),
+                repeated_line_figures(rig, frames),
                 clipping_figures(rig, frames),
             )
             by_pattern = heads_by_pattern(rig, frames, self._patterns, start)

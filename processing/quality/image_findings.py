@@ -18,6 +18,7 @@ from processing.quality.figures.image import (
     IdentityFigures,
     LocalBlurFigures,
     RelativeSharpnessFigures,
+    RepeatedLineFigures,
     SaturationFigures,
     SharpnessFigures,
     SignalFigures,
@@ -139,6 +140,18 @@ def signal_findings(figures: QualityFigures, thresholds: Thresholds) -> list[Fin
                 "supply and cable of the head. Radiometry of this frame is wrong."
             )
         findings.append(Finding(Flag.FRAME_CORRUPT, Verdict.USABLE, sentence, step))
+    repeated = figures.of(RepeatedLineFigures)
+    if repeated.repeated_lines is not None:
+        findings.append(
+            Finding(
+                Flag.FRAME_CORRUPT,
+                Verdict.USABLE,
+                f"{repeated.repeated_lines} lines of {repeated.repeated_lines_sensor} from line "
+                f"{repeated.repeated_lines_first} on repeat the line before: read-out or transfer "
+                "stood still, and the image shows no ground there. Check the head and its cable.",
+                float(repeated.repeated_lines),
+            )
+        )
     balance = figures.of(BalanceFigures)
     outlier, signal = balance.gain_outlier, balance.gain_outlier_signal
     if outlier and signal is not None:

@@ -302,3 +302,15 @@ def test_a_colour_head_or_a_region_without_fine_detail_is_named(
         assert region == (
             f"columns {columns.start} to {columns.stop - 1}, rows {rows.start} to {rows.stop - 1}"
         )
+
+
+@pytest.mark.parametrize(("sensor", "line"), [("SU01", 678), ("N", 613)])
+def test_repeated_lines_are_named(error_free: InjectedExposure, sensor: str, line: int) -> None:
+    def stuck(frame: Any) -> Any:
+        frame[line : line + 20] = frame[line - 1]
+        return frame
+
+    outcome = error_free.with_frame(sensor, stuck).outcome()
+    assert outcome.verdict == "usable" and "FRAME_CORRUPT" in outcome.flags
+    assert outcome.figure("repeated_lines_sensor") == sensor
+    assert (outcome.figure("repeated_lines_first"), outcome.figure("repeated_lines")) == (line, 20)

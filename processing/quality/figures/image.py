@@ -40,6 +40,17 @@ class UnreadFigures(FigureGroup):
 
 
 @dataclass(frozen=True)
+class RepeatedLineFigures(FigureGroup):
+    """Lines that repeat the line before."""
+
+    repeated_lines: Annotated[
+        int | None, "longest run of lines of a frame that are the line before, word by word"
+    ] = None
+    repeated_lines_sensor: Annotated[str | None, "the frame it is in"] = None
+    repeated_lines_first: Annotated[int | None, "first line of the run"] = None
+
+
+@dataclass(frozen=True)
 class SaturationFigures(FigureGroup):
     """Saturated pixels."""
 
