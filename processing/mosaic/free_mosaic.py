@@ -379,8 +379,10 @@ def _mosaic(
             sigma0,
             pitch_mm=model.pitch_mm,
         )
-        shifts = one_sided_shifts(groups, settings)
-        cofactor = cofactor + shifted_cofactor(groups, blocks, solution.cofactor, scales, shifts)
+        shifts = one_sided_shifts(adjusted.groups, settings)
+        cofactor = cofactor + shifted_cofactor(
+            adjusted.groups, adjusted.blocks, solution.cofactor, scales, shifts
+        )
     ratio = class_scale[PAN_TO_COLOUR] / class_scale[PAN_TO_PAN]
     pitch_um = model.pitch_mm * 1e3
     sigma0_px = sigma0 * settings.sigma_pp_px * class_scale[PAN_TO_PAN]
