@@ -20,7 +20,7 @@ from processing.matching.tie_points import PAN_TO_COLOUR, PAN_TO_PAN, TiePoints
 from processing.rig import Rig
 
 FEW: Final = 12
-"""Points of a pair, from which on data snooping tells which are wrong."""
+"""Points of a pair, from which on data snooping shows which are wrong."""
 CONFIRMED: Final = 5
 """Points that have to agree where there are few."""
 AGREE_PX: Final[Mapping[int, float]] = {PAN_TO_PAN: 1.0, PAN_TO_COLOUR: 2.0}

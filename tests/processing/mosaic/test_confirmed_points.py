@@ -1,4 +1,4 @@
-"""Lone matches under clouds: a frame does not go where one wrong point puts it."""
+"""Single matches under clouds: a frame does not go where one wrong point puts it."""
 
 from __future__ import annotations
 
@@ -51,9 +51,9 @@ def test_a_frame_under_a_cloud_rests_on_calibration_and_not_on_one_wrong_point()
         truth, np.random.default_rng(4), per_overlap=200, sigma_pp_px=0.02, sigma_pc_px=0.1
     )
     of_frame = np.array(["SU30" in every.pairs[i] for i in every.overlap])
-    lone = np.flatnonzero(of_frame & (every.kind == PAN_TO_PAN))[:1]
+    single = np.flatnonzero(of_frame & (every.kind == PAN_TO_PAN))[:1]
     keep = ~of_frame
-    keep[lone] = True
+    keep[single] = True
     points = every.only(keep)
     raw = points.raw_b.copy()
     raw[np.flatnonzero(np.array(["SU30" in points.pairs[i] for i in points.overlap]))] += 4.0
