@@ -75,7 +75,10 @@ def lab(
             progress=show_progress,
         )
     report = field_report(given, found, calibration_id=place.name, date=today, previous=before)
-    rig = replace(found.rig, calibration_date=today)
+    # Cones without frames keep nominal lenses: a rig that began without calibration stays so.
+    is_complete = all(camera.terms for camera in found.adjustment.network.cameras)
+    dated = today if given.rig.is_calibrated or is_complete else ""
+    rig = replace(found.rig, calibration_date=dated)
     remark = (
         f"{rig.name}, by `syntopic calibrate lab` on {today}, in place of calibration "
         f"{given.rig.calibration_id}.\nIt counts only where it is configured. Standard deviations "

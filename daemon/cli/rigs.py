@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from daemon.cli import rigs_image
 from daemon.cli.options import AsJson
 from daemon.mission.store.durable import replace_file
 from daemon.terminal.console import Console, light_table
@@ -16,7 +17,7 @@ from processing.rig import Rig, find_rig, load_rig, shipped_rigs
 app = typer.Typer(
     help="""List the shipped rigs, or describe a rig file.
 
-Examples: `syntopic rigs`, `syntopic rigs show ultracam-x`
+Examples: `syntopic rigs`, `syntopic rigs show ultracam-x`, `syntopic rigs propose-image rig.toml`
 """,
     rich_markup_mode="markdown",
 )
@@ -150,6 +151,9 @@ def show(
         console.print("Next: --drawing FILE draws the focal planes")
     else:
         console.print(f"Focal planes drawn in {drawing}", soft_wrap=True)
+
+
+app.command(name="propose-image", help=rigs_image.HELP)(rigs_image.propose_image)
 
 
 def _row(rig: Rig) -> dict[str, object]:

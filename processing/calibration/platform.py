@@ -144,7 +144,7 @@ def calibrated_rig(
         date: of the new calibration, YYYY-MM-DD.
 
     Returns:
-        A new rig.
+        A new rig; an uncalibrated one stays uncalibrated, because its lenses are nominal.
     """
     found = {c.cone: c for c in calibration.cones}
     cones = []
@@ -157,7 +157,8 @@ def calibrated_rig(
                 rotation_sigma_urad=round(found[cone.name].sigma_urad, 2),
             )
         cones.append(cone)
-    return replace(rig, cones=tuple(cones), calibration_id=calibration_id, calibration_date=date)
+    dated = date if rig.is_calibrated else ""
+    return replace(rig, cones=tuple(cones), calibration_id=calibration_id, calibration_date=dated)
 
 
 @dataclass(frozen=True)

@@ -143,6 +143,8 @@ def _held(
         )
         for probe in rig.probes
     }
+    # What has no probe drifts by a dC that nothing reads.
+    sigma_k[""] = BLIND_SIGMA_K
     yield from calibrated_parts(rig, held, temperatures_c, sigma_k)
     scaled = scaled_part(held, least=HEAD_SCALE_PPM * 1e-6)
     if scaled is not None:

@@ -73,11 +73,6 @@ def read_missions(missions: Sequence[Path]) -> PlatformMissions:
     for path in missions:
         mission = Mission.open(path)
         own = load_rig(mission.rig_path)
-        if not own.is_calibrated:
-            raise PlatformCalibrationError(
-                f"{mission.id} was flown with the uncalibrated rig {own.name}; angles need "
-                "calibrated lenses: calibrate the heads first, and process the mission again"
-            )
         rig = rig or own
         if own != rig:
             raise PlatformCalibrationError(
@@ -210,6 +205,13 @@ def _warnings(
     serials: dict[str, str],
 ) -> list[str]:
     warnings = [] if previous is None else serial_warnings(previous, serials)
+    if not flown.rig.is_calibrated:
+        warnings.append(
+            f"{flown.rig.name} is uncalibrated: the angles hold for its nominal lenses, and it "
+            "stays "
+            "uncalibrated. Calibrate the lenses (syntopic calibrate board), and process the "
+            "mission again with the new rig file"
+        )
     if calibration.missing:
         warnings.append(
             f"no or too few exposures contain cone {', '.join(calibration.missing)} (across the "

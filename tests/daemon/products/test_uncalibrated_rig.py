@@ -30,6 +30,7 @@ from daemon.postflight.calibration.thermal_calibration import (
 from daemon.postflight.export.camera_certificate import CameraCertificateError, certificate_of
 from daemon.products.exposure_products import report_unprocessed
 from daemon.products.processor import build_processor
+from processing.calibration.platform import PlatformCalibration, calibrated_rig
 from processing.geometry.conditions import Conditions
 from processing.pipelines.perspective import has_head_images
 from processing.pipelines.synthetic_frames import synthetic_head_frames
@@ -119,8 +120,13 @@ def test_no_partial_calibration_makes_an_uncalibrated_rig_calibrated(tmp_path: P
     )
     with pytest.raises(ThermalCalibrationError, match="uncalibrated rig"):
         read_thermal_records([mission.path])
-    with pytest.raises(PlatformCalibrationError, match="uncalibrated rig"):
+    with pytest.raises(PlatformCalibrationError, match="0 exposures with a stitching record"):
         read_missions([mission.path])
+    angles = PlatformCalibration(cones=(), missing=())
+    found = calibrated_rig(UNCALIBRATED, angles, calibration_id="p-1", date="2026-11-24")
+    assert not found.is_calibrated
+    found = calibrated_rig(CALIBRATED, angles, calibration_id="p-1", date="2026-11-24")
+    assert found.is_calibrated and found.calibration_id == "p-1"
 
 
 def test_there_is_no_certificate_of_nominal_values() -> None:

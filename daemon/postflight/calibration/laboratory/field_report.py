@@ -154,6 +154,8 @@ def field_report(
     if len(taken) < len(rig.cones):
         absent = ", ".join(c.name for c in rig.cones if c not in taken)
         warnings.append(f"no frames of {absent}: left as they were")
+        if not found.before.is_calibrated:
+            warnings.append(f"{rig.name} stays uncalibrated: calibrate {absent} as well")
     if missing:
         warnings.append(
             f"no temperature of {', '.join(sorted(missing))}: the new places are taken to hold at "
