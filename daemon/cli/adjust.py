@@ -8,14 +8,19 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 from rich.progress import Progress
 
 from daemon.cli.exit_status import ExitStatus
 from daemon.cli.options import AsJson
+from daemon.configuration.model import ConfigurationError
 from daemon.terminal.console import Console
+
+if TYPE_CHECKING:
+    from processing.bundle.critical_values import TestName
+    from processing.bundle.robust_weights import WeightFunction
 
 HELP = """Adjust a bundle from a project of text files.
 
@@ -26,7 +31,8 @@ check points against their predicted accuracy. With --out the adjusted project, 
 residuals are written as tables. Parameters that cannot be determined are named. The format is
 described in docs/reference/formats.md.
 
-Examples: `syntopic adjust project.toml`, `syntopic adjust project.toml --reject 4 --out adjusted`
+Examples: `syntopic adjust project.toml`, `syntopic adjust project.toml --significance 0.05 --out adjusted`,
+`syntopic adjust project.toml --robust --weight-function tukey --reject 4`
 """
 
 
@@ -36,8 +42,26 @@ def adjust(
     robust: Annotated[
         bool | None, typer.Option("--robust/--no-robust", help="Robust weights at the start.")
     ] = None,
+    weight_function: Annotated[
+        str | None,
+        typer.Option(help="Robust weights: huber, cauchy, tukey or danish (default: huber)."),
+    ] = None,
     reject: Annotated[
-        float | None, typer.Option(help="Rejection limit of observations in sigmas.")
+        float | None, typer.Option(help="Rejection limit of observations in sigmas.", min=1.0)
+    ] = None,
+    significance: Annotated[
+        float | None,
+        typer.Option(
+            help="Significance of data snooping over the whole block instead of a limit.",
+            min=1e-12,
+            max=0.999,
+        ),
+    ] = None,
+    test: Annotated[
+        str | None,
+        typer.Option(
+            help="Residuals tested a posteriori (pope) or a priori (baarda) (default: pope)."
+        ),
     ] = None,
     components: Annotated[
         bool | None, typer.Option("--components/--no-components", help="Variance components.")
@@ -57,6 +81,9 @@ def adjust(
     from processing.bundle.network import NetworkError
     from processing.bundle.rank_diagnosis import RankDefectError
 
+    _refuse_unknown_choices(weight_function, test)
+    if reject is not None and significance is not None:
+        raise ConfigurationError(["--reject and --significance both set the limit; give one"])
     if out is not None and (out / "project.toml").exists():
         raise ProjectError([f"{out} holds a project already; give another folder"])
     path = project / "project.toml" if project.is_dir() else project
@@ -65,8 +92,16 @@ def adjust(
     settings = given.settings
     if robust is not None:
         settings = replace(settings, robust=robust)
+    if weight_function is not None:
+        settings = replace(
+            settings, robust=True, weight_function=cast("WeightFunction", weight_function)
+        )
     if reject is not None:
-        settings = replace(settings, reject_beyond=reject)
+        settings = replace(settings, reject_beyond=reject, significance=None)
+    if significance is not None:
+        settings = replace(settings, significance=significance, reject_beyond=None)
+    if test is not None:
+        settings = replace(settings, test=cast("TestName", test))
     if components is not None:
         settings = replace(settings, variance_components=components)
     if free_network is not None:
@@ -110,6 +145,16 @@ def adjust(
             console.print(f"Results: {out}", soft_wrap=True)
     if result.problems:
         raise typer.Exit(ExitStatus.PROBLEM)
+
+
+def _refuse_unknown_choices(weight_function: str | None, test: str | None) -> None:
+    problems = []
+    if weight_function not in (None, "huber", "cauchy", "tukey", "danish"):
+        problems.append(f"--weight-function is {weight_function}; huber, cauchy, tukey or danish")
+    if test not in (None, "pope", "baarda"):
+        problems.append(f"--test is {test}; pope or baarda")
+    if problems:
+        raise ConfigurationError(problems)
 
 
 def _peak_mib() -> float:

@@ -5,6 +5,7 @@ A pure function of a network. It returns the adjusted network with all its stati
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Final
@@ -12,31 +13,31 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.bundle.critical_values import TestName, critical_value, number_of_tests
 from processing.bundle.data_snooping import (
     Excluded,
     contradicted,
     fitting_again,
     nothing_excluded,
 )
-from processing.bundle.equations import BehindCameraError, Equations, equations
+from processing.bundle.equations import Equations
 from processing.bundle.gauss_newton import (
     Progress,
     Run,
     WeakPointsError,
     iterate,
-    robust_weights,
 )
 from processing.bundle.network import Network, NetworkError, validate
-from processing.bundle.normal_equations import ReducedEquations, cofactor_matrix, point_normals
+from processing.bundle.normal_equations import ReducedEquations, cofactor_matrix
 from processing.bundle.rank_diagnosis import RankDefect, rank_defects
+from processing.bundle.robust_weights import WeightFunction, robust_exclusions
 from processing.bundle.statistics import ObservationGroup, groups_of, spread_of
+from processing.bundle.undetermined_points import undetermined_points
 from processing.bundle.unknowns import ParameterLayout, ParameterValues, initial_values, layout_of
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-_MIN_POINT_INFORMATION: Final = 1e-10
-_MAX_BEHIND_FRACTION: Final = 0.05
 _MAX_COMPONENT_ROUNDS: Final = 12
 _COMPONENT_CONVERGED: Final = 0.02
 
@@ -47,9 +48,15 @@ class AdjustmentSettings:
 
     Attributes:
         max_iterations: of each Gauss-Newton run.
-        robust: first with Huber weights on image points, so that blunders pull less.
-        reject_beyond: observations whose standardised residual (residual over its own a posteriori
-            standard deviation) exceeds this are left out, worst first; None: no data snooping.
+        robust: first with weights that fall with the residual, so that blunders pull less.
+        weight_function: the weights of `robust`.
+        reject_beyond: observations whose standardised residual (residual over its own standard
+            deviation) exceeds this are left out, worst first; None: see `significance`.
+        significance: of data snooping, the probability that a block without blunders loses any
+            observation; the limit follows from the number of tests. None, and no
+            `reject_beyond`: no data snooping.
+        test: `pope`, standard deviations of residuals a posteriori; `baarda`, a priori.
+        power: probability with which a minimal detectable bias is found.
         max_rounds: of data snooping; to reach it is a problem of the adjustment.
         variance_components: scale the sigmas of each kind of observation by its residuals.
         minimum_norm: undetermined directions raise no error; the shortest correction is used.
@@ -57,10 +64,24 @@ class AdjustmentSettings:
 
     max_iterations: int = 30
     robust: bool = False
+    weight_function: WeightFunction = "huber"
     reject_beyond: float | None = None
+    significance: float | None = None
+    test: TestName = "pope"
+    power: float = 0.8
     max_rounds: int = 100
     variance_components: bool = False
     minimum_norm: bool = False
+
+    @property
+    def is_snooping(self) -> bool:
+        """Whether data snooping is requested."""
+        return self.reject_beyond is not None or self.significance is not None
+
+    @property
+    def uses_a_priori_sigma(self) -> bool:
+        """Whether residuals are tested against a priori standard deviations."""
+        return self.test == "baarda"
 
 
 @dataclass(frozen=True)
@@ -77,10 +98,13 @@ class Adjustment:
         point_cofactor: (points, 3, 3) m squared, zero for held coordinates, NaN for points
             left out.
         equations: the last rows; `residual` (m,) in sigmas of each row, `redundancy_number` (m,).
-        weight: (image points,) robust weight, zero for what was rejected.
+        influence: (m, 3) m, change of the row's own object point by one sigma of the row.
+        weight: (image points,) zero for what was rejected.
         rejected: (image points,) left out by data snooping.
         excluded: everything that data snooping left out, image points among it.
         rounds: adjustments that data snooping needed; 0 without it.
+        reject_limit: critical value of data snooping in the end; None without it.
+        tests: number of distinct tests it holds for; 0 where the limit was given.
         problems: why the result is not final; empty when it is.
         left_out: (points,) object points that their rays do not fix.
         factors: variance factor applied to each kind of observation.
@@ -102,6 +126,7 @@ class Adjustment:
     equations: Equations
     residual: Array
     redundancy_number: Array
+    influence: Array
     weight: Array
     rejected: Flags
     left_out: Flags
@@ -109,13 +134,20 @@ class Adjustment:
     groups: tuple[ObservationGroup, ...]
     excluded: Excluded
     rounds: int = 0
+    reject_limit: float | None = None
+    tests: int = 0
     problems: tuple[str, ...] = ()
     rank_defects: tuple[RankDefect, ...] = field(default=())
 
     @property
+    def test_sigma0(self) -> float:
+        """Standard deviation of unit weight that residuals are tested with."""
+        return 1.0 if self.settings.uses_a_priori_sigma else self.sigma0
+
+    @property
     def standardised(self) -> Array:
-        """Residuals over their own a posteriori standard deviations, (m,)."""
-        spread = self.sigma0 * np.sqrt(np.clip(self.redundancy_number, 1e-12, None))
+        """Residuals over their own standard deviations, (m,); a priori with Baarda's test."""
+        spread = self.test_sigma0 * np.sqrt(np.clip(self.redundancy_number, 1e-12, None))
         return np.asarray(self.residual / np.where(spread > 0.0, spread, 1.0))
 
 
@@ -144,6 +176,7 @@ def adjust(
     """
     validate(network)
     settings = settings or AdjustmentSettings()
+    _validate_settings(settings)
     selection = _Selection(network, nothing_excluded(network), nothing_excluded(network))
     state = initial_values(network)
     report_progress = progress or (lambda _what, _iteration, _value: None)
@@ -166,8 +199,8 @@ def adjust(
             minimum_norm=settings.minimum_norm,
         )
         if robust:
-            robust_weights(run)
-            selection.exclude_image_points(run.weight < 0.25)
+            found = robust_exclusions(run, settings.weight_function)
+            selection.excluded = selection.excluded.joined(found)
             state, robust = run.state, False
             continue
         try:
@@ -182,9 +215,24 @@ def adjust(
         what = selection.advance(result, reduced)
         if what is None:
             return replace(
-                result, problems=tuple(selection.problems), rounds=selection.snooping_rounds
+                result,
+                problems=tuple(selection.problems),
+                rounds=selection.snooping_rounds,
+                reject_limit=selection.limit,
+                tests=selection.tests,
             )
         report_progress(what, selection.rounds, history[-1])
+
+
+def _validate_settings(settings: AdjustmentSettings) -> None:
+    problems = []
+    if settings.reject_beyond is not None and settings.significance is not None:
+        problems.append("reject_beyond and significance are both given; one of them sets the limit")
+    for name, value in (("significance", settings.significance), ("power", settings.power)):
+        if value is not None and not 0.0 < value < 1.0:
+            problems.append(f"{name} is {value:g}; it is between 0 and 1")
+    if problems:
+        raise NetworkError(problems)
 
 
 @dataclass
@@ -198,21 +246,21 @@ class _Selection:
     rounds: int = 0
     snooping_rounds: int = 0
     component_rounds: int = 0
+    limit: float | None = None
+    tests: int = 0
     problems: list[str] = field(default_factory=list)
 
     def active(self) -> Network:
         """The network to adjust next."""
         return self.excluded.applied(_rescaled(self.given, self.factors))
 
-    def exclude_image_points(self, flags: Flags) -> None:
-        self.excluded = replace(self.excluded, image=self.excluded.image | flags)
-
     def advance(self, result: Adjustment, reduced: ReducedEquations) -> str | None:
         """Choose again after an adjustment; what was done, None when the selection is final."""
         self.rounds += 1
         settings = result.settings
-        if settings.reject_beyond is not None and result.redundancy > 0:
-            what = self._snoop(result, reduced, settings.reject_beyond, settings.max_rounds)
+        if settings.is_snooping and result.redundancy > 0:
+            self._choose_limit(result, reduced)
+            what = self._snoop(result, reduced, settings.max_rounds)
             if what is not None or self.problems:
                 return what
         if (
@@ -225,9 +273,18 @@ class _Selection:
             return "variance components"
         return None
 
-    def _snoop(
-        self, result: Adjustment, reduced: ReducedEquations, limit: float, max_rounds: int
-    ) -> str | None:
+    def _choose_limit(self, result: Adjustment, reduced: ReducedEquations) -> None:
+        """The limit given, or the critical value for the tests of this adjustment."""
+        settings = result.settings
+        self.limit, self.tests = settings.reject_beyond, 0
+        if settings.reject_beyond is None and settings.significance is not None:
+            self.tests = number_of_tests(result.equations, reduced, result.redundancy_number)
+            self.limit = critical_value(
+                settings.test, settings.significance, max(self.tests, 1), result.redundancy
+            )
+
+    def _snoop(self, result: Adjustment, reduced: ReducedEquations, max_rounds: int) -> str | None:
+        limit = self.limit or math.inf
         worst, beyond = contradicted(
             self.given,
             result.equations,
@@ -235,7 +292,7 @@ class _Selection:
             result.cofactor,
             result.standardised,
             result.redundancy_number,
-            result.sigma0,
+            result.test_sigma0,
             limit,
         )
         if beyond and self.snooping_rounds >= max_rounds:
@@ -269,65 +326,9 @@ class _Selection:
             candidates,
             reduced,
             result.cofactor,
-            result.sigma0,
+            result.test_sigma0,
             limit,
         )
-
-
-def undetermined_points(
-    network: Network, state: ParameterValues, weight: Array | None = None
-) -> Flags:
-    """Object points whose rays do not fix them.
-
-    They are seen once or from one projection centre only. Or their starting value is behind a
-    camera that sees them. Only a few points may be: with many, the images are wrong.
-
-    Args:
-        network: observations.
-        state: orientations and coordinates at which rays are intersected.
-        weight: factor on the weight of each image point, shape (image points,); zero leaves it
-            out; None: one.
-
-    Returns:
-        Shape (points,), True where a point is not fixed. None of them where more than a few are
-        behind a camera.
-    """
-    found = np.zeros(len(network.points.names), dtype=bool)
-    if weight is None:
-        weight = np.ones(len(network.image_points.image))
-    try:
-        rows, layout = _bare_equations(network, found, state, weight)
-    except BehindCameraError as error:
-        behind = np.unique(network.image_points.point[error.image_points])
-        behind = behind[~(network.points.sigma_m[behind] == 0.0).all(axis=1)]
-        if len(behind) > max(1.0, _MAX_BEHIND_FRACTION * len(found)):
-            return found
-        found[behind] = True
-        try:
-            rows, layout = _bare_equations(network, found, state, weight)
-        except BehindCameraError:
-            return found
-    values = np.linalg.eigvalsh(point_normals(rows, layout))
-    weak = ~(values[:, 0] > _MIN_POINT_INFORMATION * np.maximum(values[:, 2], 1e-300))
-    free = ~layout.locked[layout.eliminated_points].all(axis=1)
-    found[layout.eliminated_points[weak & free]] = True
-    return found
-
-
-def _bare_equations(
-    network: Network, left_out: Flags, state: ParameterValues, weight: Array
-) -> tuple[Equations, ParameterLayout]:
-    """Rows with the derivatives of object points only."""
-    layout = layout_of(network, left_out)
-    bare = replace(
-        layout,
-        **{
-            name: np.full_like(getattr(layout, name), -1)
-            for name in ("station", "attitude", "head_rotation", "head_offset", "interior")
-        },
-        terms=tuple(np.full_like(t, -1) for t in layout.terms),
-    )
-    return equations(network, bare, state, weight), layout
 
 
 def _figures(
@@ -345,7 +346,7 @@ def _figures(
     found: tuple[RankDefect, ...] = ()
     if run.minimum_norm:
         found = rank_defects(run.network, layout, run.state, reduced, singular=False)
-    own, leverage = spread_of(rows, reduced, cofactor)
+    own, leverage, influence = spread_of(rows, reduced, cofactor)
     free_points = layout.eliminated_points
     held = layout.locked[free_points]
     unknowns = layout.columns + int((~held).sum())
@@ -384,6 +385,7 @@ def _figures(
         equations=rows,
         residual=residual,
         redundancy_number=redundancy_number,
+        influence=influence,
         weight=run.weight,
         rejected=selection.excluded.image,
         left_out=left_out,

@@ -13,6 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.bundle.critical_values import MIN_REDUNDANCY
 from processing.bundle.equations import BehindCameraError, Equations, equations
 from processing.bundle.network import Network
 from processing.bundle.normal_equations import ReducedEquations
@@ -22,9 +23,6 @@ from processing.bundle.unknowns import ParameterLayout, ParameterValues
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Indices = NDArray[np.int64]
-
-MIN_REDUNDANCY: Final = 0.01
-"""Redundancy number below which an observation is not controlled by the others."""
 
 _OF_LARGEST: Final = 0.5
 _AXES: Final = ("X", "Y", "Z")
@@ -276,23 +274,42 @@ def names_of(network: Network, excluded: Excluded) -> tuple[str, ...]:
     Returns:
         A name for each, such as "control point P7 X".
     """
-    points, stations = network.points.names, network.stations.names
-    found = [f"control point {points[k]} {_AXES[axis]}" for k, axis in _where(excluded.control)]
-    found += [
-        f"GNSS position of {stations[network.gnss.station[k]]} {_AXES[axis]}"
-        for k, axis in _where(excluded.gnss)
-    ]
-    found += [
-        "attitude of "
-        f"{network.attitudes.names[network.measured_attitudes.attitude[k]]} {_ROTATIONS[axis]}"
-        for k, axis in _where(excluded.attitude)
-    ]
-    table = network.distances
-    found += [
-        f"distance {points[table.point_a[k]]} to {points[table.point_b[k]]}"
-        for k, _ in _where(excluded.distance)
-    ]
-    return tuple(found)
+    tables = zip(excluded._tables()[1:], _GROUPS_OF, strict=True)
+    return tuple(
+        observation_name(network, groups[0], k, axis)
+        for flags, groups in tables
+        for k, axis in _where(flags)
+    )
+
+
+def observation_name(network: Network, group: int, source: int, axis: int) -> str:
+    """Name of an observation in messages.
+
+    Args:
+        network: its tables.
+        group: index of the kind of observation in `equations.GROUPS`.
+        source: row of its table.
+        axis: its coordinate, 0 to 2.
+
+    Returns:
+        Such as "control point P7 X".
+    """
+    points = network.points.names
+    if group < 2:
+        table = network.image_points
+        image = network.images.names[table.image[source]]
+        return f"{'xy'[axis]} of {points[table.point[source]]} in {image}"
+    if group in _GROUPS_OF[0]:
+        return f"control point {points[source]} {_AXES[axis]}"
+    if group in _GROUPS_OF[1]:
+        station = network.stations.names[network.gnss.station[source]]
+        return f"GNSS position of {station} {_AXES[axis]}"
+    if group in _GROUPS_OF[2]:
+        attitude = network.measured_attitudes.attitude[source]
+        return f"attitude of {network.attitudes.names[attitude]} {_ROTATIONS[axis]}"
+    distances = network.distances
+    ends = (points[distances.point_a[source]], points[distances.point_b[source]])
+    return f"distance {ends[0]} to {ends[1]}"
 
 
 def _where(flags: Flags) -> list[tuple[int, int]]:

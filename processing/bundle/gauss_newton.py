@@ -1,12 +1,12 @@
-"""Gauss-Newton iterations of a network: steps that always lower the sum of squares, robust weights.
+"""Gauss-Newton iterations of a network: steps that always lower the sum of squares.
 
-The selection of observations is in `adjust`.
+The selection of observations is in `adjust`, robust weights are in `robust_weights`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -38,7 +38,6 @@ _OBJECTIVE_CONVERGED: Final = 1e-10
 _SLOW_CONVERGED: Final = 1e-6
 """After the last iteration: every unknown is within a thousandth of its a priori sigma."""
 
-_HUBER: Final = 2.0
 _MAX_HALVINGS: Final = 12
 _WEAK_AFTER: Final = 12
 """Iterations after which a point with rays that are nearly parallel is set aside if it moves."""
@@ -101,7 +100,7 @@ def iterate(run: Run) -> tuple[Equations, ReducedEquations]:
         WeakPointsError: object points that keep the others from converging.
     """
     for iteration in range(run.max_iterations + 1):
-        rows = _front(run, run.state)
+        rows = front(run, run.state)
         objective = float(rows.misclosure @ rows.misclosure)
         run.history.append(objective)
         run.report_progress("iteration", iteration, objective)
@@ -119,7 +118,7 @@ def iterate(run: Run) -> tuple[Equations, ReducedEquations]:
             _refuse_moving(run, rows, step.dpoints)
         if iteration == run.max_iterations and step.predicted_decrease <= _SLOW_CONVERGED:
             return rows, reduced
-        run.state = _take_step(run, step.dx, step.dpoints, objective, step.predicted_decrease)
+        run.state = take_step(run, step.dx, step.dpoints, objective, step.predicted_decrease)
     raise NetworkError(
         [
             f"no convergence after {run.max_iterations} iterations; starting values are "
@@ -128,7 +127,19 @@ def iterate(run: Run) -> tuple[Equations, ReducedEquations]:
     )
 
 
-def _front(run: Run, state: ParameterValues) -> Equations:
+def front(run: Run, state: ParameterValues) -> Equations:
+    """Rows at a state whose object points are in front of the cameras.
+
+    Args:
+        run: variables of the adjustment.
+        state: where misclosures are computed.
+
+    Returns:
+        The rows with derivatives.
+
+    Raises:
+        NetworkError: an object point behind a camera that saw it, by name.
+    """
     try:
         return run.rows(state)
     except BehindCameraError as error:
@@ -143,10 +154,21 @@ def _front(run: Run, state: ParameterValues) -> Equations:
         ) from None
 
 
-def _take_step(
+def take_step(
     run: Run, dx: Array, dpoints: Array, objective: float, predicted_decrease: float
 ) -> ParameterValues:
-    """The full step, or shorter ones of single points or of all until the sum of squares falls."""
+    """The full step, or shorter ones of single points or of all until the sum of squares falls.
+
+    Args:
+        run: variables of the adjustment; not changed.
+        dx: corrections of the columns, shape (c,).
+        dpoints: corrections of the eliminated points, shape (p, 3), m.
+        objective: sum of squares before the step.
+        predicted_decrease: by the linear model.
+
+    Returns:
+        The state after the step.
+    """
     length = 1.0
     own = np.ones(len(dpoints))
     before = _by_point(run, run.rows(run.state, derivatives=False))
@@ -204,40 +226,3 @@ def _refuse_moving(run: Run, rows: Equations, dpoints: Array) -> None:
     weak = moving & (values[:, 0] < _WEAK_INFORMATION * values[:, 2])
     if weak.any():
         raise WeakPointsError(points[weak])
-
-
-def robust_weights(run: Run) -> None:
-    """Huber weights on whole image points, renewed at every iteration.
-
-    Args:
-        run: variables of the adjustment; its state and weights are changed.
-
-    Raises:
-        NetworkError: an object point behind a camera that saw it.
-        RankDefectError: directions without information.
-    """
-    points = run.network.image_points
-    for iteration in range(run.max_iterations):
-        rows = _front(run, run.state)
-        objective = float(rows.misclosure @ rows.misclosure)
-        run.report_progress("robust iteration", iteration, objective)
-        reduced = reduced_equations(rows, run.layout)
-        try:
-            step = solve(reduced, run.layout.constraints, minimum_norm=run.minimum_norm)
-        except SingularError as error:
-            raise RankDefectError(
-                rank_defects(run.network, run.layout, run.state, error.reduced, singular=True)
-            ) from None
-        run.state = _take_step(run, step.dx, step.dpoints, objective, step.predicted_decrease)
-        before = run.weight
-        plain = replace(run, weight=np.where(run.weight > 0.0, 1.0, 0.0))
-        rows = plain.rows(run.state, derivatives=False)
-        size = np.zeros(len(points.image))
-        image_rows = rows.group < 2
-        np.add.at(size, rows.source[image_rows], rows.misclosure[image_rows] ** 2)
-        seen = size > 0.0
-        unit = 1.4826 * np.median(np.sqrt(size[seen] / 2.0)) / 0.8 if seen.any() else 1.0
-        size = np.sqrt(size / 2.0) / max(float(unit), 1e-12)
-        run.weight = np.where(before > 0.0, np.minimum(1.0, _HUBER / np.maximum(size, 1e-9)), 0.0)
-        if np.abs(run.weight - before).max() < 1e-2 and step.predicted_decrease < 1e-6 * objective:
-            return

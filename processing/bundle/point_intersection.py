@@ -12,10 +12,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.bundle.adjust import Adjustment, undetermined_points
+from processing.bundle.adjust import Adjustment
 from processing.bundle.equations import equations
 from processing.bundle.network import Network, NetworkError
 from processing.bundle.normal_equations import point_normals
+from processing.bundle.undetermined_points import undetermined_points
 from processing.bundle.unknowns import ParameterLayout, apply_corrections, initial_values, layout_of
 
 Array = NDArray[np.float64]

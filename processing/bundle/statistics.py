@@ -40,8 +40,8 @@ class ObservationGroup:
 
 def spread_of(
     equations: Equations, reduced: ReducedEquations, cofactor: Array
-) -> tuple[Array, Array]:
-    """Cofactors of the eliminated points, and how much of each observation's error stays.
+) -> tuple[Array, Array, Array]:
+    """Cofactors of the eliminated points, and how errors of observations pass into unknowns.
 
     Args:
         equations: the rows.
@@ -49,13 +49,15 @@ def spread_of(
         cofactor: (c, c) of the columns.
 
     Returns:
-        (p, 3, 3) m squared, of held coordinates without meaning; and (m,) leverages, which are one
-        less the redundancy numbers. A row (a, b) of columns a and orthonormal point part b has the
+        (p, 3, 3) m squared, of held coordinates without meaning; (m,) leverages, which are one
+        less the redundancy numbers; and (m, 3) m, the change of the row's own object point by a
+        change of the observation by its sigma. A row (a, b) of columns a and orthonormal point part b has the
         leverage b b' + (a - b W) Q (a - b W)', W being the point's coupling with the columns.
     """
     leverage = np.einsum("mi,mi->m", reduced.point_rows, reduced.point_rows)
     leverage += _own_products(reduced, cofactor)
     points = len(reduced.point_factor)
+    influence = np.zeros((len(equations.point), 3))
     through = np.zeros((points, 3, 3))
     thin, dense = reduced.sparse_columns, reduced.dense_columns
     order = np.argsort(equations.point, kind="stable")
@@ -75,17 +77,19 @@ def spread_of(
         local = equations.point[rows] - low
         b = reduced.point_rows[rows]
         sparse_rows, dense_rows = reduced.design_sparse[rows], reduced.design_dense[rows]
-        mixed = np.zeros(len(rows))
+        mixed = np.zeros((len(rows), 3))
         for axis in range(3):
             at = 3 * local + axis
-            mixed += b[:, axis] * _row_products(sparse_rows, in_thin, at)
-            mixed += b[:, axis] * np.einsum("md,md->m", dense_rows, in_dense[at])
-        back = np.einsum("mi,mij,mj->m", b, through[equations.point[rows]], b)
-        leverage[rows] += back - 2.0 * mixed
+            mixed[:, axis] = _row_products(sparse_rows, in_thin, at)
+            mixed[:, axis] += np.einsum("md,md->m", dense_rows, in_dense[at])
+        back = np.einsum("mij,mj->mi", through[equations.point[rows]], b)
+        leverage[rows] += np.einsum("mi,mi->m", b, back - 2.0 * mixed)
+        factor = reduced.point_factor[equations.point[rows]]
+        influence[rows] = np.einsum("mij,mj->mi", factor, b + back - mixed)
     inner = through + np.eye(3)
     factor = reduced.point_factor
     cofactors = np.einsum("pij,pjk,plk->pil", factor, inner, factor)
-    return np.asarray(cofactors), np.asarray(np.clip(leverage, 0.0, 1.0))
+    return np.asarray(cofactors), np.asarray(np.clip(leverage, 0.0, 1.0)), influence
 
 
 def _own_products(reduced: ReducedEquations, cofactor: Array) -> Array:

@@ -150,7 +150,7 @@ def _is_row(remark: str, columns: Sequence[str]) -> bool:
 def write_table(
     path: Path, remark: str, columns: Sequence[str], rows: Iterable[Sequence[str | float]]
 ) -> None:
-    """Write a table; numbers in their shortest exact form, NaN as an empty cell."""
+    """Write a table; numbers in their shortest exact form, others as empty cells."""
     with new_file(path) as part, part.open("w", encoding="utf-8", newline="") as file:
         for line in remark.splitlines():
             file.write(f"# {line}\n")
@@ -163,4 +163,4 @@ def write_table(
 def _cell(value: str | float) -> str:
     if isinstance(value, str):
         return value
-    return "" if math.isnan(value) else repr(float(value))
+    return "" if not math.isfinite(value) else repr(float(value))

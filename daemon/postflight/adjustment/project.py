@@ -128,7 +128,11 @@ def read_project(path: Path) -> Project:
     settings = AdjustmentSettings(
         max_iterations=a.max_iterations,
         robust=a.robust,
+        weight_function=a.weight_function,
         reject_beyond=a.reject_beyond,
+        significance=a.significance,
+        test=a.test,
+        power=a.power,
         max_rounds=a.max_rounds,
         variance_components=a.variance_components,
         minimum_norm=a.minimum_norm,

@@ -5,10 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from daemon.mission.foreign_files import ForeignFileError, read_regular_file
 from daemon.postflight.adjustment.csv_tables import ProjectError
+from processing.bundle.critical_values import TestName
+from processing.bundle.robust_weights import WeightFunction
 from processing.bundle.self_calibration import SetName
 from processing.rig.problem_sentences import findings_of, line_finder, sentences
 from processing.rig.toml_text import TomlError, parse_toml
@@ -24,7 +26,11 @@ class AdjustSection(_ProjectSection):
     """Settings of the adjustment."""
 
     robust: bool = False
+    weight_function: WeightFunction = "huber"
     reject_beyond: float | None = Field(default=None, gt=1.0)
+    significance: float | None = Field(default=None, gt=0.0, lt=1.0)
+    test: TestName = "pope"
+    power: float = Field(default=0.8, gt=0.0, lt=1.0)
     max_rounds: int = Field(default=100, ge=1, le=10_000)
     variance_components: bool = False
     minimum_norm: bool = False
@@ -34,6 +40,12 @@ class AdjustSection(_ProjectSection):
     earth_radius_m: float | None = Field(default=None, gt=1e6)
     refraction: bool = False
     ground_m: float = 0.0
+
+    @model_validator(mode="after")
+    def _one_limit(self) -> AdjustSection:
+        if self.reject_beyond is not None and self.significance is not None:
+            raise ValueError("reject_beyond and significance both set the limit; give one of them")
+        return self
 
 
 class FilesSection(_ProjectSection):

@@ -17,6 +17,11 @@ from daemon.postflight.adjustment.csv_tables import ProjectError, write_table
 from daemon.postflight.adjustment.html_report import report_page
 from daemon.postflight.adjustment.project import ANGLES, SIGMAS, XYZ, CheckPoints, Project
 from daemon.postflight.adjustment.project_file import ProjectFile
+from daemon.postflight.adjustment.reliability_report import (
+    OBSERVATION_COLUMNS,
+    image_reliability,
+    other_observations,
+)
 from processing.bundle.adjust import Adjustment
 from processing.bundle.adjustment_results import exposures_of, image_residuals_mm
 from processing.bundle.network import INTERIOR, Network
@@ -173,9 +178,19 @@ def fill_results(
     )
     write_table(
         folder / "residuals.csv",
-        "Computed less measured image coordinates; redundancy numbers; standardised residuals.",
-        ("image", "point", "vx_um", "vy_um", "rx", "ry", "wx", "wy", "rejected"),
+        "Computed less measured image coordinates; redundancy numbers; standardised residuals; "
+        "minimal detectable bias and how far it moves the object point, empty without control.",
+        (
+            "image", "point", "vx_um", "vy_um", "rx", "ry", "wx", "wy", "rejected",
+            "detectable_x_um", "detectable_y_um", "point_shift_m",
+        ),
         _residuals(result),
+    )  # fmt: skip
+    write_table(
+        folder / "observations.csv",
+        "Observations other than image points: residuals, redundancy numbers, reliability.",
+        OBSERVATION_COLUMNS,
+        other_observations(result),
     )
     (folder / "report.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
     page = report_page(result, project.checks, report)
@@ -191,6 +206,7 @@ def _residuals(result: Adjustment) -> Iterator[tuple[str | float, ...]]:
         redundancy[rows.source[own], axis] = result.redundancy_number[own]
         standardised[rows.source[own], axis] = result.standardised[own]
     residual = image_residuals_mm(result) * 1e3
+    detectable, shift = image_reliability(result)
     for k, (image, point) in enumerate(
         zip(network.image_points.image, network.image_points.point, strict=True)
     ):
@@ -201,6 +217,8 @@ def _residuals(result: Adjustment) -> Iterator[tuple[str | float, ...]]:
             *(round(float(v), 4) for v in redundancy[k]),
             *(round(float(v), 3) for v in standardised[k]),
             "yes" if result.rejected[k] else "no",
+            *(round(float(v), 3) for v in np.where(np.isinf(detectable[k]), np.nan, detectable[k])),
+            math.nan if math.isinf(shift[k]) else float(f"{shift[k]:.4g}"),
         )
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from daemon.postflight.adjustment.project import CheckPoints
+from daemon.postflight.adjustment.reliability_report import reliability_summary, unit_of
 from daemon.terminal.console import Console, light_table
 from processing.bundle.adjust import Adjustment
 from processing.bundle.adjustment_results import (
@@ -26,12 +27,6 @@ from processing.bundle.self_calibration import parameter_count
 Array = NDArray[np.float64]
 
 _GRADS_PER_RAD = 200.0 / math.pi
-_UNIT_OF_GROUP = {
-    "image x": ("um", 1e3),
-    "image y": ("um", 1e3),
-    "attitude": ("mrad", 1e3),
-    "prior": ("", 1.0),
-}
 _MAX_LISTED = 20
 _MAX_SIGMA0 = 20.0
 
@@ -65,9 +60,9 @@ def report_of(
                     "count": g.count,
                     "redundancy": g.redundancy,
                     "variance_factor": g.factor,
-                    "rms": g.rms * _unit(g.name)[1],
-                    "worst": g.worst * _unit(g.name)[1],
-                    "unit": _unit(g.name)[0],
+                    "rms": g.rms * unit_of(g.name)[1],
+                    "worst": g.worst * unit_of(g.name)[1],
+                    "unit": unit_of(g.name)[0],
                 }
                 for g in result.groups
             ],
@@ -121,6 +116,7 @@ def report_of(
             "excluded": names_of(network, result.excluded),
             "rounds": result.rounds,
             "problems": result.problems,
+            "reliability": reliability_summary(result),
             "left_out": [network.points.names[k] for k in np.flatnonzero(result.left_out)],
             "not_determined": [d.sentence for d in result.rank_defects],
         }
@@ -221,6 +217,7 @@ def print_report(console: Console, report: Mapping[str, Any]) -> None:
             + ("not final" if report["problems"] else "none left beyond the limit"),
             highlight=False,
         )
+    _print_reliability(console, report["reliability"])
     if report["left_out"]:
         listed = ", ".join(report["left_out"][:_MAX_LISTED])
         console.print(
@@ -245,6 +242,32 @@ def _print_correlations(console: Console, report: Mapping[str, Any]) -> None:
                     "separable, one may be dropped",
                     highlight=False,
                 )
+
+
+def _print_reliability(console: Console, reliability: Mapping[str, Any]) -> None:
+    tests = f", {reliability['tests']} tests" if reliability["tests"] else ""
+    console.print(
+        f"Reliability: limit {reliability['limit']:.3f} ({reliability['test']}{tests}), power "
+        f"{reliability['power']:.0%}",
+        highlight=False,
+    )
+    columns = ("uncontrolled", "MDB median", "MDB max", "unit", "bias/noise", "point m")
+    table = light_table("Minimal detectable bias", ("",), columns)
+    for g in reliability["groups"]:
+        figures = ("detectable_median", "detectable_max", "bias_to_noise_max", "point_shift_max_m")
+        median, largest, ratio, shift = (
+            "-" if g[key] is None else f"{g[key]:.3g}" for key in figures
+        )
+        table.add_row(
+            g["name"],
+            f"{g['uncontrolled']} of {g['count']}",
+            median,
+            largest,
+            g["unit"],
+            ratio,
+            shift,
+        )
+    console.print(table)
 
 
 def _lines(result: Adjustment) -> list[dict[str, Any]]:
@@ -308,10 +331,6 @@ def _cautions(result: Adjustment) -> list[str]:
             f"{len(unseen)} control points have no image point: {', '.join(unseen[:_MAX_LISTED])}"
         )
     return found
-
-
-def _unit(group: str) -> tuple[str, float]:
-    return _UNIT_OF_GROUP.get(group, ("m", 1.0))
 
 
 def _plain(value: Any) -> Any:
