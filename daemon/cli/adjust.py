@@ -31,7 +31,8 @@ check points against their predicted accuracy. With --out the adjusted project, 
 residuals are written as tables. Parameters that cannot be determined are named. The format is
 described in docs/reference/formats.md.
 
-Examples: `syntopic adjust project.toml`, `syntopic adjust project.toml --significance 0.05 --out adjusted`,
+Examples: `syntopic adjust project.toml`,
+`syntopic adjust project.toml --significance 0.05 --out adjusted`,
 `syntopic adjust project.toml --robust --weight-function tukey --reject 4`
 """
 
@@ -73,6 +74,7 @@ def adjust(
     as_json: AsJson = False,
 ) -> None:
     from daemon.postflight.adjustment.csv_tables import ProjectError
+    from daemon.postflight.adjustment.likely_mistakes import SUSPICIOUS_SIGMA0, likely_mistakes
     from daemon.postflight.adjustment.project import read_project
     from daemon.postflight.adjustment.project_writer import write_results
     from daemon.postflight.adjustment.summary import print_report, report_of
@@ -120,6 +122,7 @@ def adjust(
     except RankDefectError as error:
         problems = tuple(defect.sentence for defect in error.rank_defects)
     if problems:
+        problems = (*problems, *likely_mistakes(given.network, None))
         if as_json:
             typer.echo(json.dumps({"name": given.name, "problems": list(problems)}))
         else:
@@ -134,6 +137,8 @@ def adjust(
         seconds=time.perf_counter() - begun,
         peak_mib=_peak_mib(),
     )
+    if result.sigma0 > SUSPICIOUS_SIGMA0:
+        report["cautions"] += likely_mistakes(given.network, result.sigma0)
     if out is not None:
         write_results(out, given, result, report)
     if as_json:

@@ -48,7 +48,7 @@ PROBLEMS: Final = {
     "pansharpen": "an exposure could not be processed; the others are done",
     "replay": "a result differs from the recorded one",
     "orient": "the orientation of an exposure cannot be computed",
-    "triangulate": "the block cannot be adjusted",
+    "triangulate": "the block cannot be adjusted, or data snooping ended before its end",
     "intersect": "no point can be intersected",
     "export": "the mission cannot be read, or a file could not be written",
     "import": "the input cannot be read or is inconsistent",

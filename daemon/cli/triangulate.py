@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 from rich.progress import Progress
 
-from daemon.cli.exit_status import exit_if_failed
+from daemon.cli.exit_status import ExitStatus, exit_if_failed
 from daemon.cli.options import (
     AsJson,
     AttitudeSigma,
@@ -168,6 +169,7 @@ def triangulate(
     if as_json:
         typer.echo(json.dumps(report | {"folder": str(results)}))
         exit_if_failed(block.failures)
+        _exit_if_not_final(result.problems)
         return
     console = Console()
     short = report | {"rejected": [], "left_out": [], "control": {"count": 0}}
@@ -180,3 +182,10 @@ def triangulate(
     print_triangulation(console, report["triangulation"])
     console.print(f"Results: {results}, report {results / 'report.html'}", soft_wrap=True)
     exit_if_failed(block.failures)
+    _exit_if_not_final(result.problems)
+
+
+def _exit_if_not_final(problems: Sequence[str]) -> None:
+    """End with a status when the adjustment reports that its result is not final."""
+    if problems:
+        raise typer.Exit(ExitStatus.PROBLEM)

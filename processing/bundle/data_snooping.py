@@ -25,6 +25,10 @@ Flags = NDArray[np.bool_]
 Indices = NDArray[np.int64]
 
 _OF_LARGEST: Final = 0.5
+_AMBIGUOUS: Final = 9.0
+"""Difference of squared sizes below which two image points of an object point explain its
+contradiction alike: three standard deviations."""
+
 _AXES: Final = ("X", "Y", "Z")
 _ROTATIONS: Final = ("about x", "about y", "about z")
 
@@ -165,7 +169,8 @@ def contradicted(
 
     One blunder enlarges its neighbours' residuals. An image point is left out if it is the largest
     of its object point, more than half the largest of its image, and not surpassed by another kind
-    of observation of that image. Another observation is left out if nothing of its images and
+    of observation of that image; with it those of its object point that explain the contradiction
+    alike (three rays in a strip, an error along the base). Another observation is left out if nothing of its images and
     object points surpasses it. The largest of all always is.
 
     Args:
@@ -207,6 +212,11 @@ def contradicted(
         & (size > _OF_LARGEST * in_image[table.image])
         & (size >= largest.of_image[table.image])
     )
+    # Where it cannot be decided which of them is wrong, none may stay: it would move its point.
+    chosen_points = np.zeros(len(network.points.names), dtype=bool)
+    chosen_points[table.point[worst.image]] = True
+    alike = size**2 > of_point[table.point] ** 2 - _AMBIGUOUS
+    worst.image[:] |= beyond & alike & chosen_points[table.point]
     around = largest.surroundings(np.maximum(in_image, largest.of_image), of_point)
     beyond_other = single[other] > limit
     chosen = other[beyond_other & (single[other] >= around)]

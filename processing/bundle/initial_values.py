@@ -131,9 +131,12 @@ def completed(network: Network) -> Network:
             rows = rows[np.isfinite(xyz[table.point[rows]]).all(axis=1)]
             if len(rows) < 4 or network.points.at_infinity[table.point[rows]].any():
                 continue
-            place, rotations = resect(
-                ideal[rows], xyz[table.point[rows]], distance[images.camera[image]]
-            )
+            try:
+                place, rotations = resect(
+                    ideal[rows], xyz[table.point[rows]], distance[images.camera[image]]
+                )
+            except (ValueError, cv2.error):
+                continue
             if images.head[image] >= 0:
                 head = network.heads[images.head[image]]
                 rotations = rotations @ head.rotation.T

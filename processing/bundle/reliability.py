@@ -1,7 +1,7 @@
 """Reliability of an adjustment: what blunder a test finds, and what one that it misses changes.
 
-Internal reliability is the minimal detectable bias of each observation, external reliability its effect
-on the unknowns.
+Internal reliability is the minimal detectable bias of each observation, external reliability its
+effect on the unknowns.
 """
 
 from __future__ import annotations

@@ -35,7 +35,7 @@ DANISH: Final = (3.0, 0.05, 3.0)
 """Limit of full weight, factor and power of the exponent. Source: Krarup et al. (1980)."""
 
 LEFT_OUT_BEYOND: Final = {"huber": 8.0, "cauchy": 4.0, "tukey": 4.0, "danish": 4.0}
-"""Sizes beyond which an observation is left out. With Huber's weights blunders still pull: size 8 is
+"""Sizes beyond which an observation is left out. With Huber's weights blunders still pull: 8 is
 weight 1/4. The others take next to no part there, and normal errors exceed 4 once in 10 million."""
 
 _LEAST: Final = 1e-4

@@ -51,8 +51,9 @@ def spread_of(
     Returns:
         (p, 3, 3) m squared, of held coordinates without meaning; (m,) leverages, which are one
         less the redundancy numbers; and (m, 3) m, the change of the row's own object point by a
-        change of the observation by its sigma. A row (a, b) of columns a and orthonormal point part b has the
-        leverage b b' + (a - b W) Q (a - b W)', W being the point's coupling with the columns.
+        change of the observation by its sigma. A row (a, b) of columns a and orthonormal point
+        part b has the leverage b b' + (a - b W) Q (a - b W)', W being the point's coupling with the
+        columns.
     """
     leverage = np.einsum("mi,mi->m", reduced.point_rows, reduced.point_rows)
     leverage += _own_products(reduced, cofactor)

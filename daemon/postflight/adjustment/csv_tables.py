@@ -157,7 +157,15 @@ def write_table(
         file.write(",".join(columns) + "\n")
         writer = csv.writer(file, lineterminator="\n")
         for row in rows:
-            writer.writerow([_cell(value) for value in row])
+            cells = [_cell(value) for value in row]
+            if cells[0].startswith("#"):
+                # A name that begins with the mark of a remark is quoted, or the row would be one.
+                file.write('"' + cells[0].replace('"', '""') + '"' + "," * (len(cells) > 1))
+                cells = cells[1:]
+            if cells:
+                writer.writerow(cells)
+            else:
+                file.write("\n")
 
 
 def _cell(value: str | float) -> str:

@@ -33,6 +33,11 @@ Array = NDArray[np.float64]
 
 PROJECT_FILE = "project.toml"
 
+RESIDUAL_COLUMNS = (
+    "image", "point", "vx_um", "vy_um", "rx", "ry", "wx", "wy", "rejected",
+    "detectable_x_um", "detectable_y_um", "point_shift_m",
+)  # fmt: skip
+
 
 def write_project(
     folder: Path,
@@ -180,12 +185,9 @@ def fill_results(
         folder / "residuals.csv",
         "Computed less measured image coordinates; redundancy numbers; standardised residuals; "
         "minimal detectable bias and how far it moves the object point, empty without control.",
-        (
-            "image", "point", "vx_um", "vy_um", "rx", "ry", "wx", "wy", "rejected",
-            "detectable_x_um", "detectable_y_um", "point_shift_m",
-        ),
+        RESIDUAL_COLUMNS,
         _residuals(result),
-    )  # fmt: skip
+    )
     write_table(
         folder / "observations.csv",
         "Observations other than image points: residuals, redundancy numbers, reliability.",

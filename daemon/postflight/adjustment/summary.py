@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from daemon.postflight.adjustment.likely_mistakes import SUSPICIOUS_SIGMA0
 from daemon.postflight.adjustment.project import CheckPoints
 from daemon.postflight.adjustment.reliability_report import reliability_summary, unit_of
 from daemon.terminal.console import Console, light_table
@@ -28,7 +29,6 @@ Array = NDArray[np.float64]
 
 _GRADS_PER_RAD = 200.0 / math.pi
 _MAX_LISTED = 20
-_MAX_SIGMA0 = 20.0
 
 
 def report_of(
@@ -316,7 +316,7 @@ def _global_test(result: Adjustment) -> dict[str, Any]:
 def _cautions(result: Adjustment) -> list[str]:
     """What a reader would see at once in the tables."""
     found = []
-    if result.sigma0 > _MAX_SIGMA0:
+    if result.sigma0 > SUSPICIOUS_SIGMA0:
         found.append(
             f"sigma0 is {result.sigma0:.5g}: image coordinates may be of another unit, y may point "
             "down, a sigma may be of another unit, or blunders are in the observations (--reject)"

@@ -328,7 +328,7 @@ def report_of(
             "correlation": found.correlation.tolist(),
         },
         verdicts=[*held, *correlated],
-        warnings=[*warnings, *sentences],
+        warnings=[*warnings, *done.adjustment.problems, *sentences],
         tables=(
             ReportTable(
                 "Result",

@@ -120,6 +120,7 @@ def report_of(
     """The calibration report, as printed and written."""
     quantities = quantities_of(result, found)
     warnings = [] if previous is None else serial_warnings(previous, rig.serials)
+    warnings += result.problems
     if math.isfinite(found.squares) and found.squares > MOVED:
         warnings.append(
             f"single exposures scatter about the averages {math.sqrt(found.squares):.1f} times as "

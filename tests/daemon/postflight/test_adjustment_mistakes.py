@@ -7,16 +7,19 @@ import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from daemon.cli import app
-from daemon.postflight.adjustment.csv_tables import ProjectError
+from daemon.configuration.model import ConfigurationError
+from daemon.postflight.adjustment.csv_tables import ProjectError, read_table, write_table
 from daemon.postflight.adjustment.project import CheckPoints
 from daemon.postflight.adjustment.project_file import AdjustSection, CameraSection, ProjectFile
-from daemon.postflight.adjustment.project_writer import write_project
+from daemon.postflight.adjustment.project_writer import RESIDUAL_COLUMNS, write_project
+from daemon.postflight.adjustment.reliability_report import OBSERVATION_COLUMNS
 from processing.bundle.network import Distances
 from tests.processing.bundle.simulated_networks import aerial
 
@@ -157,3 +160,85 @@ def test_sigmas_of_another_unit_fail_the_global_test(written, tmp_path) -> None:
     assert report["global_test"]["passed"] is False
     (caution,) = report["cautions"]
     assert "a sigma may be of another unit" in caution
+
+
+def _report(folder: Path, *options: str) -> dict[str, Any]:
+    outcome = CliRunner().invoke(app, ["adjust", str(folder), "--json", *options])
+    assert outcome.exception is None, outcome.output
+    report: dict[str, Any] = json.loads(outcome.stdout)
+    return report
+
+
+@pytest.mark.parametrize(
+    ("table", "change"),
+    [
+        ("image_points.csv", _cell(-1, "y_mm", lambda v: repr(-float(v)))),
+        ("image_points.csv", lambda text: text.replace("x_mm,y_mm", "y_mm,x_mm")),
+    ],
+)
+def test_mirrored_coordinates_are_named_with_the_sigma0_they_would_have(
+    table, change, written, tmp_path
+) -> None:
+    folder = shutil.copytree(written, tmp_path / "block")
+    # Attitudes are found from the control, wherever the images turn.
+    (folder / table).write_text(change((folder / table).read_text()))
+    for name in ("x_m", "y_m", "z_m", "omega_deg", "phi_deg", "kappa_deg"):
+        path = folder / "exposures.csv"
+        path.write_text(_cell(-1, name, lambda _: "")(path.read_text()))
+    outcome = CliRunner().invoke(app, ["adjust", str(folder), "--json"])
+    answer = json.loads(outcome.stdout)
+    found = [s for s in [*answer.get("cautions", ()), *answer["problems"]] if "mirrored" in s]
+    assert len(found) == 1, answer
+    assert float(found[0].rsplit(" ", 1)[1]) == pytest.approx(_report(written)["sigma0"], abs=1e-3)
+
+
+def test_a_good_block_with_a_blunder_names_no_reversed_axis(written, tmp_path) -> None:
+    folder = shutil.copytree(written, tmp_path / "block")
+    path = folder / "image_points.csv"
+    path.write_text(_cell(7, "x_mm", lambda v: repr(float(v) + 3.0))(path.read_text()))
+    report = _report(folder)
+    assert report["sigma0"] > 20.0
+    assert len(report["cautions"]) == 1
+
+
+def test_a_name_that_begins_with_a_hash_is_read_back_as_it_was_written(tmp_path) -> None:
+    path = tmp_path / "t.csv"
+    rows = [("#12", 1.0), ('#a"b,c', 2.0), ("d", 3.0)]
+    write_table(path, "a remark", ("name", "value"), rows)
+    back = read_table(path, ("name", "value"), ())
+    assert back.text("name") == ["#12", '#a"b,c', "d"]
+    assert back.numbers("value") == [1.0, 2.0, 3.0]
+
+
+def test_the_limit_of_a_significance_and_reliability_are_reported_and_written(
+    written, tmp_path
+) -> None:
+    out = tmp_path / "adjusted"
+    report = _report(written, "--significance", "0.05", "--test", "baarda", "--out", str(out))
+    found = report["reliability"]
+    assert found["test"] == "baarda"
+    assert 50 < found["tests"] < report["observations"]
+    assert 3.5 < found["limit"] < 4.5
+    of_kind = {g["name"]: g for g in found["groups"]}
+    assert set(of_kind) >= {"image x", "image y", "GNSS plan", "control plan", "distance"}
+    assert 3.0 < of_kind["image y"]["detectable_median"] < 30.0
+    table = read_table(out / "residuals.csv", (), (*RESIDUAL_COLUMNS,))
+    values = np.array(table.numbers("detectable_y_um"))
+    assert np.nanmedian(values) == pytest.approx(of_kind["image y"]["detectable_median"], rel=1e-3)
+    others = read_table(out / "observations.csv", OBSERVATION_COLUMNS, ())
+    assert "distance p10 to p11" in others.text("observation")
+    assert "Baarda" in (out / "report.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (("--reject", "4", "--significance", "0.05"), "both set the limit"),
+        (("--weight-function", "best"), "huber, cauchy, tukey or danish"),
+        (("--test", "t"), "pope or baarda"),
+    ],
+)
+def test_options_that_do_not_fit_are_refused(options, sentence, written) -> None:
+    outcome = CliRunner().invoke(app, ["adjust", str(written), *options])
+    assert isinstance(outcome.exception, ConfigurationError)
+    assert sentence in str(outcome.exception)

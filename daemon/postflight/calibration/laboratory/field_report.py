@@ -148,7 +148,7 @@ def field_report(
     rig, result = found.rig, found.adjustment
     residual = image_residuals_mm(result)
     good = np.isfinite(residual).all(axis=1)
-    warnings = []
+    warnings = list(result.problems)
     taken = [c for k, c in enumerate(rig.cones) if result.network.cameras[k].terms]
     missing = {c.probe for c in taken if c.probe} - set(found.temperatures_c)
     if len(taken) < len(rig.cones):

@@ -109,6 +109,7 @@ def _warnings(head: HeadGeometry) -> list[str]:
             f"{head.cone.name}: {len(head.matching.failed)} targets matched no other; look at "
             "their images"
         )
+    found += [f"{head.cone.name}: {problem}" for problem in head.adjustment.problems]
     rejected = int(head.adjustment.rejected.sum())
     if rejected:
         found.append(f"{head.cone.name}: {rejected} targets left out as blunders")
