@@ -215,14 +215,19 @@ def disturbed(block: Block, seed: int, share: float) -> tuple[Network, Array]:
 
 
 def controllable(clean: Adjustment, error: Array) -> Flags:
-    """Blunders above 1.5 times their own detectable bias in points of three rays or more."""
+    """Blunders above 1.5 times their own detectable bias in points of three rays or more.
+
+    Rays that are blunders themselves do not count: two of three outvote the third.
+    """
     rows, table = clean.equations, clean.network.image_points
     bias = np.full(error.shape, np.inf)
     found = reliability_of(clean).detectable
     for axis in range(2):
         own = rows.group == axis
         bias[rows.source[own], axis] = found[own]
-    rays = np.bincount(table.point, minlength=len(clean.network.points.names))
+    count = len(clean.network.points.names)
+    good = np.bincount(table.point[(error == 0.0).all(axis=1)], minlength=count)
+    rays = good + 1
     large = (np.abs(error) > ABOVE_DETECTABLE * bias).any(axis=1)
     return np.asarray(large & (rays[table.point] >= MIN_RAYS))
 

@@ -45,7 +45,7 @@ def single_significance(significance: float, tests: int) -> float:
     Raises:
         ValueError: a significance outside (0, 1), or no test.
 
-    Source: Šidák (1967).
+    Source: Sidak (1967).
 
     Example:
         >>> f"{single_significance(0.05, 1000):.4e}"
