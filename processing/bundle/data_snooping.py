@@ -170,8 +170,8 @@ def contradicted(
     One blunder enlarges its neighbours' residuals. An image point is left out if it is the largest
     of its object point, more than half the largest of its image, and not surpassed by another kind
     of observation of that image; with it those of its object point that explain the contradiction
-    alike (three rays in a strip, an error along the base). Another observation is left out if nothing of its images and
-    object points surpasses it. The largest of all always is.
+    alike (three rays in a strip, an error along the base). Another observation is left out if
+    nothing of its images and object points surpasses it. The largest of all always is.
 
     Args:
         network: what was adjusted.
