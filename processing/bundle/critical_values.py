@@ -1,8 +1,8 @@
 """Critical values of data snooping for the number of tests of an adjustment.
 
 Baarda's test divides a residual by its standard deviation from the a priori sigmas, Pope's by the
-one from the a posteriori sigma0. The significance is that of the whole block: the probability that a
-block without blunders loses any observation.
+one from the a posteriori sigma0. The significance is that of the whole block: the probability that
+a block without blunders loses any observation.
 """
 
 from __future__ import annotations
