@@ -110,8 +110,8 @@ def aerial_lines(lines: int = 4, along: int = 6, points: int = 600, seed: int = 
     station = np.array(place) + random.normal(0.0, 5.0, (lines * along, 3))
     rotation = np.array(
         [
-            rotation_matrix(*random.normal(0.0, 0.02, 2), np.pi * (k // along % 2))
-            for k in range(len(station))
+            rotation_matrix(omega, phi, np.pi * (k // along % 2))
+            for k, (omega, phi) in enumerate(random.normal(0.0, 0.02, (lines * along, 2)))
         ]
     )
     low = (-base, -0.6 * distance, 0.0)
