@@ -21,6 +21,13 @@ from processing.bundle.data_snooping import (
     nothing_excluded,
 )
 from processing.bundle.equations import Equations
+from processing.bundle.free_datum import (
+    DatumFigures,
+    FreeDatum,
+    free_motions,
+    in_datum,
+    scaled_directions,
+)
 from processing.bundle.gauss_newton import (
     Progress,
     Run,
@@ -28,7 +35,7 @@ from processing.bundle.gauss_newton import (
     iterate,
 )
 from processing.bundle.network import Network, NetworkError, validate
-from processing.bundle.normal_equations import ReducedEquations, cofactor_matrix
+from processing.bundle.normal_equations import ReducedEquations, cofactor_matrix, null_directions
 from processing.bundle.rank_diagnosis import RankDefect, rank_defects
 from processing.bundle.robust_weights import WeightFunction, robust_exclusions
 from processing.bundle.statistics import ObservationGroup, groups_of, spread_of
@@ -60,6 +67,9 @@ class AdjustmentSettings:
         max_rounds: of data snooping; to reach it is a problem of the adjustment.
         variance_components: scale the sigmas of each kind of observation by its residuals.
         minimum_norm: undetermined directions raise no error; the shortest correction is used.
+        free_datum: datum of a free network: `unknowns` is the shortest correction of the scaled
+            unknowns, the others are inner constraints on object points, stations or all of them.
+        datum_names: the points and stations of those inner constraints; empty: all.
     """
 
     max_iterations: int = 30
@@ -72,6 +82,8 @@ class AdjustmentSettings:
     max_rounds: int = 100
     variance_components: bool = False
     minimum_norm: bool = False
+    free_datum: FreeDatum = "unknowns"
+    datum_names: tuple[str, ...] = ()
 
     @property
     def is_snooping(self) -> bool:
@@ -342,16 +354,23 @@ def _figures(
 ) -> Adjustment:
     layout = run.layout
     run.report_progress("covariances", len(run.history), run.history[-1])
-    cofactor = cofactor_matrix(reduced, layout.constraints, minimum_norm=run.minimum_norm)
     found: tuple[RankDefect, ...] = ()
+    directions, motions = None, None
     if run.minimum_norm:
-        found = rank_defects(run.network, layout, run.state, reduced, singular=False)
+        motions = free_motions(layout, run.state, reduced)
+        expected = scaled_directions(motions, reduced)
+        directions, _ = null_directions(reduced, layout.constraints, expected)
+        found = rank_defects(
+            run.network, layout, run.state, reduced, singular=False, directions=directions
+        )
+    cofactor = cofactor_matrix(reduced, layout.constraints, directions=directions)
     own, leverage, influence = spread_of(rows, reduced, cofactor)
     free_points = layout.eliminated_points
     held = layout.locked[free_points]
     unknowns = layout.columns + int((~held).sum())
     observations = len(rows.misclosure)
-    redundancy = observations - unknowns + len(layout.constraints) + len(found)
+    free = 0 if directions is None else directions.shape[1]
+    redundancy = observations - unknowns + len(layout.constraints) + free
     if redundancy < 0:
         raise NetworkError(
             [f"{observations} observations for {unknowns} unknowns: more are needed than that"]
@@ -370,22 +389,34 @@ def _figures(
         point_cofactor[point] = 0.0
         point_cofactor[point][np.ix_(there, there)] = cofactor[np.ix_(at[there], at[there])]
     redundancy_number = 1.0 - leverage
+    figures = DatumFigures(run.state, cofactor, point_cofactor, influence)
+    if settings.free_datum != "unknowns" and motions is not None and len(motions.combinations):
+        figures = in_datum(
+            given,
+            layout,
+            figures,
+            reduced,
+            rows.point,
+            motions,
+            settings.free_datum,
+            settings.datum_names,
+        )
     return Adjustment(
         network=given,
         layout=layout,
         settings=settings,
-        state=run.state,
+        state=figures.state,
         sigma0=sigma0,
         redundancy=redundancy,
         observations=observations,
         unknowns=unknowns,
         iterations=tuple(run.history),
-        cofactor=cofactor,
-        point_cofactor=point_cofactor,
+        cofactor=figures.cofactor,
+        point_cofactor=figures.point_cofactor,
         equations=rows,
         residual=residual,
         redundancy_number=redundancy_number,
-        influence=influence,
+        influence=figures.influence,
         weight=run.weight,
         rejected=selection.excluded.image,
         left_out=left_out,

@@ -14,8 +14,10 @@ from numpy.typing import NDArray
 
 from processing import ProcessingError
 from processing.bundle.equations import BehindCameraError, Equations, equations
+from processing.bundle.free_datum import free_motions, scaled_directions
 from processing.bundle.network import Network, NetworkError
 from processing.bundle.normal_equations import (
+    GaussNewtonStep,
     ReducedEquations,
     SingularError,
     point_normals,
@@ -106,12 +108,7 @@ def iterate(run: Run) -> tuple[Equations, ReducedEquations]:
         run.report_progress("iteration", iteration, objective)
         _refuse_flat(run, rows)
         reduced = reduced_equations(rows, run.layout)
-        try:
-            step = solve(reduced, run.layout.constraints, minimum_norm=run.minimum_norm)
-        except SingularError as error:
-            raise RankDefectError(
-                rank_defects(run.network, run.layout, run.state, error.reduced, singular=True)
-            ) from None
+        step = solved(run, reduced)
         if step.predicted_decrease <= max(_CONVERGED * objective, _OBJECTIVE_CONVERGED):
             return rows, reduced
         if iteration >= min(_WEAK_AFTER, run.max_iterations):
@@ -125,6 +122,30 @@ def iterate(run: Run) -> tuple[Equations, ReducedEquations]:
             "far off, or blunders too large: try robust weights"
         ]
     )
+
+
+def solved(run: Run, reduced: ReducedEquations) -> GaussNewtonStep:
+    """Corrections of a run.
+
+    Args:
+        run: variables of the adjustment; with `minimum_norm` its free motions are left out.
+        reduced: its reduced equations.
+
+    Returns:
+        The step.
+
+    Raises:
+        RankDefectError: directions without information.
+    """
+    directions = None
+    if run.minimum_norm:
+        directions = scaled_directions(free_motions(run.layout, run.state, reduced), reduced)
+    try:
+        return solve(reduced, run.layout.constraints, directions=directions)
+    except SingularError as error:
+        raise RankDefectError(
+            rank_defects(run.network, run.layout, run.state, error.reduced, singular=True)
+        ) from None
 
 
 def front(run: Run, state: ParameterValues) -> Equations:

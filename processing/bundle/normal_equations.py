@@ -202,14 +202,37 @@ def constrained_matrix(reduced: ReducedEquations, constraints: Array) -> tuple[A
     return scaled + rows.T @ rows, rows
 
 
-def solve(reduced: ReducedEquations, constraints: Array, *, minimum_norm: bool) -> GaussNewtonStep:
+def null_directions(
+    reduced: ReducedEquations, constraints: Array, expected: Array
+) -> tuple[Array, bool]:
+    """Directions without information.
+
+    Args:
+        reduced: from `reduced_equations`.
+        constraints: rows, shape (k, c).
+        expected: orthonormal directions in the scaled unknowns that have none, shape (c, d).
+
+    Returns:
+        All directions without information, shape (c, n), and whether they are the expected ones;
+        only then no eigenvalues were needed.
+    """
+    matrix, _ = constrained_matrix(reduced, constraints)
+    if len(matrix) and _cholesky(matrix + expected @ expected.T) is not None:
+        return expected, True
+    values, vectors = linalg.eigh(matrix)
+    return np.asarray(vectors[:, values < MIN_INFORMATION]), False
+
+
+def solve(
+    reduced: ReducedEquations, constraints: Array, *, directions: Array | None = None
+) -> GaussNewtonStep:
     """Solve the reduced equations and go back to the points.
 
     Args:
         reduced: from `reduced_equations`.
         constraints: rows, shape (k, c); constraints @ dx = 0.
-        minimum_norm: with directions that nothing determines, the shortest (scaled) correction
-            instead of an error: a free network.
+        directions: a free network: the shortest (scaled) correction, without these orthonormal
+            directions, shape (c, d), and others that nothing determines; None: an error.
 
     Returns:
         Corrections of columns and points, and the predicted decrease of the sum of squares.
@@ -220,7 +243,7 @@ def solve(reduced: ReducedEquations, constraints: Array, *, minimum_norm: bool) 
     if len(reduced.right):
         matrix, rows = constrained_matrix(reduced, constraints)
         right = reduced.right / reduced.scale
-        inverse = _inverse_action(matrix, reduced, minimum_norm)
+        inverse = _inverse_action(matrix, reduced, directions)
         dx = inverse(right)
         if len(constraints):
             spread = inverse(rows.T)
@@ -237,13 +260,16 @@ def solve(reduced: ReducedEquations, constraints: Array, *, minimum_norm: bool) 
     return GaussNewtonStep(dx, dpoints, predicted_decrease)
 
 
-def cofactor_matrix(reduced: ReducedEquations, constraints: Array, *, minimum_norm: bool) -> Array:
+def cofactor_matrix(
+    reduced: ReducedEquations, constraints: Array, *, directions: Array | None = None
+) -> Array:
     """Cofactors of the columns, constraints and eliminated points taken into account.
 
     Args:
         reduced: from `reduced_equations`.
         constraints: rows, shape (k, c); constraints @ dx = 0.
-        minimum_norm: directions that nothing determines have no variance, instead of an error.
+        directions: all that nothing determines, orthonormal in the scaled unknowns, shape (c, d);
+            they have no variance. None: an error where there are any.
 
     Returns:
         Shape (c, c); times sigma0 squared it is the covariance.
@@ -254,16 +280,15 @@ def cofactor_matrix(reduced: ReducedEquations, constraints: Array, *, minimum_no
     if not len(reduced.right):
         return np.zeros((0, 0))
     matrix, rows = constrained_matrix(reduced, constraints)
-    if minimum_norm:
-        values, vectors = linalg.eigh(matrix)
-        known = values > MIN_INFORMATION
-        inverse = (vectors[:, known] / values[known]) @ vectors[:, known].T
-    else:
-        factor = _factor(matrix, reduced)
-        inverse, info = linalg.lapack.dpotri(factor, lower=1)
-        if info != 0:
-            raise SingularError(reduced)
-        inverse = np.tril(inverse) + np.tril(inverse, -1).T
+    if directions is not None:
+        matrix = matrix + directions @ directions.T
+    factor = _factor(matrix, reduced)
+    inverse, info = linalg.lapack.dpotri(factor, lower=1)
+    if info != 0:
+        raise SingularError(reduced)
+    inverse = np.tril(inverse) + np.tril(inverse, -1).T
+    if directions is not None:
+        inverse -= directions @ directions.T
     if len(constraints):
         spread = inverse @ rows.T
         inverse -= spread @ np.linalg.pinv(rows @ spread) @ spread.T
@@ -272,19 +297,35 @@ def cofactor_matrix(reduced: ReducedEquations, constraints: Array, *, minimum_no
 
 def _factor(matrix: Array, reduced: ReducedEquations) -> Array:
     """Lower Cholesky factor, refused where a pivot shows a direction without information."""
+    factor = _cholesky(matrix)
+    if factor is None:
+        raise SingularError(reduced)
+    return factor
+
+
+def _cholesky(matrix: Array) -> Array | None:
     factor, info = linalg.lapack.dpotrf(matrix, lower=1, clean=1)
     if info != 0 or float(factor.diagonal().min(initial=1.0)) ** 2 < MIN_INFORMATION:
-        raise SingularError(reduced)
+        return None
     return np.asarray(factor)
 
 
 def _inverse_action(
-    matrix: Array, reduced: ReducedEquations, minimum_norm: bool
+    matrix: Array, reduced: ReducedEquations, directions: Array | None
 ) -> Callable[[Array], Array]:
-    if minimum_norm:
-        values, vectors = linalg.eigh(matrix)
-        known = values > MIN_INFORMATION
-        eigenvectors, weights = vectors[:, known], 1.0 / values[known]
-        return lambda right: np.asarray(eigenvectors @ ((weights * (eigenvectors.T @ right).T).T))
-    factor = _factor(matrix, reduced)
-    return lambda right: np.asarray(linalg.cho_solve((factor, True), right, check_finite=False))
+    if directions is None:
+        factor = _factor(matrix, reduced)
+        return lambda right: np.asarray(linalg.cho_solve((factor, True), right, check_finite=False))
+    # In the directions, the matrix is zero: one there leaves the solution across them as it is.
+    bordered = _cholesky(matrix + directions @ directions.T)
+    if bordered is not None:
+
+        def across(right: Array) -> Array:
+            found = linalg.cho_solve((bordered, True), right, check_finite=False)
+            return np.asarray(found - directions @ (directions.T @ found))
+
+        return across
+    values, vectors = linalg.eigh(matrix)
+    known = values > MIN_INFORMATION
+    eigenvectors, weights = vectors[:, known], 1.0 / values[known]
+    return lambda right: np.asarray(eigenvectors @ ((weights * (eigenvectors.T @ right).T).T))

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from processing import ProcessingError
+from processing.bundle.free_datum import motion_columns
 from processing.bundle.network import Network
 from processing.bundle.normal_equations import MIN_INFORMATION, ReducedEquations, constrained_matrix
 from processing.bundle.unknowns import ParameterLayout, ParameterValues, Unknown
@@ -62,6 +63,7 @@ def rank_defects(
     reduced: ReducedEquations,
     *,
     singular: bool,
+    directions: Array | None = None,
 ) -> tuple[RankDefect, ...]:
     """Name every direction of the unknowns that has no information.
 
@@ -70,6 +72,8 @@ def rank_defects(
         layout: its columns.
         state: its values.
         reduced: its reduced equations.
+        directions: what has no information, orthonormal in the scaled unknowns, shape (c, k); None:
+            found here.
         singular: they could not be solved; the weakest direction is reported at least.
 
     Returns:
@@ -78,16 +82,18 @@ def rank_defects(
 
     Source: docs/explanation/mathematics/bundle.md#rank-and-free-networks.
     """
-    matrix, _ = constrained_matrix(reduced, layout.constraints)
-    values, vectors = linalg.eigh(matrix)
-    none = vectors[:, values < MIN_INFORMATION]
+    if directions is None:
+        matrix, _ = constrained_matrix(reduced, layout.constraints)
+        values, vectors = linalg.eigh(matrix)
+        directions = vectors[:, values < MIN_INFORMATION]
+        if singular and not directions.shape[1]:
+            directions = vectors[:, :1]
+    none = directions
     if not none.shape[1]:
-        if not singular:
-            return ()
-        none = vectors[:, :1]
+        return ()
     found: list[RankDefect] = []
     named: list[Array] = []
-    for (what, hint), motion in zip(_DATUM_MOTIONS, _datum_motions(layout, state), strict=True):
+    for (what, hint), motion in zip(_DATUM_MOTIONS, motion_columns(layout, state)[0], strict=True):
         scaled = motion * reduced.scale
         length = float(np.linalg.norm(scaled))
         if length == 0.0:
@@ -152,26 +158,3 @@ def _sentence(direction: Array, unknowns: Sequence[Unknown]) -> RankDefect:
 
 def _plural(kind: str) -> str:
     return f"{kind}s"
-
-
-def _datum_motions(layout: ParameterLayout, state: ParameterValues) -> Array:
-    """Shifts, rotations and scale of the whole block as corrections of the columns, (7, c)."""
-    motions = np.zeros((7, layout.columns))
-    used = layout.station.min(axis=1) >= 0 if layout.station.size else np.zeros(0, dtype=bool)
-    centre = state.station[used].mean(axis=0) if used.any() else np.zeros(3)
-
-    def put(row: int, columns: NDArray[np.int64], values: Array) -> None:
-        there = columns >= 0
-        motions[row, columns[there]] = np.broadcast_to(values, columns.shape)[there]
-
-    for axis in range(3):
-        unit = np.eye(3)[axis]
-        put(axis, layout.station, unit)
-        put(axis, layout.retained_points, unit)
-        put(3 + axis, layout.station, np.cross(unit, state.station - centre))
-        put(3 + axis, layout.retained_points, np.cross(unit, state.points - centre))
-        put(3 + axis, layout.attitude, np.einsum("nji,j->ni", state.attitude, unit))
-    put(6, layout.station, state.station - centre)
-    put(6, layout.retained_points, state.points - centre)
-    put(6, layout.head_offset, state.head_offset)
-    return motions

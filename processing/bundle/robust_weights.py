@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 
 from processing.bundle.data_snooping import Excluded, nothing_excluded
 from processing.bundle.equations import Equations
-from processing.bundle.gauss_newton import Run, front, take_step
+from processing.bundle.gauss_newton import Run, front, solved, take_step
 from processing.bundle.network import Network
-from processing.bundle.normal_equations import SingularError, reduced_equations, solve
-from processing.bundle.rank_diagnosis import RankDefectError, rank_defects
+from processing.bundle.normal_equations import reduced_equations
 
 Array = NDArray[np.float64]
 WeightFunction = Literal["huber", "cauchy", "tukey", "danish"]
@@ -111,12 +110,7 @@ def _iterate(run: Run, plain: Network, function: WeightFunction, taken: Array) -
         objective = float(rows.misclosure @ rows.misclosure)
         run.report_progress("robust iteration", iteration, objective)
         reduced = reduced_equations(rows, run.layout)
-        try:
-            step = solve(reduced, run.layout.constraints, minimum_norm=run.minimum_norm)
-        except SingularError as error:
-            raise RankDefectError(
-                rank_defects(run.network, run.layout, run.state, error.reduced, singular=True)
-            ) from None
+        step = solved(run, reduced)
         run.state = take_step(run, step.dx, step.dpoints, objective, step.predicted_decrease)
         unweighted = replace(run, network=plain, weight=taken)
         sizes = _sizes(plain, unweighted.rows(run.state, derivatives=False))

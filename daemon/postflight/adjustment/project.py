@@ -136,6 +136,8 @@ def read_project(path: Path) -> Project:
         max_rounds=a.max_rounds,
         variance_components=a.variance_components,
         minimum_norm=a.minimum_norm,
+        free_datum=a.free_datum,
+        datum_names=a.datum_names,
     )
     return Project(file.name, file, network, settings, build.checks())
 

@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from daemon.mission.foreign_files import ForeignFileError, read_regular_file
 from daemon.postflight.adjustment.csv_tables import ProjectError
 from processing.bundle.critical_values import TestName
+from processing.bundle.free_datum import FreeDatum
 from processing.bundle.robust_weights import WeightFunction
 from processing.bundle.self_calibration import SetName
 from processing.rig.problem_sentences import findings_of, line_finder, sentences
@@ -34,6 +35,8 @@ class AdjustSection(_ProjectSection):
     max_rounds: int = Field(default=100, ge=1, le=10_000)
     variance_components: bool = False
     minimum_norm: bool = False
+    free_datum: FreeDatum = "unknowns"
+    datum_names: tuple[str, ...] = ()
     max_iterations: int = Field(default=30, ge=1, le=1000)
     image_sigma_um: float = Field(default=1.0, gt=0.0)
     gnss: Literal["none", "shift", "linear"] = "none"

@@ -1,0 +1,307 @@
+"""Datum of a free network: motions that nothing determines, and inner constraints on some unknowns.
+
+An adjusted free network may be shifted, rotated and scaled without a change of its residuals. The
+datum chooses among these; covariances follow it by an S-transformation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.bundle.network import Network, NetworkError
+from processing.bundle.normal_equations import MIN_INFORMATION, ReducedEquations, constrained_matrix
+from processing.bundle.unknowns import ParameterLayout, ParameterValues
+from processing.geometry.rotation import rotations_from_vectors
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+FreeDatum = Literal["unknowns", "points", "stations", "all"]
+
+_MAX_STEPS: Final = 50
+_STEP_CONVERGED: Final = 1e-14
+
+
+@dataclass(frozen=True)
+class Motions:
+    """Shifts, rotations and scale of the whole block that nothing determines.
+
+    Attributes:
+        combinations: (d, 7) in terms of three shifts m, three rotations rad and scale, about
+            `centre`; orthogonal.
+        centre: (3,) m.
+        columns: (c, d) changes of the columns.
+        points: (points, 3, d) changes of object points, m; zero at infinity.
+    """
+
+    combinations: Array
+    centre: Array
+    columns: Array
+    points: Array
+
+
+def motion_columns(layout: ParameterLayout, state: ParameterValues) -> tuple[Array, Array]:
+    """Shifts, rotations and scale of the whole block as corrections of the columns.
+
+    Args:
+        layout: columns.
+        state: values.
+
+    Returns:
+        Shape (7, c): shifts along X, Y, Z, rotations about them, scale; and the centre of the
+        stations, shape (3,), about which the block turns.
+    """
+    motions = np.zeros((7, layout.columns))
+    used = layout.station.min(axis=1) >= 0 if layout.station.size else np.zeros(0, dtype=bool)
+    centre = state.station[used].mean(axis=0) if used.any() else np.zeros(3)
+
+    def put(row: int, columns: NDArray[np.int64], values: Array) -> None:
+        there = columns >= 0
+        motions[row, columns[there]] = np.broadcast_to(values, columns.shape)[there]
+
+    for axis in range(3):
+        unit = np.eye(3)[axis]
+        put(axis, layout.station, unit)
+        put(axis, layout.retained_points, unit)
+        put(3 + axis, layout.station, np.cross(unit, state.station - centre))
+        put(3 + axis, layout.retained_points, np.cross(unit, state.points - centre))
+        put(3 + axis, layout.attitude, np.einsum("nji,j->ni", state.attitude, unit))
+    put(6, layout.station, state.station - centre)
+    put(6, layout.retained_points, state.points - centre)
+    put(6, layout.head_offset, state.head_offset)
+    return motions, centre
+
+
+def free_motions(
+    layout: ParameterLayout, state: ParameterValues, reduced: ReducedEquations
+) -> Motions:
+    """Motions of the block that leave all observations as they are.
+
+    Args:
+        layout: columns.
+        state: values at which the equations were reduced.
+        reduced: reduced equations.
+
+    Returns:
+        As many as have less information than `MIN_INFORMATION`; combinations of the seven where a
+        single control point, say, leaves three rotations about it.
+    """
+    motions, centre = motion_columns(layout, state)
+    scaled = motions * reduced.scale
+    length = np.linalg.norm(scaled, axis=1)
+    own = length > 0.0
+    unit = np.zeros((7, int(own.sum())))
+    unit[own, np.arange(int(own.sum()))] = 1.0 / length[own]
+    # Orthonormal directions in the scaled space, as combinations of the seven.
+    basis, triangle = np.linalg.qr((unit.T @ scaled).T)
+    matrix, _ = constrained_matrix(reduced, layout.constraints)
+    values, vectors = np.linalg.eigh(basis.T @ matrix @ basis)
+    null = vectors[:, values < MIN_INFORMATION]
+    combinations = (unit @ np.linalg.solve(triangle, null)).T
+    ground = state.points - centre
+    by_point = np.zeros((len(ground), 3, 7))
+    by_point[:, :, :3] = np.eye(3)
+    for axis in range(3):
+        by_point[:, :, 3 + axis] = np.cross(np.eye(3)[axis], ground)
+    by_point[:, :, 6] = ground
+    return Motions(
+        combinations,
+        centre,
+        (combinations @ motions).T,
+        np.einsum("pik,dk->pid", by_point, combinations),
+    )
+
+
+def scaled_directions(motions: Motions, reduced: ReducedEquations) -> Array:
+    """Orthonormal directions of the motions in the unknowns multiplied by their scale.
+
+    Args:
+        motions: from `free_motions`.
+        reduced: reduced equations.
+
+    Returns:
+        Shape (c, d).
+    """
+    return np.asarray(np.linalg.qr(motions.columns * reduced.scale[:, None])[0])
+
+
+@dataclass(frozen=True)
+class DatumFigures:
+    """State and cofactors in a datum; shapes as in `Adjustment`."""
+
+    state: ParameterValues
+    cofactor: Array
+    point_cofactor: Array
+    influence: Array
+
+
+def in_datum(
+    network: Network,
+    layout: ParameterLayout,
+    figures: DatumFigures,
+    reduced: ReducedEquations,
+    row_point: NDArray[np.int64],
+    motions: Motions,
+    datum: FreeDatum,
+    chosen: tuple[str, ...] = (),
+) -> DatumFigures:
+    """Move a free network to the datum of chosen object points and stations.
+
+    The sum of squares of the differences between adjusted and starting coordinates of the chosen is
+    smallest, and so is the trace of their covariance (inner constraints).
+
+    Args:
+        network: starting values.
+        layout: columns.
+        figures: in any datum.
+        reduced: reduced equations of the adjustment.
+        row_point: eliminated point of each row, -1 where there is none, shape (m,).
+        motions: what is free.
+        datum: object points, stations, or both.
+        chosen: names of those that define it; all of them if empty.
+
+    Returns:
+        The same in the datum.
+
+    Raises:
+        NetworkError: a name that is not there, or coordinates that do not fix the motions.
+
+    Source: Meissl (1962); docs/explanation/mathematics/bundle.md#rank-and-free-networks.
+    """
+    points, stations = _members(network, layout, datum, chosen)
+    state = _best_fit(network, figures.state, motions, points, stations)
+    at_station = layout.station[stations]
+    g_points, g_stations = motions.points[points], motions.columns[at_station]
+    normal = np.einsum("pid,pie->de", g_points, g_points)
+    normal += np.einsum("pid,pie->de", g_stations, g_stations)
+    d = len(normal)
+    scale = np.sqrt(np.clip(np.diag(normal), 1e-300, None))
+    values = np.linalg.eigvalsh(normal / scale[:, None] / scale)
+    if not len(values) or values[0] < 1e-12:
+        raise NetworkError(
+            [f"the {datum} of the datum do not fix {d} free motions of the block: choose more"]
+        )
+    inverse = np.linalg.inv(normal)
+    # t = by_columns x + sum of by_point p over the eliminated points of the datum.
+    by_columns = np.zeros((d, layout.columns))
+    for of_kind, its_columns in (
+        (g_stations, at_station),
+        (g_points, layout.retained_points[points]),
+    ):
+        there = its_columns >= 0
+        part = np.einsum("de,pie->pid", inverse, of_kind)
+        by_columns[:, its_columns[there]] += part[there].T
+    own = layout.eliminated[points] >= 0
+    where = layout.eliminated[points[own]]
+    factor = reduced.point_factor
+    by_point = np.zeros((len(factor), d, 3))
+    by_point[where] = np.einsum("de,pie,pij->pdj", inverse, g_points[own], factor[where])
+    flat = by_point.transpose(1, 0, 2).reshape(d, -1)
+    through = np.zeros((d, layout.columns))
+    through[:, reduced.sparse_columns] = (reduced.coupling_sparse.T @ flat.T).T
+    through[:, reduced.dense_columns] = flat @ reduced.coupling_dense
+    by_reduced = by_columns - through
+    with_t = figures.cofactor @ by_reduced.T
+    of_t = by_reduced @ with_t + np.einsum("pdj,pej->de", by_point, by_point)
+    coupled = reduced.coupling_sparse @ with_t[reduced.sparse_columns]
+    coupled = coupled + reduced.coupling_dense @ with_t[reduced.dense_columns]
+    point_with_t = np.einsum(
+        "pij,pjd->pid", factor, by_point.transpose(0, 2, 1) - coupled.reshape(-1, 3, d)
+    )
+    columns = motions.columns
+    cofactor = figures.cofactor - with_t @ columns.T - columns @ with_t.T
+    cofactor += columns @ of_t @ columns.T
+    point_cofactor = figures.point_cofactor.copy()
+    eliminated = layout.eliminated_points
+    g = motions.points[eliminated]
+    cross = np.einsum("pid,pjd->pij", point_with_t, g)
+    point_cofactor[eliminated] += np.einsum("pid,de,pje->pij", g, of_t, g) - cross
+    point_cofactor[eliminated] -= cross.transpose(0, 2, 1)
+    retained = (layout.retained_points >= 0).all(axis=1)
+    at = layout.retained_points[retained]
+    point_cofactor[retained] = cofactor[at[:, :, None], at[:, None, :]]
+    there = row_point >= 0
+    of = row_point[there]
+    row_t = (reduced.design_sparse @ with_t[reduced.sparse_columns])[there]
+    row_t = row_t + reduced.design_dense[there] @ with_t[reduced.dense_columns]
+    b = reduced.point_rows[there]
+    inside = by_point.transpose(0, 2, 1) - coupled.reshape(-1, 3, d)
+    row_t = row_t + np.einsum("mj,mjd->md", b, inside[of])
+    influence = figures.influence.copy()
+    influence[there] -= np.einsum("mid,md->mi", g[of], row_t)
+    return DatumFigures(state, cofactor, point_cofactor, influence)
+
+
+def _members(
+    network: Network, layout: ParameterLayout, datum: FreeDatum, chosen: tuple[str, ...]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Object points and stations of the datum, by index."""
+    adjusted = (layout.eliminated >= 0) | (layout.retained_points >= 0).all(axis=1)
+    adjusted &= ~layout.locked.any(axis=1) & ~network.points.at_infinity
+    free = (layout.station >= 0).all(axis=1)
+    names = set(chosen)
+    taken_points, taken_stations = np.zeros_like(adjusted), np.zeros_like(free)
+    if datum in ("points", "all"):
+        taken_points = adjusted & _named(network.points.names, names)
+    if datum in ("stations", "all"):
+        taken_stations = free & _named(network.stations.names, names)
+    known = {*network.points.names, *network.stations.names}
+    missing = sorted(names - known)
+    if missing:
+        raise NetworkError([f"the datum names {', '.join(missing[:5])}, which are not there"])
+    return np.flatnonzero(taken_points), np.flatnonzero(taken_stations)
+
+
+def _named(names: tuple[str, ...], chosen: set[str]) -> Flags:
+    if not chosen:
+        return np.ones(len(names), dtype=bool)
+    return np.array([name in chosen for name in names], dtype=bool)
+
+
+def _best_fit(
+    network: Network,
+    state: ParameterValues,
+    motions: Motions,
+    points: NDArray[np.int64],
+    stations: NDArray[np.int64],
+) -> ParameterValues:
+    """The state moved so that the coordinates of the datum fit their starting values best."""
+    target = np.concatenate([network.points.xyz_m[points], network.stations.position_m[stations]])
+    for _ in range(_MAX_STEPS):
+        now = np.concatenate([state.points[points], state.station[stations]])
+        about = now - motions.centre
+        by_motion = np.zeros((len(now), 3, 7))
+        by_motion[:, :, :3] = np.eye(3)
+        for axis in range(3):
+            by_motion[:, :, 3 + axis] = np.cross(np.eye(3)[axis], about)
+        by_motion[:, :, 6] = about
+        design = np.einsum("pik,dk->pid", by_motion, motions.combinations).reshape(3 * len(now), -1)
+        step = np.linalg.lstsq(design, (target - now).ravel(), rcond=None)[0]
+        seven = step @ motions.combinations
+        state = _moved(network, state, motions.centre, seven)
+        size = max(float(np.abs(about).max(initial=1.0)), 1.0)
+        if np.abs(design @ step).max(initial=0.0) <= _STEP_CONVERGED * size:
+            break
+    return state
+
+
+def _moved(
+    network: Network, state: ParameterValues, centre: Array, seven: Array
+) -> ParameterValues:
+    rotation = rotations_from_vectors(seven[3:6][None])[0]
+    scale = float(np.exp(seven[6]))
+
+    def place(xyz: Array) -> Array:
+        return np.asarray(centre + seven[:3] + scale * (xyz - centre) @ rotation.T)
+
+    infinite = network.points.at_infinity[:, None]
+    return replace(
+        state,
+        station=place(state.station),
+        attitude=rotation @ state.attitude,
+        head_offset=scale * state.head_offset,
+        points=np.where(infinite, state.points @ rotation.T, place(state.points)),
+    )

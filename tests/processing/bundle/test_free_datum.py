@@ -1,0 +1,103 @@
+"""Free networks: inner constraints on points and stations, against all unknowns at once."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from processing.bundle.adjust import Adjustment, AdjustmentSettings, adjust
+from processing.bundle.network import Network, NetworkError
+from tests.processing.bundle.simulated_networks import aerial
+
+
+@pytest.fixture(scope="module")
+def free() -> Network:
+    network = aerial(seed=3, sigma_mm=2e-3, lines=2, along=3, points=40, control=0).network
+    rays = np.bincount(network.image_points.point, minlength=40)
+    assert (rays >= 2).sum() > 30
+    return network
+
+
+def in_datum(network: Network, datum: str, names: tuple[str, ...] = ()) -> Adjustment:
+    return adjust(
+        network,
+        AdjustmentSettings(minimum_norm=True, free_datum=datum, datum_names=names),
+    )
+
+
+def dense(result: Adjustment) -> tuple[np.ndarray, np.ndarray, list[int]]:
+    """Normal matrix of all unknowns, its seven null directions, and the adjusted points."""
+    rows, points = result.equations, result.layout.eliminated_points
+    c = result.layout.columns
+    design = np.zeros((len(rows.misclosure), c + 3 * len(points)))
+    design[:, :c] = rows.reduced.toarray()
+    for k, p in enumerate(rows.point):
+        if p >= 0:
+            design[k, c + 3 * p : c + 3 * p + 3] = rows.point_part[k]
+    scale = np.linalg.norm(design, axis=0)
+    _, values, right = np.linalg.svd(design / scale)
+    assert values[-7] < 1e-9 * values[0] < 1e-3 * values[-8]
+    return design.T @ design, (right[-7:] / scale).T, list(points)
+
+
+@pytest.mark.parametrize("datum", ["points", "stations", "all"])
+@pytest.mark.parametrize("some", [False, True])
+def test_covariances_are_those_of_inner_constraints(free, datum, some) -> None:
+    if some:
+        names = {"points": ("p3", "p7", "p12", "p20"), "stations": ("e0", "e2", "e5"),
+                 "all": ("p3", "p7", "e0", "e5")}[datum]  # fmt: skip
+    else:
+        names = ()
+    result = in_datum(free, datum, names)
+    normal, null, points = dense(result)
+    c, layout = result.layout.columns, result.layout
+    chosen = np.zeros(len(normal), dtype=bool)
+    if datum in ("points", "all"):
+        for at, p in enumerate(points):
+            chosen[c + 3 * at : c + 3 * at + 3] = not names or f"p{p}" in names
+    if datum in ("stations", "all"):
+        for k, columns in enumerate(layout.station):
+            chosen[columns[columns >= 0]] = not names or f"e{k}" in names
+    constraint = np.where(chosen[:, None], null, 0.0).T
+    m = len(normal)
+    bordered = np.zeros((m + 7, m + 7))
+    bordered[:m, :m], bordered[m:, :m], bordered[:m, m:] = normal, constraint, constraint.T
+    scale = np.sqrt(np.concatenate([np.diag(normal), np.ones(7)]))
+    scale[m:] = np.linalg.norm(constraint / scale[:m], axis=1)
+    wanted = np.linalg.inv(bordered / scale[:, None] / scale) / scale[:, None] / scale
+    spread = np.sqrt(np.diag(wanted)[:m])
+    own = np.sqrt(np.diag(result.cofactor))
+    assert own == pytest.approx(spread[:c], rel=1e-4)
+    of_points = np.sqrt(np.einsum("pii->pi", result.point_cofactor[points])).ravel()
+    assert of_points == pytest.approx(spread[c:], rel=1e-4)
+    reference = in_datum(free, "unknowns")
+    assert result.sigma0 == pytest.approx(reference.sigma0, rel=1e-9)
+    assert result.redundancy == reference.redundancy
+
+
+def test_adjusted_coordinates_fit_the_starting_values_best(free) -> None:
+    result = in_datum(free, "points")
+    points = result.layout.eliminated_points
+    difference = result.state.points[points] - free.points.xyz_m[points]
+    about = result.state.points[points] - result.state.points[points].mean(axis=0)
+    assert np.abs(difference.sum(axis=0)).max() < 1e-8
+    assert np.abs(np.cross(about, difference).sum(axis=0)).max() < 1e-5
+    assert abs((about * difference).sum()) < 1e-5
+    # The same network: adjusted again from there, nothing moves.
+    state = result.state
+    again = replace(
+        free,
+        stations=replace(free.stations, position_m=state.station),
+        attitudes=replace(free.attitudes, rotation=state.attitude),
+        points=replace(free.points, xyz_m=state.points),
+    )
+    assert in_datum(again, "points").iterations[0] == pytest.approx(result.iterations[-1], rel=1e-6)
+
+
+def test_a_datum_that_does_not_fix_the_block_or_names_nothing_is_refused(free) -> None:
+    with pytest.raises(NetworkError, match="choose more"):
+        in_datum(free, "points", ("p3",))
+    with pytest.raises(NetworkError, match="x9, which are not there"):
+        in_datum(free, "points", ("x9",))
