@@ -6,12 +6,10 @@ Drivers declare the settings of devices. How a file is read is in
 
 from __future__ import annotations
 
-import ipaddress
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, TypeVar
+from typing import Annotated, Any, Final, Literal
 
 from pydantic import (
     AfterValidator,
@@ -25,6 +23,9 @@ from pydantic import (
 )
 
 from daemon import DaemonError
+from daemon.configuration.section import ConfigurationSection, FilePath, Several
+from daemon.configuration.watch_section import MavlinkCameraSection as MavlinkCameraSection
+from daemon.configuration.watch_section import WatchSection as WatchSection
 from processing.image.kernels import DEFAULT_INTERPOLATION, Interpolation
 from processing.quality.report import Thresholds
 from processing.rig.problem_sentences import ProblemList
@@ -49,11 +50,6 @@ class ConfigurationError(ProblemList, DaemonError, ValueError):
     """An invalid configuration; `problems` holds one sentence per error."""
 
 
-def _in_folder(path: Path, info: ValidationInfo) -> Path:
-    """The path relative to the folder of the file, if that is in the context of the validation."""
-    return info.context["folder"] / path if info.context else path
-
-
 def local_rig(name: str, folder: Path) -> str:
     """The path of a rig file next to the configuration, or the name of a rig."""
     path = folder / name
@@ -64,16 +60,7 @@ def _local_rig(name: str, info: ValidationInfo) -> str:
     return local_rig(name, info.context["folder"]) if info.context else name
 
 
-Item = TypeVar("Item")
-Several = Annotated[tuple[Item, ...], Strict(False)]
 Vector = Annotated[tuple[float, float, float], Strict(False)]
-FilePath = Annotated[Path, Strict(False), AfterValidator(_in_folder)]
-
-
-class _ConfigurationSection(BaseModel):
-    model_config = ConfigDict(
-        extra="forbid", frozen=True, strict=True, allow_inf_nan=False, use_attribute_docstrings=True
-    )
 
 
 class _DriverSection(BaseModel):
@@ -87,7 +74,7 @@ class _DriverSection(BaseModel):
     """Name of the driver; its settings are further keys."""
 
 
-class MissionSection(_ConfigurationSection):
+class MissionSection(ConfigurationSection):
     """Storage of missions, and the rig.
 
     With `mirror`, a folder on another disk, all files are stored on both
@@ -108,7 +95,7 @@ class MissionSection(_ConfigurationSection):
     """Whether the service ends after the last exposure is processed."""
 
 
-class PlanSection(_ConfigurationSection):
+class PlanSection(ConfigurationSection):
     """The planned flight; navigation data replace its values when they arrive.
 
     `file` holds the lines (docs/how-to/flight/plan.md). A position farther than `corridor_m` from a
@@ -147,7 +134,7 @@ class PlanSection(_ConfigurationSection):
         return self
 
 
-class MountSection(_ConfigurationSection):
+class MountSection(ConfigurationSection):
     """Mounting of the camera relative to the navigation receiver.
 
     Conventions: docs/how-to/processing/orientation.md.
@@ -165,16 +152,16 @@ class MountSection(_ConfigurationSection):
     """Added to exposure times before the trajectory is interpolated."""
 
 
-class SerialsSection(_ConfigurationSection):
+class SerialsSection(ConfigurationSection):
     """Serial numbers that no bus reports, from the labels of lenses (by cone) and probes.
 
     They are compared with those of the calibration before a flight
     (docs/reference/flight/arming.md).
     """
 
-    lens: dict[str, str] = {}
+    lens: dict[str, str] = Field(default_factory=dict)
     """Serial number of each lens by the name of its cone."""
-    probe: dict[str, str] = {}
+    probe: dict[str, str] = Field(default_factory=dict)
     """Serial number of each probe by its name."""
 
     @property
@@ -236,7 +223,7 @@ class NamedDeviceSection(DeviceSection):
     """Name of the device in records and messages."""
 
 
-class ExposureSection(_ConfigurationSection):
+class ExposureSection(ConfigurationSection):
     """Control of the exposure settings of the heads, with limits (docs/how-to/flight/exposure.md).
 
     `target` is the desired 99th percentile of the pixels, as a fraction of full scale. With `lock`
@@ -261,7 +248,7 @@ class ExposureSection(_ConfigurationSection):
     """Highest number of TDI shifts."""
 
 
-class ProcessingSection(_ConfigurationSection):
+class ProcessingSection(ConfigurationSection):
     """Processing of exposures, and the thresholds of their verdicts.
 
     `thresholds` are those of `processing.quality.report.Thresholds` that are not the defaults.
@@ -301,126 +288,7 @@ class ProcessingSection(_ConfigurationSection):
         return given
 
 
-class MavlinkCameraSection(_ConfigurationSection):
-    """The rig as one camera of a vehicle (docs/how-to/flight/mavlink-camera.md).
-
-    `connect` is "udpout:HOST:PORT", the address of a ground station or autopilot, or
-    "udpin:HOST:PORT". `commands` from others are executed when "signed" (with `signing_key`, a file
-    of 64 hexadecimal digits), from "any", or from "none". `signing_state` is the file for
-    the last timestamps of signed messages (default: in the folder of missions).
-    """
-
-    connect: str = "udpout:127.0.0.1:14550"
-    """Address: `udpout:HOST:PORT` or `udpin:HOST:PORT`."""
-    system_id: int = Field(default=1, ge=1, le=255)
-    """MAVLink system, that of the vehicle."""
-    component_id: int = Field(default=100, ge=100, le=105)
-    """MAVLink component."""
-    commands: Literal["signed", "any", "none"] = "none"
-    """Whose commands are executed."""
-    signing_key: FilePath | None = None
-    """File with the signing key of 64 hexadecimal digits."""
-    signing_state: FilePath | None = None
-    """File of the last timestamps of signed messages; default: below the missions."""
-    feedback: bool = False
-    """Whether `CAMERA_FEEDBACK` is sent for autopilots."""
-
-    @model_validator(mode="after")
-    def _check_connection(self) -> MavlinkCameraSection:
-        scheme, _, rest = self.connect.partition(":")
-        host, _, port = rest.rpartition(":")
-        is_valid_port = port.isdecimal() and 0 < int(port) < 65536
-        if scheme not in ("udpin", "udpout") or not host or not is_valid_port:
-            raise ValueError(
-                f"connect is {self.connect!r}; write udpout:HOST:PORT or udpin:HOST:PORT"
-            )
-        if self.commands == "signed" and self.signing_key is None:
-            raise ValueError("commands are 'signed' and signing_key is missing; give its file")
-        return self
-
-
-class WatchSection(_ConfigurationSection):
-    """Access for monitoring and commands (docs/how-to/flight/watching.md).
-
-    Commands over the network require a token. At the Unix socket `control` members of
-    `control_group` are operators, and members of `control_administrator_group` administrators.
-    """
-
-    host: str = "127.0.0.1"
-    """Address on which page and API listen."""
-    port: int = Field(default=8470, ge=0, le=65535)
-    """TCP port of page and API; 0 takes any free port."""
-    anonymous_read: bool = True
-    """Whether reading requires no token. Commands always require one."""
-    tokens: FilePath | None = None
-    """File with the hashes of the tokens; without it there are no commands over the network."""
-    tls_certificate: FilePath | None = None
-    """Certificate of the server, PEM."""
-    tls_key: FilePath | None = None
-    """Private key of the certificate, PEM."""
-    announce: bool = True
-    """Whether the service is announced by mDNS."""
-    udp: Several[str] = Field(default=(), max_length=8)
-    """Receivers of telemetry datagrams, `HOST:PORT` each."""
-    udp_bytes_per_s: float = Field(default=4000.0, ge=1000)
-    """Highest rate of datagrams to each receiver."""
-    mavlink: MavlinkCameraSection | None = None
-    control: FilePath | None = None
-    """Path of the Unix socket for commands on this computer."""
-    control_group: str | None = None
-    """Group whose members are operators; default: the group of the service."""
-    control_administrator_group: str | None = None
-    """Group whose members are administrators, in addition to root."""
-    hosts: Several[str] = Field(default=(), max_length=16)
-    """Names under which the page is served, in addition to the computer's own."""
-    proxies: Several[str] = Field(default=(), max_length=8)
-    """IP addresses of reverse proxies whose forwarding headers count."""
-
-    @property
-    def udp_addresses(self) -> dict[str, tuple[str, int]]:
-        """Addresses of datagrams by their text in the configuration."""
-        return {text: (text.rpartition(":")[0], int(text.rpartition(":")[2])) for text in self.udp}
-
-    @model_validator(mode="after")
-    def _check_udp(self) -> WatchSection:
-        for text in self.udp:
-            host, _, port = text.rpartition(":")
-            if not host or not port.isdecimal() or not 0 < int(port) < 65536:
-                raise ValueError(f"udp has {text!r}; write HOST:PORT")
-        return self
-
-    @field_validator("hosts")
-    @classmethod
-    def _check_hosts(cls, names: tuple[str, ...]) -> tuple[str, ...]:
-        for name in names:
-            if not re.fullmatch(r"[A-Za-z0-9]([A-Za-z0-9.\-]{0,251}[A-Za-z0-9])?", name):
-                raise ValueError(f"hosts has {name!r}; write a host name without scheme and port")
-        return names
-
-    @field_validator("proxies")
-    @classmethod
-    def _check_proxies(cls, addresses: tuple[str, ...]) -> tuple[str, ...]:
-        for address in addresses:
-            try:
-                ipaddress.ip_address(address)
-            except ValueError:
-                raise ValueError(f"proxies has {address!r}; write an IP address") from None
-        return addresses
-
-    @model_validator(mode="after")
-    def _check_tls(self) -> WatchSection:
-        if (self.tls_certificate is None) != (self.tls_key is None):
-            raise ValueError("tls_certificate and tls_key belong together; give both or none")
-        is_remote = not (self.host.startswith("127.") or self.host in ("::1", "localhost"))
-        if is_remote and self.tokens is not None and self.tls_certificate is None:
-            raise ValueError(
-                f"host {self.host} is not on this machine, and tokens would be sent without "
-                "encryption; give tls_certificate and tls_key, or no tokens (no commands)"
-            )
-        return self
-
-
-class LimitsSection(_ConfigurationSection):
+class LimitsSection(ConfigurationSection):
     """Time limits, and the number of exposures in memory."""
 
     frame_timeout_s: float = Field(default=8.0, gt=0)
@@ -445,14 +313,14 @@ class LimitsSection(_ConfigurationSection):
     """Time in which open exposures are stored and sealed after a power failure."""
 
 
-class NetworkSection(_ConfigurationSection):
+class NetworkSection(ConfigurationSection):
     """Links between heads and this computer (docs/how-to/flight/link-budget.md).
 
     The rate of an interface is read from the kernel. `link_mbps` replaces it where the interface
     reports none, or where a slower link lies between the switch and this computer.
     """
 
-    link_mbps: dict[str, Annotated[float, Field(gt=0)]] = {}
+    link_mbps: dict[str, Annotated[float, Field(gt=0)]] = Field(default_factory=dict)
     """Rate of the slowest link between heads and this computer by interface, Mbit/s."""
     head_link_mbps: float = Field(default=1000.0, gt=0)
     """Rate of the link between a head and the switch, Mbit/s."""
@@ -462,7 +330,7 @@ class NetworkSection(_ConfigurationSection):
     """Whether heads that share a link are paced."""
 
 
-class Configuration(_ConfigurationSection):
+class Configuration(ConfigurationSection):
     """The complete file."""
 
     mission: MissionSection

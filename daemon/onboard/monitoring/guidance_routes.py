@@ -11,9 +11,11 @@ import asyncio
 import time
 from contextlib import suppress
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Final, Protocol
 
 from fastapi import FastAPI, WebSocket
+from fastapi.responses import FileResponse
 from starlette.requests import HTTPConnection
 from starlette.websockets import WebSocketDisconnect
 
@@ -99,8 +101,12 @@ class FrameWindow:
         self.rtt_s = rtt_s if self.rtt_s is None else 0.8 * self.rtt_s + 0.2 * rtt_s
 
 
-def add_guidance(app: FastAPI, state: FlightState, access: WatchAccess) -> None:
-    """Add the route; `access` authorizes readers and limits their number."""
+def add_guidance(app: FastAPI, state: FlightState, access: WatchAccess, page: Path) -> None:
+    """Add the routes; `access` authorizes and counts readers, `page` is the pilot's."""
+
+    @app.get("/pilot", include_in_schema=False)
+    async def pilot() -> FileResponse:
+        return FileResponse(page)
 
     @app.websocket("/api/v1/guidance")
     async def guidance(socket: WebSocket) -> None:

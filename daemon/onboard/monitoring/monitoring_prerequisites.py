@@ -25,6 +25,7 @@ from daemon.onboard.monitoring.access.certificates import (
     validity_problem,
 )
 from daemon.onboard.monitoring.access.tokens import TokenError, read_tokens
+from daemon.onboard.monitoring.maps.map_library import check_maps
 from daemon.onboard.monitoring.mavlink.signatures import read_key
 from daemon.onboard.preflight.check_results import CheckOutcome, CheckResult, failed, passed
 
@@ -46,6 +47,7 @@ def check_monitoring(settings: WatchSection, *, port: bool = True) -> Iterator[C
     yield from _certificate(settings)
     yield from _control(settings)
     yield from _signing_key(settings)
+    yield from check_maps(settings.maps)
 
 
 def listen(host: str, port: int) -> socket.socket:

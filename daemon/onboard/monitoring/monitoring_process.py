@@ -38,6 +38,7 @@ from daemon.onboard.monitoring.http_limits import (
     LimitedWebSocket,
     RateLimitFilter,
 )
+from daemon.onboard.monitoring.maps.map_library import MapLibrary
 from daemon.onboard.monitoring.mavlink.camera import MavlinkCamera
 from daemon.onboard.monitoring.mavlink.datagrams import send
 from daemon.onboard.monitoring.monitoring_prerequisites import WatchError, check_monitoring, listen
@@ -89,7 +90,8 @@ async def _serve(link: PageConnection, settings: WatchSection, plan: PlanSection
     coverage = Coverage(state, plan)
     watchers = AccessSettings(_tokens(settings.tokens), settings.anonymous_read)
     connections = Connections(settings.proxies)
-    app = create_app(state, gateway, watchers, coverage, connections)
+    maps = MapLibrary(settings.maps, plan)
+    app = create_app(state, gateway, watchers, coverage, connections, maps)
     certified = "certificate" not in failing
     files = _certificate_files(settings) if certified else None
     server = _Server(

@@ -33,7 +33,15 @@ NUMBER_MAX: Final = 2**53
 ARGUMENTS_MAX: Final = 16
 
 PAGE_DEVICES: Final = frozenset(
-    {"watch", "tokens", "certificate", "certificate for clients", "control", "mavlink camera"}
+    {
+        "watch",
+        "tokens",
+        "certificate",
+        "certificate for clients",
+        "control",
+        "mavlink camera",
+        "maps",
+    }
 )
 """What the page's process may report as absent."""
 

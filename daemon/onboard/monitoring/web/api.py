@@ -36,6 +36,9 @@ from daemon.onboard.monitoring.access.tokens import FailedAttempts, TokenHolder,
 from daemon.onboard.monitoring.coverage import Coverage
 from daemon.onboard.monitoring.flight_state import EXPOSURES_MAX, PARTS, PREVIEW_PARTS, FlightState
 from daemon.onboard.monitoring.guidance_routes import add_guidance
+from daemon.onboard.monitoring.image_routes import add_images
+from daemon.onboard.monitoring.map_routes import add_maps
+from daemon.onboard.monitoring.maps.map_library import MapLibrary
 from daemon.onboard.monitoring.metrics import exposition
 from daemon.onboard.monitoring.plan_routes import add_plan
 from daemon.onboard.monitoring.telemetry import MIN_BYTES_PER_S, Subscription, packed
@@ -135,6 +138,7 @@ def create_app(
     settings: AccessSettings,
     coverage: Coverage | None = None,
     connections: Connections | None = None,
+    maps: MapLibrary | None = None,
 ) -> FastAPI:
     """The application; its only own state is the open connections."""
     app = FastAPI(
@@ -153,7 +157,9 @@ def create_app(
     _add_products(app, state, access)
     _add_commands(app, state, gateway, access)
     _add_telemetry(app, state, access)
-    add_guidance(app, state, access)
+    add_guidance(app, state, access, PAGE / "pilot.html")
+    add_maps(app, maps or MapLibrary(()), Depends(access.watch))
+    add_images(app, state, Depends(access.watch))
     add_plan(app, state, coverage or Coverage(state), Depends(access.watch))
     _add_page(app)
     return app

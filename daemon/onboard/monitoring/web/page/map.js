@@ -1,6 +1,9 @@
-// The map: track and footprints, coloured by verdict and marked by shape. No tiles: it works offline.
+// The map: lines, track and footprints, coloured by verdict and marked by shape, over offline base maps.
 
 import { flight } from "./telemetry.js";
+import { onGuidance } from "./guidance.js";
+import { startLayers } from "./map_layers.js";
+import { startMeasuring } from "./map_measure.js";
 
 const COLOURS = { good: "--good", usable: "--caution", refly: "--warning", lost: "--warning" };
 const DASHES = { good: null, usable: "6 3", refly: "2 4", lost: "1 7" };
@@ -55,15 +58,38 @@ function behind([[lat0, lon0], [lat1, lon1]]) {
   return east > 0 ? "left" : "right";
 }
 
-// The planned lines with their ids and planned exposure positions.
+let planned = null;
+let drawnState = "";
+const lineState = () => JSON.stringify(flight.brief?.status?.lines || {});
+
+// State of a line: flown, current, next, or only planned.
+function styleOfLine(id) {
+  const { flown = [], current, next } = flight.brief?.status?.lines || {};
+  if (id === current) return { color: colour("--accent"), weight: 5, dashArray: null };
+  if (id === next) return { color: colour("--accent"), weight: 4, dashArray: "14 6" };
+  if (flown.includes(id)) return { color: colour("--soft"), weight: 3, dashArray: null };
+  return { color: colour("--soft"), weight: 2, dashArray: "8 6" };
+}
+
+function drawRetakes(retakes) {
+  for (const one of retakes) {
+    L.polyline(one.at, { color: colour("--accent"), weight: 8, opacity: 0.5, interactive: false }).addTo(plan);
+    L.circleMarker(one.at[0], { radius: 2, color: colour("--accent"), interactive: false })
+      .bindTooltip(label(`↻ ${one.line}`), { permanent: true, direction: "left", className: "retake-label" }).addTo(plan);
+  }
+}
+
+// The planned lines with their ids, states and planned exposure positions, and retakes.
 export function drawPlan(received) {
   plan.clearLayers();
   planBounds = null;
+  planned = received;
+  drawnState = lineState();
   const lines = received?.lines || [];
   if (!lines.length) return;
   planBounds = L.latLngBounds(lines.flatMap((line) => line.at));
   for (const line of lines) {
-    L.polyline(line.at, { color: colour("--soft"), weight: 2, dashArray: "8 6", interactive: false }).addTo(plan);
+    L.polyline(line.at, { ...styleOfLine(line.id), interactive: false }).addTo(plan);
     L.circleMarker(line.at[0], { radius: 2, color: colour("--soft"), interactive: false })
       .bindTooltip(label(line.id), { permanent: true, direction: behind(line.at), className: "line-label" }).addTo(plan);
     if (line.places_m.length > 200) continue;
@@ -76,6 +102,12 @@ export function drawPlan(received) {
         { radius: 2, weight: 1, color: colour("--soft"), interactive: false }).addTo(plan);
     }
   }
+  drawRetakes(received.retakes || []);
+}
+
+// Redraw the lines when their state, the theme or the retakes changed.
+function updateLines() {
+  if (planned && drawnState !== lineState()) drawPlan(planned);
 }
 
 // Ground covered by too few images, and the line segments to re-fly for it.
@@ -140,7 +172,16 @@ function frame() {
 }
 
 export function start(root, feed) {
+  startLayers(map, feed);
+  startMeasuring(map);
+  onGuidance((frame) => {
+    if (frame.latitude_deg == null) return;
+    marker.setLatLng([frame.latitude_deg, frame.longitude_deg]).addTo(map);
+    marker.setStyle({ color: colour(frame.is_deviating ? "--warning" : "--accent") });
+  });
   feed.subscribe((record, isFirstRecord) => {
+    if (!record && planned) drawPlan(planned);
+    updateLines();
     if (isFirstRecord || !record || record.exposures || record.track) drawMap(feed.select);
   });
   feed.key("f", "map.follow", () => follow.click());

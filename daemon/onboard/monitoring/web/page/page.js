@@ -24,13 +24,18 @@ import * as expert from "./expert.js";
 import * as map from "./map.js";
 import * as plan from "./plan.js";
 import * as quicklook from "./quicklook.js";
+import * as guidance from "./guidance.js";
+import * as strip from "./strip.js";
+import * as deepzoom from "./deepzoom.js";
+import * as manual from "./manual_verdict.js";
 
 // Each with the element that it fills. They start in this order.
 const MODULES = [
   [tabs, "tabs"], [keys, "settings"], [settings, "settings"], [lamps, "lamps"], [phase, "phase-actions"],
   [alarms, "page-alarms"], [verdict, "verdict-panel"], [left, "left"], [checklist, "checklist"],
   [landing, "landing"], [wakeLock, "settings"], [install, "settings"], [devices, "page-devices"],
-  [exposure, "exposure-panel"], [map, "map-panel"], [plan, "reflights"], [quicklook, "image-panel"], [expert, "page-expert"],
+  [exposure, "exposure-panel"], [map, "map-panel"], [plan, "reflights"], [quicklook, "image-panel"],
+  [guidance, "guidance"], [strip, "strip"], [deepzoom, "image-panel"], [manual, "image-panel"], [expert, "page-expert"],
 ];
 
 fill();

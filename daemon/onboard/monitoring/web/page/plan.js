@@ -3,6 +3,9 @@
 import { fetchJson } from "./http.js";
 import { flight } from "./telemetry.js";
 import { drawGaps, drawPlan } from "./map.js";
+import { t } from "./i18n.js";
+import { distance, number, percent } from "./format.js";
+import { button } from "./dom.js";
 
 const REFRESH_MS = 3000;
 const coverageText = document.getElementById("coverage");
@@ -11,13 +14,15 @@ let mission = null;
 let hasPlan = false;
 let requestedMs = 0;
 let timer = null;
+let retakes = 0;
+let sendCommand = null;
 
 const areaOf = (one) => one.holes.reduce((sum, gap) => sum + gap.area_m2, 0);
 
 // Shortfalls of a segment: missing bands, and images found of images required.
 function shortfallsOf(one) {
   const texts = one.holes.map((gap) =>
-    `${gap.bands.length ? `${gap.bands.join(", ")}: ` : ""}${gap.images} of ${gap.needed} images`);
+    `${gap.bands.length ? `${gap.bands.join(", ")}: ` : ""}${t("lines.images", gap)}`);
   return [...new Set(texts)];
 }
 
@@ -29,6 +34,10 @@ function row(one) {
     cell.textContent = text;
     tableRow.append(cell);
   }
+  const action = document.createElement("td");
+  action.append(button(t("lines.retake"), () => sendCommand("retake", { line: one.line, from_m: one.from_m, to_m: one.to_m }),
+    { ariaLabel: `${t("lines.retake")} ${one.line} ${one.from_m.toFixed(0)}` }));
+  tableRow.append(action);
   return tableRow;
 }
 
@@ -37,11 +46,10 @@ async function updateAdvice() {
   const advice = await fetchJson("/api/v1/advice");
   if (!advice?.segments) return;
   const gaps = advice.segments.filter((one) => one.kind === "hole");
-  const share = advice.planned_m ? 100 * advice.covered_m / advice.planned_m : 0;
+  const share = advice.planned_m ? advice.covered_m / advice.planned_m : 0;
   coverageText.textContent = [
-    `${share.toFixed(0)} % of ${(advice.planned_m / 1000).toFixed(1)} km covered`,
-    gaps.length ? `${gaps.length} ${gaps.length === 1 ? "gap" : "gaps"} to re-fly, ${(advice.hole_m2 / 1e4).toFixed(2)} ha`
-      : "no gap to re-fly",
+    t("lines.covered", { share: percent(share), length: distance(advice.planned_m) }),
+    gaps.length ? t("lines.gaps", { n: gaps.length, ha: number(advice.hole_m2 / 1e4, 2) }) : t("lines.no_gap"),
     ...advice.notes,
   ].join(". ");
   rows.replaceChildren(...gaps.map(row));
@@ -52,8 +60,10 @@ async function updateAdvice() {
 // Fetch the plan once per mission. Fetch the coverage after new exposures, at most every REFRESH_MS.
 async function followPlan(hasNewExposures) {
   const current = flight.brief?.mission?.id || null;
-  if (current !== mission) {
+  const wantedRetakes = flight.brief?.retakes || 0;
+  if (current !== mission || wantedRetakes !== retakes) {
     mission = current;
+    retakes = wantedRetakes;
     const plan = current && await fetchJson("/api/v1/plan");
     hasPlan = Boolean(plan?.lines);
     drawPlan(plan);
@@ -65,5 +75,6 @@ async function followPlan(hasNewExposures) {
 }
 
 export function start(_root, feed) {
+  sendCommand = feed.command;
   feed.subscribe((record) => followPlan(Boolean(record?.exposures)));
 }

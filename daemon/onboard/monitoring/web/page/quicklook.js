@@ -2,6 +2,8 @@
 
 import { fetchOk, fetchJson } from "./http.js";
 import { flight } from "./telemetry.js";
+import { t } from "./i18n.js";
+import { isSlow, thumbnailOf } from "./thumbnails.js";
 import { drawHistogram, drawVectors, clearHistogram, listOverlaps } from "./residuals.js";
 
 const viewport = document.getElementById("image");
@@ -16,6 +18,7 @@ const drawing = document.getElementById("vectors");
 const RETRY_MS = 5000;
 const view = { scale: 1, x: 0, y: 0 };
 let shownAddress = null;
+let ownAddress = null;
 
 function place() {
   image.style.transform = `translate(${view.x}px, ${view.y}px) scale(${view.scale})`;
@@ -96,9 +99,10 @@ function showFigures(one) {
   }
 }
 
-async function showImage(number) {
+// While the image is not seen, nothing is fetched. On a slow link only the thumbnail is, until an exposure is selected.
+async function showImage(number, isFollowing = false) {
   const one = flight.exposures.get(number);
-  if (!one) return;
+  if (!one || !viewport.clientWidth) return;
   showFigures(one);
   numberLabel.textContent = `${number}`;
   if (one.step !== "processed") {
@@ -108,17 +112,17 @@ async function showImage(number) {
   drawing.toggleAttribute("hidden", residuals.getAttribute("aria-pressed") !== "true");
   vectorsNote.hidden = drawing.hasAttribute("hidden");
   const address = `/api/v1/exposures/${number}/quicklook.jpg`;
-  if (shownAddress === address) return;
+  if (shownAddress === address || (isFollowing && shownAddress === `thumbnail ${number}`)) return;
   shownAddress = address;
   const refit = image.hidden;
-  const products = Promise.all(["histogram.json", "residuals.json"].map((name) =>
-    fetchJson(`/api/v1/exposures/${number}/${name}`)));
+  const products = isFollowing && isSlow() ? Promise.resolve([null, null])
+    : Promise.all(["histogram.json", "residuals.json"].map((name) => fetchJson(`/api/v1/exposures/${number}/${name}`)));
   image.onload = async () => {
     image.hidden = false;
     placeholder.hidden = true;
     if (refit) fit();
     const [raw, vectors] = await products;
-    if (shownAddress !== address) return;
+    if (shownAddress !== address && shownAddress !== `thumbnail ${number}`) return;
     if (raw) drawHistogram(canvas, raw);
     else quicklookHistogram();
     drawVectors(drawing, vectors, image.naturalWidth, image.naturalHeight);
@@ -127,6 +131,13 @@ async function showImage(number) {
   };
   image.onerror = () => showPlaceholder(`exposure ${number}: the quick look cannot be read`);
   image.alt = `Quick look of exposure ${number}, verdict ${one.verdict}`;
+  if (isFollowing && isSlow()) {
+    const thumbnail = await thumbnailOf(number);
+    if (shownAddress !== address) return;
+    shownAddress = `thumbnail ${number}`;
+    if (thumbnail) image.src = thumbnail;
+    return;
+  }
   const picture = await (await fetchOk(address))?.blob();
   if (shownAddress !== address) return;
   if (!picture) {
@@ -136,8 +147,8 @@ async function showImage(number) {
     setTimeout(() => { if (shownAddress === address) shownAddress = null; }, RETRY_MS);
     return;
   }
-  if (image.src) URL.revokeObjectURL(image.src);
-  image.src = URL.createObjectURL(picture);
+  if (ownAddress) URL.revokeObjectURL(ownAddress);
+  image.src = ownAddress = URL.createObjectURL(picture);
 }
 
 function clearImage() {
@@ -213,10 +224,11 @@ function prepareImage(redraw) {
 
 export function start(_root, feed) {
   const follow = document.getElementById("follow");
-  const draw = () => feed.selected == null ? clearImage() : showImage(feed.selected);
+  const draw = () => feed.selected == null ? clearImage() : showImage(feed.selected, feed.isFollowing);
   prepareImage(draw);
   follow.addEventListener("click", () => feed.follow(!feed.isFollowing));
-  feed.subscribe((record) => { if (record && feed.selected != null) showImage(feed.selected); });
+  feed.subscribe((record) => { if (record && feed.selected != null) showImage(feed.selected, feed.isFollowing); });
+  new ResizeObserver(() => { if (viewport.clientWidth && !shownAddress) draw(); }).observe(viewport);
   feed.onSelect(() => {
     follow.setAttribute("aria-pressed", String(feed.isFollowing));
     draw();

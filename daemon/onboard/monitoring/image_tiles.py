@@ -1,0 +1,355 @@
+"""Tiles of Level-2 images at full resolution, read by windows from the uncompressed rasters.
+
+A tile of reduction r covers 256 r x 256 r pixels. Rows are read in blocks, so that memory stays
+below a few megabytes whatever the size of the image. Nothing is read without a request.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections import OrderedDict
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon import DaemonError
+from daemon.mission.store.level0 import tiff_errors
+from daemon.onboard.monitoring.maps.pictures import encode
+from daemon.onboard.monitoring.maps.tiles import TILE_PX, Tile
+
+REDUCTIONS: Final = (1, 2, 4, 8, 16)
+OUTPUT_ROWS: Final = 16
+"""Rows of a tile that are computed at a time."""
+FULL_SCALE: Final = 32_768
+"""Counts of Level-2 at the full scale of the converter: 2^(15 - bits) counts to the DN."""
+NEAR_FULL: Final = 0.95
+SIDE_MAX_PX: Final = 200_000
+SHARP_BLOCK_PX: Final = 32
+CONTRAST_MIN: Final = 12.0
+"""RMS difference of pixels two apart, in counts, below which there is no texture to measure."""
+SHARP_LIMITS: Final = (0.5, 0.75)
+DERIVED: Final = ("saturation", "sharpness")
+LAYERS_MAX: Final = 24
+_NAME: Final = re.compile(r"[A-Za-z0-9_-]{1,40}")
+Words = NDArray[np.uint16]
+
+
+class ImageTileError(DaemonError):
+    """An image that cannot be read; the message names file and finding."""
+
+
+@dataclass(frozen=True)
+class Raster:
+    """Where the planes of a raster lie in its file, and how its values are shown."""
+
+    path: Path
+    offset: int
+    planes: int
+    height: int
+    width: int
+    byte_order: str
+    low: float
+    high: float
+
+    @property
+    def dtype(self) -> np.dtype[np.uint16]:
+        return np.dtype(f"{self.byte_order}u2")
+
+
+class ImageTiles:
+    """Tiles of the exposures of a mission; the shapes of the last images are cached."""
+
+    def __init__(self) -> None:
+        self._known: OrderedDict[tuple[Path, int, int], Raster] = OrderedDict()
+
+    def about(self, folder: Path) -> dict[str, Any]:
+        """Layers of an exposure and the size of its image.
+
+        Args:
+            folder: products of the exposure.
+
+        Returns:
+            `layers` with name, width and height in pixels; `reductions`; `tile_px`.
+
+        Raises:
+            ImageTileError: there is no image.
+        """
+        names = _names(folder)
+        if not names:
+            raise ImageTileError("there is no image of full resolution (yet)")
+        layers = []
+        for name in names:
+            found = self._raster(folder / f"{name}.tif")
+            layers.append({"name": name, "width_px": found.width, "height_px": found.height})
+        return {
+            "layers": layers,
+            "derived": list(DERIVED),
+            "reductions": list(REDUCTIONS),
+            "tile_px": TILE_PX,
+            "near_full_scale": NEAR_FULL,
+            "sharpness": {"low": SHARP_LIMITS[0], "high": SHARP_LIMITS[1]},
+        }
+
+    def tile(self, folder: Path, layer: str, reduction: int, x: int, y: int) -> Tile | None:
+        """A tile in the pixel grid of the first layer, counted from its upper left corner.
+
+        Args:
+            folder: products of the exposure.
+            layer: one of `about`, or a derived one.
+            reduction: side of the square of pixels that becomes one.
+            x: column of the tile.
+            y: row of the tile.
+
+        Returns:
+            The tile; None beyond the image.
+
+        Raises:
+            ImageTileError: no such layer, or a damaged file.
+        """
+        names = _names(folder)
+        wanted = names[0] if layer in DERIVED and names else layer
+        if wanted not in names or reduction not in REDUCTIONS:
+            raise ImageTileError(f"there is no layer {layer!r}; there are {', '.join(names)}")
+        base = self._raster(folder / f"{names[0]}.tif")
+        side_px = TILE_PX * reduction
+        x0, y0 = x * side_px, y * side_px
+        if x0 >= base.width or y0 >= base.height:
+            return None
+        raster = self._raster(folder / f"{wanted}.tif")
+        try:
+            descriptor = os.open(raster.path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
+        except OSError as error:
+            raise ImageTileError(f"{raster.path.name}: {error.strerror}") from error
+        try:
+            if layer == "saturation":
+                return _saturation(descriptor, raster, reduction, x0, y0)
+            if layer == "sharpness":
+                return _sharpness(descriptor, raster, reduction, x0, y0)
+            if (raster.height, raster.width) != (base.height, base.width):
+                return _scaled(descriptor, raster, base, reduction, x0, y0)
+            return _plain(descriptor, raster, reduction, x0, y0)
+        finally:
+            os.close(descriptor)
+
+    def _raster(self, path: Path) -> Raster:
+        try:
+            status = path.stat()
+        except OSError as error:
+            raise ImageTileError(f"{path.name}: {error.strerror}") from error
+        key = path, status.st_mtime_ns, status.st_size
+        known = self._known.get(key)
+        if known is None:
+            known = read_raster(path)
+            self._known[key] = known
+            while len(self._known) > 2 * LAYERS_MAX:
+                self._known.popitem(last=False)
+        return known
+
+
+def read_raster(path: Path) -> Raster:
+    """The layout of an uncompressed 16-bit TIFF.
+
+    Args:
+        path: the file.
+
+    Returns:
+        Where its planes are.
+
+    Raises:
+        ImageTileError: it is compressed, of another type, truncated or no TIFF.
+    """
+    from tifffile import TiffFile
+
+    try:
+        with TiffFile(path) as tiff:
+            page = tiff.pages.first
+            shape = page.shape if len(page.shape) == 3 else (1, *page.shape)
+            offset, nbytes = page.dataoffsets[0], sum(page.databytecounts)
+            byte_order = tiff.byteorder
+            is_plain = page.compression == 1 and page.dtype == np.uint16 and page.is_contiguous
+    except (OSError, *tiff_errors()) as error:
+        raise ImageTileError(f"{path.name}: is no TIFF that can be read ({error})") from error
+    planes, height, width = shape if len(shape) == 3 else (0, 0, 0)
+    is_sized = 0 < height <= SIDE_MAX_PX and 0 < width <= SIDE_MAX_PX and 0 < planes <= 16
+    if not is_plain or not is_sized or nbytes < planes * height * width * 2:
+        raise ImageTileError(f"{path.name}: is no uncompressed image of 16 bits")
+    if path.stat().st_size < offset + planes * height * width * 2:
+        raise ImageTileError(f"{path.name}: is truncated; process the exposure again")
+    plain = Raster(path, offset, planes, height, width, byte_order, 0.0, 1.0)
+    low, high = _stretch(plain)
+    return Raster(path, offset, planes, height, width, byte_order, low, high)
+
+
+def _names(folder: Path) -> list[str]:
+    """Layers in the folder, the panchromatic image first."""
+    try:
+        names = [one.stem for one in folder.iterdir() if one.suffix == ".tif"]
+    except OSError:
+        return []
+    valid = sorted(name for name in names if _NAME.fullmatch(name) and name not in DERIVED)
+    return sorted(valid, key=lambda name: (name != "pan", name != "rgbn", name))[:LAYERS_MAX]
+
+
+def _stretch(raster: Raster) -> tuple[float, float]:
+    """Counts shown as black and white, from 64 rows."""
+    descriptor = os.open(raster.path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
+    try:
+        rows = np.linspace(0, raster.height - 1, 64).astype(int)
+        step = max(1, raster.width // 512)
+        samples = [
+            _rows(descriptor, raster, plane, int(row), 1, 0, raster.width)[0, ::step]
+            for plane in range(min(raster.planes, 3))
+            for row in rows
+        ]
+    finally:
+        os.close(descriptor)
+    known = np.concatenate(samples)
+    known = known[known > 0]
+    if not len(known):
+        return 0.0, 1.0
+    low, high = np.percentile(known, (0.5, 99.5))
+    return float(low), float(max(high, low + 1.0))
+
+
+def _rows(
+    descriptor: int, raster: Raster, plane: int, row: int, count: int, column: int, width: int
+) -> Words:
+    """A window of a plane, row by row."""
+    out = np.zeros((count, width), np.uint16)
+    line_nbytes = raster.width * 2
+    begin = raster.offset + (plane * raster.height + row) * line_nbytes + column * 2
+    for index in range(count):
+        data = os.pread(descriptor, width * 2, begin + index * line_nbytes)
+        if len(data) != width * 2:
+            raise ImageTileError(f"{raster.path.name}: is truncated; process the exposure again")
+        out[index] = np.frombuffer(data, raster.dtype)
+    return out
+
+
+def _blocks(
+    descriptor: int, raster: Raster, plane: int, reduction: int, x0: int, y0: int
+) -> Iterator[tuple[int, Words]]:
+    """Row of the tile and pixels (rows, r, columns, r) of a few rows of it; whole squares only."""
+    columns = min(TILE_PX, -(-(raster.width - x0) // reduction))
+    rows = min(TILE_PX, -(-(raster.height - y0) // reduction))
+    width = min(columns * reduction, raster.width - x0)
+    for first in range(0, rows, OUTPUT_ROWS):
+        count = min(OUTPUT_ROWS, rows - first)
+        begin = y0 + first * reduction
+        height = min(count * reduction, raster.height - begin)
+        window = _rows(descriptor, raster, plane, begin, height, x0, width)
+        padded = np.zeros((count * reduction, columns * reduction), np.uint16)
+        padded[:height, :width] = window
+        yield first, padded.reshape(count, reduction, columns, reduction)
+
+
+def _mean(descriptor: int, raster: Raster, plane: int, reduction: int, x0: int, y0: int) -> Any:
+    """Mean of the known pixels of each square, 0 where none is known, shape (256, 256)."""
+    tile = np.zeros((TILE_PX, TILE_PX), np.float32)
+    for first, block in _blocks(descriptor, raster, plane, reduction, x0, y0):
+        known = (block > 0).sum(axis=(1, 3))
+        total = block.sum(axis=(1, 3), dtype=np.float32)
+        tile[first : first + len(block), : block.shape[2]] = total / np.maximum(known, 1)
+    return tile
+
+
+def _shown(values: NDArray[np.float32], raster: Raster) -> NDArray[np.uint8]:
+    scaled = np.clip((values - raster.low) / (raster.high - raster.low), 0.0, 1.0)
+    return (255.0 * scaled ** np.float32(1 / 2.2) + 0.5).astype(np.uint8)
+
+
+def _plain(descriptor: int, raster: Raster, reduction: int, x0: int, y0: int) -> Tile:
+    planes = range(3) if raster.planes >= 3 else range(1)
+    values = np.dstack([_mean(descriptor, raster, p, reduction, x0, y0) for p in planes])
+    return _encoded(values, raster)
+
+
+def _scaled(
+    descriptor: int, raster: Raster, base: Raster, reduction: int, x0: int, y0: int
+) -> Tile:
+    """A layer of another resolution, brought to the grid of the first one."""
+    import cv2
+
+    scale = base.width / raster.width
+    coarse = max(one for one in REDUCTIONS if one <= max(1.0, reduction / scale))
+    left = max(0, int(x0 / scale / coarse) - 1) * coarse
+    top = max(0, int(y0 / scale / coarse) - 1) * coarse
+    planes = range(3) if raster.planes >= 3 else range(1)
+    window = np.dstack([_mean(descriptor, raster, p, coarse, left, top) for p in planes])
+    step = reduction / scale / coarse
+    begin = np.array([x0, y0]) / scale / coarse - np.array([left, top]) / coarse + step / 2 - 0.5
+    matrix = np.array([[step, 0.0, begin[0]], [0.0, step, begin[1]]])
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    values = cv2.warpAffine(window, matrix, (TILE_PX, TILE_PX), flags=flags)
+    return _encoded(values if values.ndim == 3 else values[..., None], raster)
+
+
+def _encoded(values: NDArray[np.float32], raster: Raster) -> Tile:
+    alpha = (values.max(axis=2) > 0).astype(np.uint8) * 255
+    return encode(_shown(values, raster), alpha)
+
+
+def _saturation(descriptor: int, raster: Raster, reduction: int, x0: int, y0: int) -> Tile:
+    """Red where a pixel of the square is near the full scale of the converter."""
+    alpha = np.zeros((TILE_PX, TILE_PX), np.uint8)
+    for first, block in _blocks(descriptor, raster, 0, reduction, x0, y0):
+        full = block.max(axis=(1, 3)) >= NEAR_FULL * FULL_SCALE
+        alpha[first : first + len(block), : block.shape[2]] = full * 254
+    red = np.zeros((TILE_PX, TILE_PX, 3), np.uint8)
+    red[..., 0] = 255
+    return encode(red, alpha, lossless=True)
+
+
+def _sharpness(descriptor: int, raster: Raster, reduction: int, x0: int, y0: int) -> Tile:
+    """Ratio of differences one and two pixels apart, by blocks of 32 pixels; blank without texture.
+
+    White noise and the sharpest edges give 0.7 to 1, a blur over two pixels and more gives 0.5.
+    """
+    side_px = TILE_PX * reduction
+    width, height = min(side_px, raster.width - x0), min(side_px, raster.height - y0)
+    columns, rows = width // SHARP_BLOCK_PX, height // SHARP_BLOCK_PX
+    red_green = np.zeros((max(rows, 1), max(columns, 1), 3), np.uint8)
+    alpha = np.zeros(red_green.shape[:2], np.uint8)
+    for row in range(rows):
+        begin = y0 + row * SHARP_BLOCK_PX
+        pixels = _rows(descriptor, raster, 0, begin, SHARP_BLOCK_PX, x0, columns * SHARP_BLOCK_PX)
+        ratio = sharpness_of(pixels)
+        share = (ratio - SHARP_LIMITS[0]) / (SHARP_LIMITS[1] - SHARP_LIMITS[0])
+        share = np.clip(np.nan_to_num(share), 0.0, 1.0)
+        red_green[row, :, 0] = 255 * np.minimum(1.0, 2 - 2 * share)
+        red_green[row, :, 1] = 200 * np.minimum(1.0, 2 * share)
+        alpha[row] = np.where(np.isfinite(ratio), 110, 0)
+    size = SHARP_BLOCK_PX
+    over = np.zeros((side_px // size, side_px // size, 4), np.uint8)
+    over[: len(alpha), : alpha.shape[1], :3], over[: len(alpha), : alpha.shape[1], 3] = (
+        red_green,
+        alpha,
+    )
+    import cv2
+
+    full = cv2.resize(over, (TILE_PX, TILE_PX), interpolation=cv2.INTER_NEAREST)
+    return encode(full[..., :3], full[..., 3], lossless=True)
+
+
+def sharpness_of(pixels: Words) -> NDArray[np.float64]:
+    """Sharpness of the blocks of a strip of pixels.
+
+    Args:
+        pixels: shape (32, 32 n), counts; 0 is no data.
+
+    Returns:
+        Shape (n,): RMS difference of neighbours over that of pixels two apart; NaN without texture
+        or without data.
+    """
+    values = pixels.astype(np.float64).reshape(SHARP_BLOCK_PX, -1, SHARP_BLOCK_PX)
+    near = ((values[:, :, 1:] - values[:, :, :-1]) ** 2).mean(axis=(0, 2))
+    near += ((values[1:] - values[:-1]) ** 2).mean(axis=(0, 2))
+    far = ((values[:, :, 2:] - values[:, :, :-2]) ** 2).mean(axis=(0, 2))
+    far += ((values[2:] - values[:-2]) ** 2).mean(axis=(0, 2))
+    has_texture = (far > 2 * CONTRAST_MIN**2) & (values > 0).all(axis=(0, 2))
+    return np.where(has_texture, np.sqrt(near / np.maximum(far, 1e-9)), np.nan)

@@ -1,0 +1,1 @@
+"""Base maps of the page: tiles from files of the operator, without any network."""

@@ -1,0 +1,45 @@
+// Guidance frames of the service: one WebSocket, each frame answered, so that a slow link loses rate and not age.
+
+import { headers } from "./http.js";
+
+const RETRY_MIN_MS = 500;
+const RETRY_MAX_MS = 8000;
+const SILENCE_MS = 6000;
+
+// Call `onFrame(frame)` for each frame, and `onLink(isLinked)` when the connection opens or closes.
+// Each frame gets `receivedMs`, for its age.
+export function followGuidance(onFrame, onLink = () => {}) {
+  const scheme = location.protocol === "https:" ? "wss" : "ws";
+  let waitMs = RETRY_MIN_MS;
+  const open = () => {
+    const token = (headers().Authorization || "").replace("Bearer ", "");
+    const protocols = token ? ["syntopic.v1", `bearer.${token}`] : ["syntopic.v1"];
+    const socket = new WebSocket(`${scheme}://${location.host}/api/v1/guidance`, protocols);
+    let silence = null;
+    const restart = () => {
+      clearTimeout(silence);
+      silence = setTimeout(() => socket.close(), SILENCE_MS);
+    };
+    socket.onopen = () => onLink(true);
+    socket.onmessage = (message) => {
+      waitMs = RETRY_MIN_MS;
+      restart();
+      const frame = JSON.parse(message.data);
+      socket.send(String(frame.frame));
+      frame.receivedMs = performance.now();
+      onFrame(frame);
+    };
+    socket.onclose = () => {
+      clearTimeout(silence);
+      onLink(false);
+      setTimeout(open, waitMs);
+      waitMs = Math.min(waitMs * 2, RETRY_MAX_MS);
+    };
+  };
+  open();
+}
+
+// Age of a frame now, in s: at the sender, half of the round trip, and the time since it came.
+export function ageOf(frame, nowMs = performance.now()) {
+  return frame.age_s + (frame.rtt_s ?? 0) / 2 + (nowMs - frame.receivedMs) / 1000;
+}

@@ -1,0 +1,165 @@
+// Layers below and above the lines of the map: base maps of the service, hill shade, thumbnails at their place.
+
+import { fetchJson, fetchOk } from "./http.js";
+import { t } from "./i18n.js";
+import { element } from "./dom.js";
+import { drawTile } from "./mvt.js";
+import { thumbnailOf } from "./thumbnails.js";
+
+const THUMBNAILS_MAX = 60;
+const OVERZOOM = 4;
+const isNight = () => document.documentElement.dataset.theme === "dark";
+
+// Tiles of the service: pictures, or vector tiles drawn here. Fetched, since a picture's address carries no token.
+const ServiceTiles = L.GridLayer.extend({
+  initialize(about, options) {
+    this.about = about;
+    L.GridLayer.prototype.initialize.call(this, options);
+  },
+  createTile(at, done) {
+    const size = this.getTileSize();
+    const tile = element("canvas", { width: size.x, height: size.y });
+    tile.dataset.map = this.about.id;
+    this.fill(tile, at).then(() => done(null, tile), (error) => done(error, tile));
+    return tile;
+  },
+  async fill(tile, at) {
+    const answer = await fetchOk(`/api/v1/maps/${this.about.id}/${at.z}/${at.x}/${at.y}`);
+    const isEmpty = !answer || answer.status === 204;
+    if (this.about.kind === "vector") {
+      drawTile(tile, isEmpty ? null : new Uint8Array(await answer.arrayBuffer()), isNight());
+    } else if (!isEmpty) {
+      const picture = await createImageBitmap(await answer.blob());
+      tile.getContext("2d").drawImage(picture, 0, 0, tile.width, tile.height);
+      picture.close();
+    }
+  },
+});
+
+// A picture whose corners lie on four places: an affine transformation of an <img>.
+const PlacedPicture = L.Layer.extend({
+  initialize(corners, address) {
+    this.corners = corners;
+    this.address = address;
+  },
+  onAdd(map) {
+    this.picture = element("img", { className: "placed leaflet-zoom-hide", alt: "", src: this.address });
+    this.picture.onload = () => this.place();
+    map.getPane("thumbnails").append(this.picture);
+    this.place();
+  },
+  onRemove() {
+    this.picture.remove();
+  },
+  getEvents() {
+    return { zoomend: this.place, viewreset: this.place };
+  },
+  place() {
+    const { naturalWidth: w, naturalHeight: h } = this.picture;
+    if (!w || !this._map) return;
+    const [lowerLeft, , upperRight, upperLeft] = this.corners.map((one) => this._map.latLngToLayerPoint(one));
+    const right = upperRight.subtract(upperLeft).divideBy(w);
+    const down = lowerLeft.subtract(upperLeft).divideBy(h);
+    this.picture.style.transform =
+      `matrix(${right.x}, ${right.y}, ${down.x}, ${down.y}, ${upperLeft.x}, ${upperLeft.y})`;
+  },
+});
+
+let shown = null;
+let shade = null;
+let listed = [];
+
+function pick(map, about) {
+  shown?.remove();
+  shown = null;
+  if (about) {
+    const bounds = L.latLngBounds([[about.bounds[1], about.bounds[0]], [about.bounds[3], about.bounds[2]]]);
+    shown = new ServiceTiles(about, { pane: "ground", bounds, minNativeZoom: about.min_zoom, maxNativeZoom: about.max_zoom,
+      maxZoom: about.max_zoom + OVERZOOM + 8, attribution: "" }).addTo(map);
+  }
+  localStorage.setItem("map", about ? about.name : "");
+  document.getElementById("map-attribution").textContent = about?.attribution.replace(/<[^>]*>/g, "") || "";
+}
+
+function drawChoices(map, tools) {
+  const maps = listed.filter((one) => !one.is_overlay);
+  const relief = listed.find((one) => one.is_overlay);
+  if (maps.length) {
+    const choice = element("select", { id: "map-choice", ariaLabel: t("map.base") },
+      new Option(t("map.no_base"), ""), ...maps.map((one) => new Option(one.name, one.id)));
+    choice.addEventListener("change", () => pick(map, maps.find((one) => String(one.id) === choice.value)));
+    tools.append(choice);
+    const stored = localStorage.getItem("map");
+    const first = stored === "" ? null : maps.find((one) => one.name === stored) || maps[0];
+    choice.value = first ? String(first.id) : "";
+    pick(map, first);
+  }
+  if (relief) {
+    const button = element("button", { type: "button", id: "map-relief", textContent: t("map.relief"), ariaPressed: "false" });
+    button.addEventListener("click", () => {
+      const wanted = !shade;
+      shade?.remove();
+      shade = wanted ? new ServiceTiles(relief, { pane: "relief", minNativeZoom: relief.min_zoom,
+        maxNativeZoom: relief.max_zoom, maxZoom: relief.max_zoom + OVERZOOM + 8 }).addTo(map) : null;
+      button.setAttribute("aria-pressed", String(wanted));
+    });
+    tools.append(button);
+  }
+}
+
+const placed = new Map();
+let areThumbnailsShown = localStorage.getItem("thumbnails") !== "off";
+
+async function placeThumbnails(map, flight) {
+  const newest = areThumbnailsShown ? [...flight.exposures.values()]
+    .filter((one) => one.step === "processed" && one.footprint).sort((a, b) => b.number - a.number)
+    .slice(0, THUMBNAILS_MAX) : [];
+  const wanted = new Set(newest.map((one) => one.number));
+  for (const [number, layer] of placed) {
+    if (!wanted.has(number)) {
+      layer?.remove();
+      placed.delete(number);
+    }
+  }
+  for (const one of newest) {
+    if (placed.has(one.number)) continue;
+    placed.set(one.number, null);
+    const address = await thumbnailOf(one.number);
+    if (!address || !placed.has(one.number)) placed.delete(one.number);
+    else placed.set(one.number, new PlacedPicture(one.footprint, address).addTo(map));
+  }
+}
+
+export function startLayers(map, feed) {
+  const tools = document.getElementById("map-tools");
+  for (const [name, order] of [["ground", 150], ["relief", 180], ["thumbnails", 350]]) {
+    map.createPane(name).style.zIndex = order;
+    map.getPane(name).style.pointerEvents = "none";
+  }
+  document.getElementById("map").append(element("p", { id: "map-attribution" }));
+  const button = element("button", { type: "button", id: "map-thumbnails", textContent: t("map.thumbnails"),
+    ariaPressed: String(areThumbnailsShown) });
+  button.addEventListener("click", () => {
+    areThumbnailsShown = !areThumbnailsShown;
+    localStorage.setItem("thumbnails", areThumbnailsShown ? "on" : "off");
+    button.setAttribute("aria-pressed", String(areThumbnailsShown));
+    placeThumbnails(map, feed.flight);
+  });
+  tools.append(button);
+  let isNightShown = isNight();
+  let isAsked = false;
+  feed.subscribe(async (record, isFirstRecord) => {
+    if (record?.exposures || isFirstRecord) {
+      if (isFirstRecord) for (const number of placed.keys()) { placed.get(number)?.remove(); placed.delete(number); }
+      placeThumbnails(map, feed.flight);
+    }
+    if (isNightShown !== isNight()) {
+      isNightShown = isNight();
+      shown?.redraw();
+    }
+    if (isAsked) return;
+    isAsked = true;
+    listed = (await fetchJson("/api/v1/maps")) || [];
+    drawChoices(map, tools);
+  });
+}
