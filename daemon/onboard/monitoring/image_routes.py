@@ -14,7 +14,6 @@ from daemon.onboard.monitoring.flight_state import FlightState
 from daemon.onboard.monitoring.image_tiles import ImageTileError, ImageTiles
 
 TILES_AT_ONCE = 2
-TILE_CACHE = "private, max-age=600"
 
 Number = Annotated[int, Path(ge=1, lt=10**9, description="of the exposure")]
 Layer = Annotated[str, Path(pattern=r"^[A-Za-z0-9_-]{1,40}$", description="from /images/NUMBER")]
@@ -61,5 +60,5 @@ def add_images(app: FastAPI, state: FlightState, watcher: Depends) -> None:
                 raise HTTPException(404, f"exposure {number}: {error}") from error
         if found is None:
             return Response(status_code=204)
-        headers = {"Cache-Control": TILE_CACHE}
-        return Response(found.data, media_type=found.media_type, headers=headers)
+        # Not cached: the next mission has an exposure of the same number.
+        return Response(found.data, media_type=found.media_type)

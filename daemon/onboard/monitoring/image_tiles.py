@@ -44,7 +44,7 @@ class ImageTileError(DaemonError):
 
 
 @dataclass(frozen=True)
-class Raster:
+class RasterLayout:
     """Where the planes of a raster lie in its file, and how its values are shown."""
 
     path: Path
@@ -65,7 +65,7 @@ class ImageTiles:
     """Tiles of the exposures of a mission; the shapes of the last images are cached."""
 
     def __init__(self) -> None:
-        self._known: OrderedDict[tuple[Path, int, int], Raster] = OrderedDict()
+        self._known: OrderedDict[tuple[Path, int, int], RasterLayout] = OrderedDict()
 
     def about(self, folder: Path) -> dict[str, Any]:
         """Layers of an exposure and the size of its image.
@@ -136,7 +136,7 @@ class ImageTiles:
         finally:
             os.close(descriptor)
 
-    def _raster(self, path: Path) -> Raster:
+    def _raster(self, path: Path) -> RasterLayout:
         try:
             status = path.stat()
         except OSError as error:
@@ -151,7 +151,7 @@ class ImageTiles:
         return known
 
 
-def read_raster(path: Path) -> Raster:
+def read_raster(path: Path) -> RasterLayout:
     """The layout of an uncompressed 16-bit TIFF.
 
     Args:
@@ -165,6 +165,7 @@ def read_raster(path: Path) -> Raster:
     """
     from tifffile import TiffFile
 
+    faults: tuple[type[Exception], ...] = (OSError, *tiff_errors())
     try:
         with TiffFile(path) as tiff:
             page = tiff.pages.first
@@ -172,7 +173,7 @@ def read_raster(path: Path) -> Raster:
             offset, nbytes = page.dataoffsets[0], sum(page.databytecounts)
             byte_order = tiff.byteorder
             is_plain = page.compression == 1 and page.dtype == np.uint16 and page.is_contiguous
-    except (OSError, *tiff_errors()) as error:
+    except faults as error:
         raise ImageTileError(f"{path.name}: is no TIFF that can be read ({error})") from error
     planes, height, width = shape if len(shape) == 3 else (0, 0, 0)
     is_sized = 0 < height <= SIDE_MAX_PX and 0 < width <= SIDE_MAX_PX and 0 < planes <= 16
@@ -180,9 +181,9 @@ def read_raster(path: Path) -> Raster:
         raise ImageTileError(f"{path.name}: is no uncompressed image of 16 bits")
     if path.stat().st_size < offset + planes * height * width * 2:
         raise ImageTileError(f"{path.name}: is truncated; process the exposure again")
-    plain = Raster(path, offset, planes, height, width, byte_order, 0.0, 1.0)
+    plain = RasterLayout(path, offset, planes, height, width, byte_order, 0.0, 1.0)
     low, high = _stretch(plain)
-    return Raster(path, offset, planes, height, width, byte_order, low, high)
+    return RasterLayout(path, offset, planes, height, width, byte_order, low, high)
 
 
 def _names(folder: Path) -> list[str]:
@@ -195,7 +196,7 @@ def _names(folder: Path) -> list[str]:
     return sorted(valid, key=lambda name: (name != "pan", name != "rgbn", name))[:LAYERS_MAX]
 
 
-def _stretch(raster: Raster) -> tuple[float, float]:
+def _stretch(raster: RasterLayout) -> tuple[float, float]:
     """Counts shown as black and white, from 64 rows."""
     descriptor = os.open(raster.path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
     try:
@@ -217,7 +218,7 @@ def _stretch(raster: Raster) -> tuple[float, float]:
 
 
 def _rows(
-    descriptor: int, raster: Raster, plane: int, row: int, count: int, column: int, width: int
+    descriptor: int, raster: RasterLayout, plane: int, row: int, count: int, column: int, width: int
 ) -> Words:
     """A window of a plane, row by row."""
     out = np.zeros((count, width), np.uint16)
@@ -232,7 +233,7 @@ def _rows(
 
 
 def _blocks(
-    descriptor: int, raster: Raster, plane: int, reduction: int, x0: int, y0: int
+    descriptor: int, raster: RasterLayout, plane: int, reduction: int, x0: int, y0: int
 ) -> Iterator[tuple[int, Words]]:
     """Row of the tile and pixels (rows, r, columns, r) of a few rows of it; whole squares only."""
     columns = min(TILE_PX, -(-(raster.width - x0) // reduction))
@@ -248,7 +249,9 @@ def _blocks(
         yield first, padded.reshape(count, reduction, columns, reduction)
 
 
-def _mean(descriptor: int, raster: Raster, plane: int, reduction: int, x0: int, y0: int) -> Any:
+def _mean(
+    descriptor: int, raster: RasterLayout, plane: int, reduction: int, x0: int, y0: int
+) -> Any:
     """Mean of the known pixels of each square, 0 where none is known, shape (256, 256)."""
     tile = np.zeros((TILE_PX, TILE_PX), np.float32)
     for first, block in _blocks(descriptor, raster, plane, reduction, x0, y0):
@@ -258,19 +261,20 @@ def _mean(descriptor: int, raster: Raster, plane: int, reduction: int, x0: int, 
     return tile
 
 
-def _shown(values: NDArray[np.float32], raster: Raster) -> NDArray[np.uint8]:
+def _shown(values: NDArray[np.float32], raster: RasterLayout) -> NDArray[np.uint8]:
     scaled = np.clip((values - raster.low) / (raster.high - raster.low), 0.0, 1.0)
-    return (255.0 * scaled ** np.float32(1 / 2.2) + 0.5).astype(np.uint8)
+    grey: NDArray[np.uint8] = (255.0 * scaled ** np.float32(1 / 2.2) + 0.5).astype(np.uint8)
+    return grey
 
 
-def _plain(descriptor: int, raster: Raster, reduction: int, x0: int, y0: int) -> Tile:
+def _plain(descriptor: int, raster: RasterLayout, reduction: int, x0: int, y0: int) -> Tile:
     planes = range(3) if raster.planes >= 3 else range(1)
     values = np.dstack([_mean(descriptor, raster, p, reduction, x0, y0) for p in planes])
     return _encoded(values, raster)
 
 
 def _scaled(
-    descriptor: int, raster: Raster, base: Raster, reduction: int, x0: int, y0: int
+    descriptor: int, raster: RasterLayout, base: RasterLayout, reduction: int, x0: int, y0: int
 ) -> Tile:
     """A layer of another resolution, brought to the grid of the first one."""
     import cv2
@@ -289,12 +293,12 @@ def _scaled(
     return _encoded(values if values.ndim == 3 else values[..., None], raster)
 
 
-def _encoded(values: NDArray[np.float32], raster: Raster) -> Tile:
+def _encoded(values: NDArray[np.float32], raster: RasterLayout) -> Tile:
     alpha = (values.max(axis=2) > 0).astype(np.uint8) * 255
     return encode(_shown(values, raster), alpha)
 
 
-def _saturation(descriptor: int, raster: Raster, reduction: int, x0: int, y0: int) -> Tile:
+def _saturation(descriptor: int, raster: RasterLayout, reduction: int, x0: int, y0: int) -> Tile:
     """Red where a pixel of the square is near the full scale of the converter."""
     alpha = np.zeros((TILE_PX, TILE_PX), np.uint8)
     for first, block in _blocks(descriptor, raster, 0, reduction, x0, y0):
@@ -305,7 +309,7 @@ def _saturation(descriptor: int, raster: Raster, reduction: int, x0: int, y0: in
     return encode(red, alpha, lossless=True)
 
 
-def _sharpness(descriptor: int, raster: Raster, reduction: int, x0: int, y0: int) -> Tile:
+def _sharpness(descriptor: int, raster: RasterLayout, reduction: int, x0: int, y0: int) -> Tile:
     """Ratio of differences one and two pixels apart, by blocks of 32 pixels; blank without texture.
 
     White noise and the sharpest edges give 0.7 to 1, a blur over two pixels and more gives 0.5.

@@ -12,7 +12,7 @@ from daemon.onboard.monitoring.maps.map_library import MapLibrary
 from daemon.onboard.monitoring.maps.tiles import MVT, ZOOM_MAX, BaseMapError
 
 TILES_AT_ONCE = 2
-TILE_CACHE = "private, max-age=3600"
+TILE_CACHE = "private, max-age=600"
 KINDS = ("image/png", "image/jpeg", "image/webp", "image/gif", MVT)
 
 MapNumber = Annotated[int, Path(ge=0, lt=100, description="of the map, from /api/v1/maps")]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -21,8 +21,12 @@ from daemon.onboard.preflight.check_results import CheckResult, failed, passed
 from daemon.planning.relief import relief_of
 
 CACHE_BYTES: Final = 16_000_000
-SUFFIXES: Final = {".mbtiles": MbtilesMap, ".pmtiles": PmtilesMap, ".tif": GeotiffMap,
-                   ".tiff": GeotiffMap}  # fmt: skip
+SUFFIXES: Final[dict[str, Callable[[Path], BaseMap]]] = {
+    ".mbtiles": MbtilesMap,
+    ".pmtiles": PmtilesMap,
+    ".tif": GeotiffMap,
+    ".tiff": GeotiffMap,
+}
 HILL_SHADE_CELLS_MAX: Final = 16_000_000
 """A height model is in memory: 8 bytes a cell."""
 
@@ -45,8 +49,7 @@ def open_map(path: Path) -> BaseMap:
             f"base map {path}: the name ends in none of {', '.join(SUFFIXES)}; [watch] maps names "
             "MBTiles, PMTiles and GeoTIFF files"
         )
-    opened: BaseMap = kind(path)
-    return opened
+    return kind(path)
 
 
 def check_maps(paths: Iterable[Path]) -> Iterator[CheckResult]:

@@ -141,6 +141,7 @@ def checked_bounds(values: object, file: str) -> Bounds:
         BaseMapError: they are none.
     """
     try:
+        # What is no sequence raises the TypeError that is caught.
         west, south, east, north = (float(value) for value in values)  # type: ignore[attr-defined]
     except (TypeError, ValueError) as error:
         raise BaseMapError(

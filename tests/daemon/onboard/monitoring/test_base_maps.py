@@ -81,7 +81,9 @@ def test_rows_of_mbtiles_count_from_the_south(tmp_path: Path) -> None:
     found = opened.tile(1, 0, 0)
     assert found is not None
     assert (found.data, found.media_type, found.encoding) == (north, "image/png", "")
-    assert opened.tile(1, 0, 1).data == south  # type: ignore[union-attr]
+    second = opened.tile(1, 0, 1)
+    assert second is not None
+    assert second.data == south
     assert opened.tile(1, 1, 0) is None
 
 

@@ -24,7 +24,9 @@ const ServiceTiles = L.GridLayer.extend({
     return tile;
   },
   async fill(tile, at) {
-    const answer = await fetchOk(`/api/v1/maps/${this.about.id}/${at.z}/${at.x}/${at.y}`);
+    // The name keeps tiles of another map with the same number apart in the browser's cache.
+    const query = `?name=${encodeURIComponent(this.about.name)}`;
+    const answer = await fetchOk(`/api/v1/maps/${this.about.id}/${at.z}/${at.x}/${at.y}${query}`);
     const isEmpty = !answer || answer.status === 204;
     if (this.about.kind === "vector") {
       drawTile(tile, isEmpty ? null : new Uint8Array(await answer.arrayBuffer()), isNight());
