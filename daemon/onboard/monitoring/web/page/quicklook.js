@@ -102,13 +102,14 @@ function showFigures(one) {
 // While the image is not seen, nothing is fetched. On a slow link only the thumbnail is, until an exposure is selected.
 async function showImage(number, isFollowing = false) {
   const one = flight.exposures.get(number);
-  if (!one || !viewport.clientWidth) return;
+  if (!one) return;
   showFigures(one);
   numberLabel.textContent = `${number}`;
   if (one.step !== "processed") {
     showPlaceholder(`exposure ${number}: ${one.step === "lost" ? "lost, no image" : `${one.step}, no image yet`}`);
     return;
   }
+  if (!viewport.clientWidth) return;
   drawing.toggleAttribute("hidden", residuals.getAttribute("aria-pressed") !== "true");
   vectorsNote.hidden = drawing.hasAttribute("hidden");
   const address = `/api/v1/exposures/${number}/quicklook.jpg`;
@@ -228,7 +229,7 @@ export function start(_root, feed) {
   prepareImage(draw);
   follow.addEventListener("click", () => feed.follow(!feed.isFollowing));
   feed.subscribe((record) => { if (record && feed.selected != null) showImage(feed.selected, feed.isFollowing); });
-  new ResizeObserver(() => { if (viewport.clientWidth && !shownAddress) draw(); }).observe(viewport);
+  new ResizeObserver(() => { if (viewport.clientWidth) draw(); }).observe(viewport);
   feed.onSelect(() => {
     follow.setAttribute("aria-pressed", String(feed.isFollowing));
     draw();
