@@ -1,0 +1,222 @@
+"""The operator's page over a thin link: delays of verdict, thumbnail and coverage, rate, bytes.
+
+Two TUN devices in two network namespaces are joined by a forwarder that delays each packet and
+drops some. The page's process is behind one, Chromium before the other. Run as root: `python -m
+benchmarks.page_link`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ctypes
+import fcntl
+import heapq
+import json
+import os
+import random
+import select
+import shutil
+import struct
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any, Final
+
+TUNSETIFF: Final = 0x400454CA
+IFF_TUN_NO_PI: Final = 0x1001
+CLONE_NEWNET: Final = 0x40000000
+SERVER, CLIENT = "10.9.0.1", "10.9.0.2"
+INTERVAL_S: Final = 2.0
+GUIDANCE_S: Final = 0.2
+LOAD_TIMEOUT_S: Final = 180.0
+QUEUE_MAX: Final = 2000
+PROBE: Final = """
+window.log = { verdict: {}, thumbnail: {}, coverage: [], guidance: [] };
+const Plain = window.WebSocket;
+window.WebSocket = class extends Plain {
+  constructor(...given) {
+    super(...given);
+    if (String(given[0]).includes('/guidance')) this.addEventListener('message', (message) => {
+      const frame = JSON.parse(message.data);
+      window.log.guidance.push([Date.now() / 1000, frame.age_s, frame.rtt_s]);
+    });
+  }
+};
+setInterval(() => {
+  const now = Date.now() / 1000;
+  const number = document.querySelector('#verdict .which')?.textContent.match(/\\d+/)?.[0];
+  if (number && !(number in window.log.verdict)) window.log.verdict[number] = now;
+  for (const one of document.querySelectorAll('#strip .thumb')) {
+    const name = one.querySelector('.t-mark')?.textContent.match(/\\d+/)?.[0];
+    const isSeen = one.querySelector('img')?.naturalWidth > 0;
+    if (name && isSeen && !(name in window.log.thumbnail)) window.log.thumbnail[name] = now;
+  }
+  const text = document.querySelector('#coverage')?.textContent;
+  if (text && window.log.coverage.at(-1)?.[1] !== text) window.log.coverage.push([now, text]);
+}, 25);
+"""
+
+
+def open_tun(name: str, address: str) -> int:
+    """A TUN device in the present network namespace."""
+    descriptor = os.open("/dev/net/tun", os.O_RDWR)
+    fcntl.ioctl(descriptor, TUNSETIFF, struct.pack("16sH", name.encode(), IFF_TUN_NO_PI))
+    for command in (
+        f"ip addr add {address}/24 dev {name}",
+        f"ip link set {name} up mtu 1500",
+        "ip link set lo up",
+    ):
+        subprocess.run(command.split(), check=True)
+    return descriptor
+
+
+def forward(first: int, second: int, delay_s: float, loss: float, counts: str) -> None:
+    """Carry packets both ways, each delayed, some dropped, until the process is ended."""
+    chance, waiting = random.Random(7), list[tuple[float, int, int, bytes]]()
+    order, carried, saved_s = 0, {first: [0, 0], second: [0, 0]}, 0.0
+    while True:
+        now_s = time.monotonic()
+        while waiting and waiting[0][0] <= now_s:
+            _, _, target, packet = heapq.heappop(waiting)
+            os.write(target, packet)
+        if now_s - saved_s > 0.5:
+            saved_s = now_s
+            Path(counts).write_text(json.dumps([carried[first], carried[second]]))
+        pause_s = min(waiting[0][0] - now_s, 0.2) if waiting else 0.2
+        for source in select.select([first, second], [], [], max(pause_s, 0.0))[0]:
+            packet = os.read(source, 2048)
+            carried[source][0] += len(packet)
+            carried[source][1] += 1
+            if chance.random() >= loss and len(waiting) < QUEUE_MAX:
+                order += 1
+                target = second if source == first else first
+                heapq.heappush(waiting, (time.monotonic() + delay_s, order, target, packet))
+
+
+def quantile(values: list[float], share: float) -> float | None:
+    """A quantile of the values, s; None without any."""
+    ordered = sorted(values)
+    return round(ordered[min(len(ordered) - 1, int(share * len(ordered)))], 2) if ordered else None
+
+
+def measure(delay_s: float, loss: float, exposures: int) -> dict[str, Any]:
+    """Fly over the link and read what the page noted."""
+    from daemon.configuration.model import WatchSection
+    from daemon.onboard.service.messages import ServiceEvent
+    from daemon.onboard.service.processes import ChildProcess
+    from tests.browser import Browser
+    from tests.daemon.onboard.monitoring import flight_events
+    from tests.daemon.onboard.monitoring import test_page_guidance as scene
+
+    libc = ctypes.CDLL(None, use_errno=True)
+    assert libc.unshare(CLONE_NEWNET) == 0
+    own = os.open("/proc/self/ns/net", os.O_RDONLY)
+    client = open_tun("link0", CLIENT)
+    assert libc.unshare(CLONE_NEWNET) == 0
+    server = open_tun("link1", SERVER)
+    folder = Path(tempfile.mkdtemp(prefix="page-link"))
+    mission = folder / "mission"
+    (mission / "L0").mkdir(parents=True)
+    scene.write_products(mission)
+    for number in range(7, exposures + 1):
+        copied, ignored = mission / f"L2/{number:06d}", shutil.ignore_patterns("pan.tif")
+        shutil.copytree(mission / "L2/000001", copied, ignore=ignored)
+    rig = scene.shipped_rigs()["ultracam-x-mini"].read_bytes()
+    (mission / "rig.toml").write_bytes(rig)
+    line = {"type": "LineString", "coordinates": [[15.43, 47.07], [15.43, 47.12]]}
+    feature = {"type": "Feature", "properties": {"id": "A1", "strip": "S"}, "geometry": line}
+    plan = {"type": "FeatureCollection", "features": [feature]}
+    (mission / "plan.geojson").write_text(json.dumps(plan))
+    (mission / "service.toml").write_text("[plan]\nground_height_m = 395.0\n")
+    settings = WatchSection(host=SERVER, port=8470, announce=False)
+    entry = "daemon.onboard.monitoring.monitoring_process:main"
+    child = ChildProcess("watch", entry, (settings,), {})
+    assert libc.setns(own, CLONE_NEWNET) == 0
+    counts = folder / "counts.json"
+    arguments = [str(client), str(server), str(delay_s), str(loss), str(counts)]
+    forwarder = subprocess.Popen(
+        [sys.executable, "-m", "benchmarks.page_link", "--forward", *arguments],
+        pass_fds=(client, server),
+    )
+
+    def emit(event: dict[str, Any]) -> None:
+        while not child.try_send(ServiceEvent(event)):
+            time.sleep(0.01)
+
+    emit(flight_events.mission(str(mission)))
+    emit(scene.status(0))
+    time.sleep(3.0)
+    began_s, emitted = time.time(), dict[int, float]()
+    try:
+        with Browser(folder / "profile") as browser:
+            browser.call("Page.addScriptToEvaluateOnNewDocument", source=PROBE)
+            browser.open(f"http://{SERVER}:8470/")
+            connected = "document.body?.dataset.ready !== undefined && "
+            connected += "document.querySelector('#link')?.className.includes('good')"
+            browser.wait_for(connected, LOAD_TIMEOUT_S)
+            loaded_s = time.time() - began_s
+            time.sleep(5.0)
+            begin, begin_s = json.loads(counts.read_text()), time.time()
+            for number in range(1, exposures + 1):
+                emitted[number] = time.time()
+                for event in flight_events.exposure(number, line="A1", north_m=68.0 * number):
+                    emit(event)
+                emit(scene.status(number))
+                until_s = emitted[number] + INTERVAL_S
+                while time.time() < until_s:
+                    emit(scene.frame(0.3 + 0.01 * (number % 50)))
+                    time.sleep(GUIDANCE_S)
+            flown_s = time.time() - begin_s
+            end = json.loads(counts.read_text())
+            time.sleep(8.0)
+            log = browser.evaluate("window.log")
+    finally:
+        forwarder.kill()
+        child.end(1.0)
+
+    def delays(part: str) -> list[float]:
+        return [log[part][str(k)] - s for k, s in emitted.items() if str(k) in log[part]]
+
+    changes = [at for at, _ in log["coverage"]]
+    coverage = [min((c for c in changes if c > s), default=s + 99.0) - s for s in emitted.values()]
+    frames = [one for one in log["guidance"] if begin_s <= one[0] <= begin_s + flown_s]
+    ages = [age + (rtt or 0.0) / 2 for _, age, rtt in frames]
+    result: dict[str, Any] = {"exposures": exposures, "page_loaded_s": round(loaded_s, 1)}
+    for part, values in (("verdict", delays("verdict")), ("thumbnail", delays("thumbnail")),
+                         ("coverage", coverage)):  # fmt: skip
+        result[part] = {
+            "count": len(values),
+            "median_s": quantile(values, 0.5),
+            "p95_s": quantile(values, 0.95),
+        }
+    result["guidance"] = {
+        "hz": round(len(frames) / flown_s, 2),
+        "age_median_s": quantile(ages, 0.5),
+        "age_p95_s": quantile(ages, 0.95),
+    }
+    down, up = end[1][0] - begin[1][0], end[0][0] - begin[0][0]
+    result["kbytes_per_min"] = {
+        "down": round(down / flown_s * 60 / 1000, 1),
+        "up": round(up / flown_s * 60 / 1000, 1),
+    }
+    return result
+
+
+def main() -> int:
+    """Measure and print JSON."""
+    if sys.argv[1:2] == ["--forward"]:
+        first, second, delay_s, loss, counts = sys.argv[2:]
+        forward(int(first), int(second), float(delay_s), float(loss), counts)
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--delay-ms", type=float, default=150.0, help="each way (default: 150)")
+    parser.add_argument("--loss", type=float, default=0.05, help="each way (default: 0.05)")
+    parser.add_argument("--exposures", type=int, default=30, help="one every 2 s (default: 30)")
+    given = parser.parse_args()
+    print(json.dumps(measure(given.delay_ms / 1000, given.loss, given.exposures), indent=1))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
