@@ -152,7 +152,7 @@ def test_the_planned_line_is_on_the_map_with_the_holes_in_what_was_flown(
         for event in flight_events.exposure(number, "good", line="A1", north_m=north_m):
             service.emit(event)
     browser.wait_for("document.querySelectorAll('#segments tr').length === 1", WITHIN_S)
-    line, from_m, to_m, hectares, why = browser.evaluate(
+    line, from_m, to_m, hectares, why, _ = browser.evaluate(
         "[...document.querySelectorAll('#segments td')].map((cell) => cell.innerText)"
     )
     assert line == "A1"

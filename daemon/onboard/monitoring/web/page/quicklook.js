@@ -99,7 +99,7 @@ function showFigures(one) {
   }
 }
 
-// While the image is not seen, nothing is fetched. On a slow link only the thumbnail is, until an exposure is selected.
+// On a slow link nothing is fetched while the image is not seen, and only the thumbnail until an exposure is selected.
 async function showImage(number, isFollowing = false) {
   const one = flight.exposures.get(number);
   if (!one) return;
@@ -109,7 +109,7 @@ async function showImage(number, isFollowing = false) {
     showPlaceholder(`exposure ${number}: ${one.step === "lost" ? "lost, no image" : `${one.step}, no image yet`}`);
     return;
   }
-  if (!viewport.clientWidth) return;
+  if (!viewport.clientWidth && isFollowing && isSlow()) return;
   drawing.toggleAttribute("hidden", residuals.getAttribute("aria-pressed") !== "true");
   vectorsNote.hidden = drawing.hasAttribute("hidden");
   const address = `/api/v1/exposures/${number}/quicklook.jpg`;
