@@ -11,6 +11,7 @@ import argparse
 import ctypes
 import fcntl
 import heapq
+import importlib
 import json
 import os
 import random
@@ -106,10 +107,11 @@ def measure(delay_s: float, loss: float, exposures: int) -> dict[str, Any]:
     from daemon.configuration.model import WatchSection
     from daemon.onboard.service.messages import ServiceEvent
     from daemon.onboard.service.processes import ChildProcess
-    from tests.browser import Browser
-    from tests.daemon.onboard.monitoring import flight_events
-    from tests.daemon.onboard.monitoring import test_page_guidance as scene
 
+    # The types of tests are checked on their own.
+    browser_of = importlib.import_module("tests.browser").Browser
+    flight_events = importlib.import_module("tests.daemon.onboard.monitoring.flight_events")
+    scene = importlib.import_module("tests.daemon.onboard.monitoring.test_page_guidance")
     libc = ctypes.CDLL(None, use_errno=True)
     assert libc.unshare(CLONE_NEWNET) == 0
     own = os.open("/proc/self/ns/net", os.O_RDONLY)
@@ -150,7 +152,7 @@ def measure(delay_s: float, loss: float, exposures: int) -> dict[str, Any]:
     time.sleep(3.0)
     began_s, emitted = time.time(), dict[int, float]()
     try:
-        with Browser(folder / "profile") as browser:
+        with browser_of(folder / "profile") as browser:
             browser.call("Page.addScriptToEvaluateOnNewDocument", source=PROBE)
             browser.open(f"http://{SERVER}:8470/")
             connected = "document.body?.dataset.ready !== undefined && "
