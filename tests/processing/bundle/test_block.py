@@ -18,12 +18,12 @@ from processing.bundle.self_calibration import (
     with_self_calibration,
 )
 from processing.bundle.terms import part_of
-from processing.rig import find_rig
+from processing.rig import Rig, find_rig
 from sim_hw.blocks.aerial import (
     AerialBlock,
+    ImageFormat,
     MeasurementErrors,
     ccd_pattern,
-    frame_of,
     image_grid,
     residuals_after_orientation,
     simulate_block,
@@ -129,9 +129,17 @@ def test_the_planted_pattern_has_the_size_it_is_stated_to_have(block) -> None:
     assert np.hypot(*left.T).max() == pytest.approx(2e-3, rel=0.01)
 
 
+def image_of(rig: Rig) -> ImageFormat:
+    """The stitched image of a rig."""
+    image = rig.virtual_image
+    assert image is not None
+    half = image.pitch_mm / 2.0
+    return ImageFormat(image.width_px * half, image.height_px * half, image.f_mm, image.pitch_mm)
+
+
 def test_nine_ccds_off_on_their_own_are_found_by_58_parameters_and_not_by_two() -> None:
     rig = find_rig("ultracam-x")
-    plan = small_plan(frame_of(rig), "ultracam-x")
+    plan = small_plan(image_of(rig), "ultracam-x")
     block = simulate_block(plan, 3, ccd_pattern(rig, 3, 2e-3))
     full, radial = evaluate(block, "sensors-full"), evaluate(block, "radial")
     assert full.figures["parameters"] == 58, "61 less the interior orientation"
