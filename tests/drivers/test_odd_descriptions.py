@@ -248,6 +248,12 @@ def test_limits_of_each_other_are_no_cycle_and_values_of_each_other_are() -> Non
     entry += "<pValue>K</pValue></Enumeration>"
     assert features_with_cycles(f"<D>{entry}{knife.format('K', 'K')}</D>".encode()) == {"E", "K"}
     assert features_with_cycles(f"<D>{entry}{knife.format('K', 'Z')}</D>".encode()) == frozenset()
+    chain = '<Integer Name="F"><pValue>R</pValue></Integer><Integer Name="R">{}</Integer>'
+    for condition in ("pIsLocked", "pIsAvailable", "pIsImplemented", "pMin", "pMax", "pInc"):
+        text = chain.format(f"<{condition}>K</{condition}>") + knife.format("K", "K")
+        assert features_with_cycles(f"<D>{text}</D>".encode()) == {"F", "R", "K"}, condition
+    text = chain.format("<pSelected>K</pSelected>") + knife.format("K", "K")
+    assert features_with_cycles(f"<D>{text}</D>".encode()) == {"K"}
     for wrong in (b"<D>", b"<D/>", b""):
         with pytest.raises(DescriptionUnreadableError):
             features_with_cycles(wrong)

@@ -65,8 +65,6 @@ def _references(root: ElementTree.Element) -> dict[Aspect, list[Aspect]]:
         for child in node:
             for aspect, target in _references_of(child, _tag(child)):
                 graph.setdefault((name, aspect), []).append(target)
-                if aspect != VALUE:
-                    graph.setdefault((name, VALUE), [])
         graph.setdefault((name, VALUE), [])
     return graph
 
