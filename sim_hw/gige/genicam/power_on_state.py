@@ -180,6 +180,7 @@ def write_power_on_state(nodes: NodeMap, state: InitialState = InitialState.FACT
         _write_factory_value(nodes, name)
     # Conditions may depend on values that have just been written.
     _write_presence(nodes, features)
+    _write_chunk_presence(nodes)
     if state is InitialState.AUTOMATIC:
         _write_automatic(nodes, features)
     elif state is InitialState.USER_SET:
@@ -220,6 +221,21 @@ def _write_presence(nodes: NodeMap, features: Iterable[str]) -> None:
     for condition in sorted(conditions):
         if not _number_or(nodes, condition, 0):
             _search_true(nodes, condition)
+
+
+def _write_chunk_presence(nodes: NodeMap) -> None:
+    """Let every chunk be switched on; whether one can be may be stated for each by itself."""
+    selector = nodes.nodes.get("ChunkSelector")
+    if selector is None or "ChunkEnable" not in nodes.nodes:
+        return
+    held = _number_or(nodes, "ChunkSelector", 0)
+    last = list(_value_chain(nodes, "ChunkSelector"))[-1]
+    for value in (*(nodes.entry_value(entry) for entry in selector.entries), held):
+        if nodes.nodes[last].texts("Value"):
+            nodes.set_local(last, value)
+        elif not _try_write(nodes, "ChunkSelector", value):
+            continue
+        _write_presence(nodes, ["ChunkEnable"])
 
 
 def _conditions(nodes: NodeMap, name: str) -> Iterator[str]:

@@ -170,6 +170,13 @@ def test_another_grandmaster_has_to_agree_with_the_receiver_first() -> None:
     assert ptp.counts["ptp-grandmaster-changed"] == 1
 
 
+def test_the_sentence_states_by_how_much_the_clock_is_off() -> None:
+    for error_ns, expected in ((-37 * NS, "(-37.0 s from the receiver)"), (NS, "it is +1.0000 s")):
+        ptp = synchronised(error_ns=error_ns)
+        assert expected in ptp.events(6 * NS)[-1].sentence
+    assert synchronised().events(6 * NS) == []
+
+
 def test_what_was_stamped_before_the_master_changed_proves_nothing_of_the_new_one() -> None:
     ptp = synchronised()
     for second in (6, 7, 8):
