@@ -19,11 +19,11 @@ from daemon.cli.benchmark.measurement import machine
 from daemon.configuration.model import PlanSection
 from daemon.mission.layout import Mission
 from daemon.mission.store import store
-from daemon.mission.store.radiometry_folder import RadiometryFolder
 from daemon.products.exposure_conditions import conditions_of
 from daemon.products.pipeline_pool import PipelinePool
 from processing.pipelines.stitched import Pipeline, PipelineSettings
 from processing.quality.report import Flag
+from processing.radiometry.calibration import RadiometryFolder
 from processing.rig import find_rig, load_rig
 
 WARM_UP_EXPOSURES = 4

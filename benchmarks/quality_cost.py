@@ -28,12 +28,12 @@ from daemon.cli.benchmark.measurement import machine
 from daemon.cli.benchmark.pipeline import benchmark_exposure
 from daemon.configuration.model import PlanSection
 from daemon.mission.layout import Mission
-from daemon.mission.store.radiometry_folder import RadiometryFolder
 from daemon.mission.store.store import load_level0
 from daemon.products.exposure_conditions import conditions_of
 from processing.pipelines import exposure_pipeline, stitched, stitched_stages
 from processing.pipelines.stitched import Conditions, Pipeline, PipelineSettings
 from processing.quality.report import Flag
+from processing.radiometry.calibration import RadiometryFolder
 from processing.radiometry.level1 import Corrector, corrector_for, level1_from_level0
 from processing.rig import find_rig, load_rig
 

@@ -1,7 +1,8 @@
 """Ground footprints of images, as GeoJSON and as STAC items.
 
 Rays are followed to level ground in the local east, north, up of the projection centre; relief and
-the curvature of the earth (8 cm at 1 km) are left out.
+the curvature of the earth (8 cm at 1 km) are left out. `rings_on_terrain` follows them to the
+ground of a height model.
 """
 
 from __future__ import annotations
@@ -17,12 +18,19 @@ from daemon.configuration.model import MountSection
 from daemon.mission.exposure import NavigationRecord
 from daemon.mission.layout import Mission
 from daemon.orientation.exterior_orientation import ExteriorOrientation
+from daemon.orientation.georeference import Georeference
 from daemon.orientation.local_frame import LocalFrame
 from daemon.orientation.orientation_files import image_extent_mm
 from drivers.timescales.leap_seconds import leap_seconds_at
 from processing.geometry.orientation import BODY_FROM_CAMERA, grid_from_camera, on_level_ground
 from processing.geometry.rotation import level_from_body
+from processing.geometry.terrain_rays import HeightModel, on_terrain
 from processing.rig import Rig
+
+ALONG_EDGE = 8
+"""Points on each side of the image."""
+
+Ring = Sequence[tuple[float, float]]
 
 GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC)
 STAC_VERSION = "1.0.0"
@@ -204,3 +212,35 @@ def _polygon(corners: Sequence[tuple[float, float]] | None) -> dict[str, Any] | 
 def _off_nadir_deg(eo: ExteriorOrientation) -> float:
     """Angle between the camera's axis and straight down."""
     return math.degrees(math.acos(max(-1.0, min(1.0, float(eo.rotation[2, 2])))))
+
+
+def rings_on_terrain(
+    oriented: Sequence[ExteriorOrientation],
+    rig: Rig,
+    model: HeightModel,
+    georeference: Georeference,
+) -> Mapping[str, Ring | None]:
+    """Image edges followed to the ground of a height model.
+
+    Returns:
+        Rings (longitude, latitude), counter-clockwise, by image; None where an edge misses the
+        model or the horizon is seen.
+    """
+    found: dict[str, Ring | None] = {}
+    for eo in oriented:
+        cone = rig.cone(eo.cone)
+        left, bottom, right, top = image_extent_mm(rig, cone, is_virtual=eo.is_virtual)
+        f_mm = rig.virtual_image.f_mm if eo.is_virtual and rig.virtual_image else cone.lens.f_mm
+        corners = np.array([[left, bottom], [right, bottom], [right, top], [left, top]])
+        share = np.arange(ALONG_EDGE)[:, None] / ALONG_EDGE
+        edge = np.concatenate(
+            [a + (b - a) * share for a, b in zip(corners, np.roll(corners, -1, 0), strict=True)]
+        )
+        rays = np.column_stack([edge, np.full(len(edge), -f_mm)]) @ eo.rotation.T
+        ground = on_terrain(eo.centre_m, rays, model)
+        found[eo.name] = (
+            [georeference.position(*(float(v) for v in p)) for p in ground]
+            if np.isfinite(ground).all()
+            else None
+        )
+    return found

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from daemon.configuration.model import ProcessingSection
 from daemon.mission.exposure import Exposure
 from daemon.mission.layout import Mission
-from daemon.mission.store.radiometry_folder import RadiometryFolder
 from daemon.planning.plan_readers import read_plan
 from daemon.products.band_images import build_bands, radiance_folder, radiance_of
 from daemon.products.head_images import build_heads
@@ -29,6 +28,7 @@ from processing.pipelines.perspective import HeadPipeline, HeadSettings, has_hea
 from processing.pipelines.stitched import Conditions, Pipeline, PipelineSettings
 from processing.quality.report import Thresholds
 from processing.quality.requirements import QualityRequirements
+from processing.radiometry.calibration import RadiometryFolder
 from processing.rig import Rig
 
 Frames: TypeAlias = Mapping[str, NDArray[np.uint16]]

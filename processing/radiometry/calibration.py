@@ -11,6 +11,7 @@ import math
 import tokenize
 import zipfile
 import zlib
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, Final
@@ -19,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing import ProcessingError
-from processing.rig import Sensor
+from processing.rig import Rig, Sensor
 
 Array = NDArray[Any]
 
@@ -233,3 +234,26 @@ def _header(member: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:
         raise ValueError(f"array format {version} is not read here")
     shape, _, dtype = read(member)
     return shape, dtype
+
+
+class RadiometryFolder(Mapping[str, RadiometricCalibration]):
+    """Calibrations `<sensor>.npz` by sensor, read on demand; a sensor without a file is not in it.
+
+    As floating-point maps they are four times what a pipeline keeps of them; nothing is kept here.
+
+    Raises:
+        CalibrationError: when a requested file cannot be read.
+    """
+
+    def __init__(self, folder: Path, rig: Rig) -> None:
+        paths = {sensor.name: folder / f"{sensor.name}.npz" for sensor in rig.sensors}
+        self._paths = {name: path for name, path in paths.items() if path.exists()}
+
+    def __getitem__(self, name: str) -> RadiometricCalibration:
+        return load_radiometry(self._paths[name])
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._paths)
+
+    def __len__(self) -> int:
+        return len(self._paths)

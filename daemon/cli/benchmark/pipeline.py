@@ -30,7 +30,6 @@ from daemon.cli.benchmark.measurement import interleaved, machine, spread
 from daemon.configuration.model import PlanSection
 from daemon.mission.layout import Mission
 from daemon.mission.store import direct_io, store
-from daemon.mission.store.radiometry_folder import RadiometryFolder
 from daemon.orientation.exterior_orientation import mount_of
 from daemon.products.exposure_conditions import conditions_of
 from daemon.products.exposure_products import (
@@ -46,6 +45,7 @@ from daemon.products.stitched_image import build_stitched
 from processing.matching.tie_points import TiePoints
 from processing.pipelines.stitched import Pipeline, PipelineSettings, Product
 from processing.quality.report import Flag
+from processing.radiometry.calibration import RadiometryFolder
 from processing.rig import Rig, load_rig
 
 DC_K = 12.0

@@ -30,6 +30,7 @@ from daemon.orientation.exterior_orientation import (
     orient,
     sealed_exposures,
 )
+from daemon.orientation.footprints import rings_on_terrain
 from daemon.orientation.georeference import Georeference
 from daemon.orientation.orientation_files import (
     OrientationSetInfo,
@@ -40,7 +41,6 @@ from daemon.orientation.orientation_files import (
     patb_text,
 )
 from daemon.orientation.orientation_inputs import OrientationError, read_orientation_inputs
-from daemon.orientation.terrain_footprints import rings_on_terrain
 from daemon.orientation.trajectory import flown_trajectory
 from processing.geometry.rotation import vectors_from_rotations
 from processing.rig import Rig

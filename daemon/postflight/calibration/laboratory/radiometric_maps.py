@@ -1,6 +1,6 @@
 """Maps of a radiometric calibration as files, and against those of the one before.
 
-A folder for every aperture, `f<N>/<sensor>.npz`, as `daemon.mission.store.radiometry_folder` reads
+A folder for every aperture, `f<N>/<sensor>.npz`, as `processing.radiometry.calibration` reads
 one of them.
 """
 
@@ -47,7 +47,7 @@ def files_of(
 
 
 def calibration_bytes(calibration: RadiometricCalibration) -> bytes:
-    """`<sensor>.npz` as `daemon.mission.store.radiometry_folder` reads it."""
+    """`<sensor>.npz` as `processing.radiometry.calibration` reads it."""
     stream = io.BytesIO()
     np.savez_compressed(
         stream,

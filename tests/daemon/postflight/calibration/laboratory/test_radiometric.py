@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from daemon.cli.calibrate import app
-from daemon.mission.store.radiometry_folder import RadiometryFolder
+from processing.radiometry.calibration import RadiometryFolder
 from processing.rig import Rig, load_rig
 from sim_hw.laboratory import sphere
 
