@@ -109,6 +109,10 @@ def test_a_bias_of_the_detectable_size_has_the_stated_residual_and_moves_its_poi
         assert np.linalg.norm(shift[point]) == pytest.approx(
             0.01 * found.point_shift_m[k], rel=1e-3
         )
+        # The function that changes most is that of the adjusted observations themselves.
+        fitted = moved.residual - clean.residual
+        fitted[k] += 0.01 * found.detectable[k] / rows.sigma[k]
+        assert np.linalg.norm(fitted) == pytest.approx(0.01 * found.bias_to_noise[k], rel=1e-3)
         # No unknown moves by more of its standard deviation than stated.
         spread = np.sqrt(np.einsum("nii->ni", clean.point_cofactor))
         ratio = np.abs(shift) / spread
