@@ -24,9 +24,9 @@ setup: .venv/ready .venv/kernels
 	@touch $@
 
 # Browser, npm packages and other programs that only tests use.
-.venv/tests: .venv/ready bootstrap.sh tests/npm.lock
+.venv/tests: .venv/ready bootstrap.sh tests/support/npm.lock
 	sh bootstrap.sh --tests
-	$(BIN)/python -m tests.npm
+	$(BIN)/python -m tests.support.npm
 	touch $@
 
 # The wheels of Syntopic, with its manual page, and of the photographs for the emulator.
@@ -41,13 +41,13 @@ demo: setup
 	$(BIN)/syntopic demo
 
 # Whole flights run in real time and have the right of way (tests/conftest.py). STRICT=--fail-on-skip
-# where only skips of tests/expected_skips.toml are allowed.
+# where only skips of tests/support/expected_skips.toml are allowed.
 test: setup .venv/tests .venv/docs
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(STRICT)
 
 # The tests that need real time, five times in a row, with four busy loops next to them.
 test-busy: setup .venv/tests
-	$(BIN)/python -m tests.busy
+	$(BIN)/python -m tests.support.busy
 
 # `make demo` and `make test` in a fresh root of each release; as root, with debootstrap.
 release-check:
@@ -57,15 +57,15 @@ release-check:
 # REQUIRED=--required where skipping is no answer.
 test-v4l2: .venv/ready
 	sh bootstrap.sh --machine
-	$(BIN)/python -m tests.kernel.machine $(REQUIRED)
+	$(BIN)/python -m tests.installed.kernel.machine $(REQUIRED)
 
 check: .venv/ready
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(BIN)/python -m tests.licences
-	$(BIN)/python -m tests.audit
+	$(BIN)/python -m tests.repository.licences
+	$(BIN)/python -m tests.repository.audit
 
 # JSON Schemas of rig.toml and service.toml, after a change of their keys.
 schemas: .venv/ready
@@ -73,7 +73,7 @@ schemas: .venv/ready
 
 # Known vulnerabilities of what is pinned; unlike in `check`, a database out of reach is a failure.
 audit: setup
-	$(BIN)/python -m tests.audit --required
+	$(BIN)/python -m tests.repository.audit --required
 
 # The documents as a site in build/site. Once its packages are installed it needs no network.
 docs: .venv/docs
@@ -94,7 +94,7 @@ attack: setup .venv/tests
 # Until 30 CPU minutes bring no new edge, parser by parser: many hours. It goes on where it was ended.
 fuzz: setup
 	$(BIN)/python -m pip install -q --require-hashes -r requirements-fuzz.lock
-	$(BIN)/python -m tests.fuzz all --quiet-minutes 30 --seconds 60 --work .fuzz
+	$(BIN)/python -m tests.robustness.fuzz all --quiet-minutes 30 --seconds 60 --work .fuzz
 
 soak: setup .venv/tests
 	$(BIN)/python -m pytest -m soak --timeout=7200

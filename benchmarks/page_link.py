@@ -109,7 +109,7 @@ def measure(delay_s: float, loss: float, exposures: int) -> dict[str, Any]:
     from daemon.onboard.service.processes import ChildProcess
 
     # The types of tests are checked on their own.
-    browser_of = importlib.import_module("tests.browser").Browser
+    browser_of = importlib.import_module("tests.support.browser").Browser
     flight_events = importlib.import_module("tests.daemon.onboard.monitoring.flight_events")
     scene = importlib.import_module("tests.daemon.onboard.monitoring.test_page_guidance")
     libc = ctypes.CDLL(None, use_errno=True)

@@ -14,13 +14,13 @@ from typing import Any
 import pytest
 from hypothesis import settings
 
-from tests.skips import pytest_addoption, pytest_sessionfinish, pytest_terminal_summary
-from tests.stopwatch import slowdown
+from tests.support.skips import pytest_addoption, pytest_sessionfinish, pytest_terminal_summary
+from tests.support.stopwatch import slowdown
 
 __all__ = ["pytest_addoption", "pytest_sessionfinish", "pytest_terminal_summary"]
 
 FLIGHTS = Path(__file__).parent / "system"
-PAGES = Path(__file__).parent / "documents"
+PAGES = Path(__file__).parent / "repository" / "test_document_examples.py"
 NICENESS = 10
 
 settings.register_profile("patient", settings.default, deadline=None)
@@ -43,7 +43,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """The longest first; time-outs against hanging grow with the load of the machine."""
-    items.sort(key=lambda item: (not _is_flight(item), PAGES not in item.path.parents))
+    items.sort(key=lambda item: (not _is_flight(item), item.path != PAGES))
     factor = slowdown()
     for item in items:
         if _is_flight(item):

@@ -23,7 +23,7 @@ SCRIPTS: Final = {"assets/iframe-worker.js": "vendor/iframe-worker.js"}
 
 _LINK: Final = re.compile(r"(!?)\[((?:[^\]\\]|\\.)*)\]\(([^)\s]+)\)")
 _OPTIONS: Final = re.compile(r"^(```\w+) [^\n]+$", re.MULTILINE)
-"""Options of a block for tests/documents/test_document_examples.py, which Markdown does not
+"""Options of a block for tests/repository/test_document_examples.py, which Markdown does not
 know."""
 _NAMED: Final = re.compile(r"(?<![\w/\[.`])(?<!\]\()docs/([\w/-]+\.md)((?:#[\w-]+)?)")
 

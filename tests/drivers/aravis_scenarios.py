@@ -32,7 +32,7 @@ from drivers.contract import (
     LifeCycle,
     Record,
 )
-from tests.stopwatch import Stopwatch
+from tests.support.stopwatch import Stopwatch
 
 ADDRESS = "127.0.0.1"
 FAKE_CAMERA = "arv-fake-gv-camera-0.8"

@@ -14,7 +14,7 @@ from typing import Final
 from drivers.contract import DeviceError
 from sim_hw.gige.genicam.power_on_state import InitialState
 from tests.drivers.test_real_descriptions import served
-from tests.genicam_descriptions import names
+from tests.support.genicam_descriptions import names
 
 PAGE: Final = Path(__file__).parents[2] / "docs" / "reference" / "drivers" / "genicam-cameras.md"
 HEADER: Final = """# Real cameras by their GenICam description

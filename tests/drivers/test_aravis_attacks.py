@@ -30,7 +30,7 @@ from sim_hw.gige.gvsp import PAYLOAD_IMAGE
 from sim_hw.world.world_clock import FreeRunningClock
 from tests.daemon.onboard.monitoring.test_mavsdk_camera import free_port
 from tests.drivers.test_aravis_head import NETWORK, PATTERN, SHAPE, Pair, flying
-from tests.stopwatch import Stopwatch
+from tests.support.stopwatch import Stopwatch
 
 pytest.importorskip("gi", reason="needs PyGObject (extra aravis) and gir1.2-aravis-0.8")
 pytestmark = [pytest.mark.realtime, pytest.mark.timeout(240), pytest.mark.trust, pytest.mark.attack]

@@ -21,8 +21,8 @@ from sim_hw.gige.gige_head import ExposureRequest, FrameSize, GigeHead, HeadIden
 from sim_hw.gige.ptp_slave import PtpSlave
 from sim_hw.world.world_clock import FreeRunningClock
 from tests.drivers.test_aravis_head import SHAPE, Memory
-from tests.namespaces import Host, two_hosts
-from tests.ptp_master import ptp_master
+from tests.support.namespaces import Host, two_hosts
+from tests.support.ptp_master import ptp_master
 
 pytest.importorskip("gi", reason="needs PyGObject (extra aravis) and gir1.2-aravis-0.8")
 pytestmark = [pytest.mark.realtime, pytest.mark.timeout(120)]

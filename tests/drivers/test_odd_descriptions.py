@@ -25,7 +25,7 @@ from sim_hw.gige.described_head import DescribedHead
 from sim_hw.gige.genicam.description_file import DescriptionError, read_description
 from tests.drivers.described_frames import Memory, first_frame
 from tests.drivers.test_head_configuration import DESCRIPTION
-from tests.genicam_descriptions import description, names, needs_descriptions
+from tests.support.genicam_descriptions import description, names, needs_descriptions
 
 pytest.importorskip("gi", reason="needs PyGObject (extra aravis) and gir1.2-aravis-0.8")
 pytestmark = pytest.mark.timeout(120)

@@ -12,7 +12,7 @@ import pytest
 
 from drivers.contract import DeviceError
 from drivers.triggers.pulse_bus import PulseBusTrigger
-from tests.stopwatch import Stopwatch
+from tests.support.stopwatch import Stopwatch
 
 pytestmark = pytest.mark.realtime
 

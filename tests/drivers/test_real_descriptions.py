@@ -32,8 +32,8 @@ from sim_hw.gige.genicam.power_on_state import (
     write_power_on_state,
 )
 from tests.drivers.described_frames import Memory, first_frame
-from tests.genicam_descriptions import description, names, needs_descriptions
-from tests.genicam_reference import Port, genapi
+from tests.support.genicam_descriptions import description, names, needs_descriptions
+from tests.support.genicam_reference import Port, genapi
 
 pytest.importorskip("gi", reason="needs PyGObject (extra aravis) and gir1.2-aravis-0.8")
 pytestmark = [needs_descriptions, pytest.mark.timeout(180)]

@@ -13,7 +13,7 @@ import serial
 from drivers.contract import DeviceError, LifeCycle, RawBytes, TemperatureSample
 from drivers.transport.serial_device import SerialDevice, SerialLine, open_serial_port
 from tests.drivers.fakes import FakeClock, FakePort, RecordingSink, refusing_port
-from tests.stopwatch import Stopwatch
+from tests.support.stopwatch import Stopwatch
 
 
 class EchoDevice(SerialDevice):

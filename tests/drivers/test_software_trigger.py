@@ -10,7 +10,7 @@ import pytest
 
 from drivers.contract import DeviceError, Head
 from drivers.triggers.software import SoftwareTrigger
-from tests.stopwatch import Stopwatch
+from tests.support.stopwatch import Stopwatch
 
 
 class StubHead:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from sim_hw.world.atomic_file import atomic_file
-from tests.crash.kill_at_call import run_to_call
+from tests.robustness.crash.kill_at_call import run_to_call
 
 pytestmark = pytest.mark.trust
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tests.stopwatch import slowdown
+from tests.support.stopwatch import slowdown
 
 ROOT = Path(__file__).parents[2]
 FLIGHT_WITHIN_S = 300.0

@@ -12,7 +12,7 @@ from daemon.cli.sim import Emulator, free_first_address, service_toml, simulator
 from daemon.mission.layout import Mission
 from daemon.mission.store.level0_folder import read_sealed
 from daemon.mission.verification.verification import verify
-from tests.crash.write_log import needs_strace, run_with_faults
+from tests.robustness.crash.write_log import needs_strace, run_with_faults
 from tests.system.demo_mission import ROOT
 
 pytestmark = [
@@ -47,7 +47,7 @@ def test_a_disk_that_refuses_and_stalls_costs_exposures_and_never_the_service(
     config.write_text(
         service_toml(emulator.ready, root="missions", count=EXPOSURES, end_when_done=True)
     )
-    program = [sys.executable, "-m", "tests.crash.service", str(config)]
+    program = [sys.executable, "-m", "tests.robustness.crash.service", str(config)]
     stdout, trace = tmp_path / "events", tmp_path / "trace"
     try:
         run_with_faults(program, FAULTS, trace, cwd=ROOT, stdout=stdout)

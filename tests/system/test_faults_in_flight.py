@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from daemon.cli.sim import Emulator, free_first_address, service_toml, simulator_arguments
-from tests.stopwatch import Stopwatch, slowdown
+from tests.support.stopwatch import Stopwatch, slowdown
 from tests.system.demo_mission import ROOT, syntopic
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(400)]

@@ -15,8 +15,8 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 
-from tests.browser import Browser
-from tests.npm import npm_package
+from tests.support.browser import Browser
+from tests.support.npm import npm_package
 from tests.system.demo_mission import DemoMission, syntopic
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(400)]

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from daemon.cli.sim import Emulator, free_first_address, service_toml, simulator_arguments
-from tests.crash.test_full_disk import NAMESPACE, needs_namespace
+from tests.robustness.crash.test_full_disk import NAMESPACE, needs_namespace
 from tests.system.demo_mission import ROOT
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(400)]
@@ -29,7 +29,13 @@ def test_a_full_disk_costs_exposures_and_never_the_service(tmp_path: Path, scene
     # No reserve: the guard would stop the flight long before anything is refused.
     text = service_toml(emulator.ready, root="missions")
     config.write_text(f"{text}\n[limits]\ndisk_reserve_bytes = 0\n")
-    program = [sys.executable, "-m", "tests.crash.service_on_full_disk", str(config), str(disk)]
+    program = [
+        sys.executable,
+        "-m",
+        "tests.robustness.crash.service_on_full_disk",
+        str(config),
+        str(disk),
+    ]
     try:
         done = subprocess.run(
             [*NAMESPACE, *program], cwd=ROOT, capture_output=True, text=True, timeout=300

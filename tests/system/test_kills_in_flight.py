@@ -122,7 +122,7 @@ def _run_and_kill(
 
 
 def _start(config: Path) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "tests.crash.service", str(config)]
+    command = [sys.executable, "-m", "tests.robustness.crash.service", str(config)]
     return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
 
 

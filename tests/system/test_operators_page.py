@@ -29,9 +29,9 @@ from daemon.onboard.monitoring.access.tokens import add_token
 from daemon.planning.model import LocalPlane, Point
 from daemon.planning.plan_readers import read_plan
 from sim_hw.world.flight import FlightPlan
-from tests.browser import Browser, chromium
 from tests.daemon.onboard.monitoring.test_mavsdk_camera import free_port
-from tests.stopwatch import Stopwatch
+from tests.support.browser import Browser, chromium
+from tests.support.stopwatch import Stopwatch
 from tests.system.demo_mission import ROOT, DemoMission
 from tests.system.waypoints import darkened, fly_mission
 

@@ -45,7 +45,7 @@ def test_a_pulled_disk_costs_no_exposure_and_is_brought_up_to_date_when_it_retur
     config = tmp_path / "service.toml"
     text = service_toml(emulator.ready, root="missions", count=JOINED_WITHIN, end_when_done=True)
     config.write_text(text.replace("[mission]\n", '[mission]\nmirror = "mirror"\n'))
-    program = [sys.executable, "-m", "tests.crash.service", str(config)]
+    program = [sys.executable, "-m", "tests.robustness.crash.service", str(config)]
     events: list[dict[str, Any]] = []
     process = subprocess.Popen(program, cwd=ROOT, stdout=subprocess.PIPE, text=True)
     pulled, is_landing = tmp_path / "pulled", False

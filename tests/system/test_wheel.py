@@ -21,7 +21,7 @@ from typing import Any
 import pytest
 
 from daemon.cli.exit_status import ExitStatus
-from tests.documents.test_document_examples import blocks, page_of
+from tests.repository.test_document_examples import blocks, page_of
 
 ROOT = Path(__file__).parents[2]
 TUTORIAL = "tutorials/your-own-hardware.md"

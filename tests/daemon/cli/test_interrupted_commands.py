@@ -20,8 +20,8 @@ from daemon.cli import interrupt_messages
 from daemon.cli.exit_status import ExitStatus
 from daemon.mission.log.flight_log import read
 from daemon.mission.store import durable
-from tests.crash.kill_at_call import run_to_call
-from tests.crash.kill_transfer import three_exposures
+from tests.robustness.crash.kill_at_call import run_to_call
+from tests.robustness.crash.kill_transfer import three_exposures
 
 pytestmark = pytest.mark.trust
 

@@ -16,7 +16,7 @@ import pytest
 
 from daemon.cli import interrupt_messages
 from daemon.cli.exit_status import ExitStatus
-from tests.crash.kill_transfer import three_exposures
+from tests.robustness.crash.kill_transfer import three_exposures
 
 pytestmark = [pytest.mark.trust, pytest.mark.timeout(300)]
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from daemon.mission.store import durable
-from tests.crash.kill_at_call import run_to_call
+from tests.robustness.crash.kill_at_call import run_to_call
 
 pytestmark = pytest.mark.trust
 

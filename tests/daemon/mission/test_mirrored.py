@@ -30,7 +30,7 @@ from tests.daemon.small_camera import (
     new_mission,
     pixels_of,
 )
-from tests.stopwatch import Stopwatch
+from tests.support.stopwatch import Stopwatch
 
 pytestmark = [pytest.mark.realtime, pytest.mark.trust]
 

@@ -19,8 +19,8 @@ from daemon.mission.transfer.transfer import TransferError, transfer
 from daemon.mission.transfer.transfer_manifest import EXCLUDED_FILES, MANIFEST_FILE, MOVED_FILE
 from daemon.mission.transfer.transfer_removal import removing_path
 from daemon.mission.verification.verification import verify
-from tests.crash.kill_at_call import run_to_call
-from tests.crash.kill_transfer import content_of, three_exposures
+from tests.robustness.crash.kill_at_call import run_to_call
+from tests.robustness.crash.kill_transfer import content_of, three_exposures
 
 pytestmark = pytest.mark.trust
 

@@ -1,7 +1,7 @@
 """Each flag is raised by what it is there for, at twice its threshold, and by nothing else.
 
 The faults are in the light, the true camera, the probes or the instruments of a rendered exposure;
-flags of capture are provoked in tests/faults. Rates over many exposures:
+flags of capture are provoked in tests/robustness/faults. Rates over many exposures:
 docs/reference/results/accuracy.md.
 """
 

@@ -30,7 +30,7 @@ from sim_hw.receivers.ublox_receiver import (
 )
 from sim_hw.world.world_clock import WorldClock
 from tests.sim_hw.receiver_state import NS, START_GPS_NS, STATE, WEEK_NS, state_at
-from tests.stopwatch import Stopwatch
+from tests.support.stopwatch import Stopwatch
 
 pytestmark = pytest.mark.realtime
 

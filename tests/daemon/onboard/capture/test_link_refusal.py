@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from processing.rig import find_rig
-from tests.head_network import head_network
+from tests.support.head_network import head_network
 
 SENTENCE = "432 MB of 13 heads take 3.5 s of 1.35 s on eth1 (1000 Mbit/s"
 

@@ -21,10 +21,10 @@ import pytest
 
 from daemon.onboard.service.messages import ServiceEvent
 from processing.rig import shipped_rigs
-from tests.browser import Browser, chromium
 from tests.daemon.onboard.monitoring import flight_events
 from tests.daemon.onboard.monitoring.test_page import WITHIN_S, Service
-from tests.npm import npm_package
+from tests.support.browser import Browser, chromium
+from tests.support.npm import npm_package
 
 SIZES = ((1280, 800), (2000, 1200), (390, 844))
 THEMES = ("", "dark")

@@ -16,9 +16,9 @@ from daemon.configuration.model import WatchSection
 from daemon.onboard.monitoring.access.tokens import add_token
 from daemon.onboard.service.messages import Answer, ServiceCommand, ServiceEvent, Stop
 from daemon.onboard.service.processes import ChildProcess
-from tests.browser import Browser, chromium
 from tests.daemon.onboard.monitoring import flight_events
-from tests.npm import npm_package
+from tests.support.browser import Browser, chromium
+from tests.support.npm import npm_package
 
 WITHIN_S = 30.0
 

@@ -37,7 +37,7 @@ from daemon.onboard.service.messages import Answer, ServiceCommand, ServiceEvent
 from daemon.onboard.service.processes import ChildProcess
 from tests.daemon.onboard.monitoring import flight_events
 from tests.daemon.onboard.monitoring.test_watchers import resident_kb
-from tests.stopwatch import Stopwatch
+from tests.support.stopwatch import Stopwatch
 
 pytestmark = pytest.mark.realtime
 

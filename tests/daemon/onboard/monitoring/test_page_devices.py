@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tests.browser import Browser, chromium
 from tests.daemon.onboard.monitoring import flight_events
 from tests.daemon.onboard.monitoring.test_page import WITHIN_S, Service
+from tests.support.browser import Browser, chromium
 
 
 def test_the_counters_of_a_device_are_read_when_its_kind_is_expanded(tmp_path: Path) -> None:

@@ -17,12 +17,12 @@ from daemon.mission.store.level0 import tiff_parts
 from daemon.planning.guidance import GuidanceLimits, guide
 from daemon.planning.model import PlannedLine, Point
 from processing.rig import shipped_rigs
-from tests.browser import Browser, chromium
 from tests.daemon.onboard.flight.test_flight import nav as any_sample
 from tests.daemon.onboard.monitoring import flight_events
 from tests.daemon.onboard.monitoring.test_base_maps import geotiff, mbtiles, tile_of
 from tests.daemon.onboard.monitoring.test_page import WITHIN_S, Service
 from tests.daemon.onboard.monitoring.vector_tiles import vector_tile
+from tests.support.browser import Browser, chromium
 
 LINES = {"A1": [[15.43, 47.07], [15.43, 47.08]], "A2": [[15.434, 47.08], [15.434, 47.07]]}
 LIMITS = GuidanceLimits(25.0, 40.0, None)

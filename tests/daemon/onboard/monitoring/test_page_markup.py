@@ -14,9 +14,9 @@ import pytest
 
 from daemon.onboard.service.messages import ServiceEvent
 from processing.rig import shipped_rigs
-from tests.browser import Browser, chromium
 from tests.daemon.onboard.monitoring import flight_events
 from tests.daemon.onboard.monitoring.test_page import WITHIN_S, Service
+from tests.support.browser import Browser, chromium
 
 pytestmark = pytest.mark.trust
 

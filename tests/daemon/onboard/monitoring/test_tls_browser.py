@@ -14,10 +14,10 @@ from typing import Any
 import pytest
 
 from daemon.onboard.monitoring.access.certificate_authority import issue_certificate
-from tests.browser import Browser, chromium
 from tests.daemon.onboard.monitoring import flight_events
 from tests.daemon.onboard.monitoring.test_page import WITHIN_S, Service
-from tests.namespaces import Host, two_hosts
+from tests.support.browser import Browser, chromium
+from tests.support.namespaces import Host, two_hosts
 
 pytestmark = pytest.mark.trust
 NAME = f"{socket.gethostname().lower().partition('.')[0]}.local"

@@ -17,7 +17,7 @@ from daemon.onboard.preflight.kernel_counters import (
     softirq_shares,
 )
 from daemon.onboard.preflight.network_diagnosis import governor
-from tests.head_network import head_network
+from tests.support.head_network import head_network
 
 SOFTNET = """\
 00002609 00000003 00000001 00000000 00000000

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from tests.head_network import HeadNetwork, head_network
+from tests.support.head_network import HeadNetwork, head_network
 
 pytestmark = pytest.mark.timeout(120)
 

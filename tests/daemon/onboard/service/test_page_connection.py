@@ -51,7 +51,7 @@ from daemon.onboard.service.page_messages import (
 )
 from daemon.onboard.service.supervisor import Supervisor
 from tests.daemon.onboard.service.test_audit import Flight
-from tests.stopwatch import Stopwatch
+from tests.support.stopwatch import Stopwatch
 
 pytestmark = pytest.mark.realtime
 

@@ -15,7 +15,7 @@ from daemon.onboard.service.messages import Ping, Pong, Stop, WorkerBuilt, Worke
 from daemon.onboard.service.processes import ServiceConnection
 from daemon.onboard.service.supervisor import Supervisor
 from tests.daemon.onboard.service.flight_parts import ThreadChild
-from tests.stopwatch import Stopwatch
+from tests.support.stopwatch import Stopwatch
 
 pytestmark = pytest.mark.realtime
 

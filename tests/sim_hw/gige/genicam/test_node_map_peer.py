@@ -20,8 +20,8 @@ from sim_hw.gige.genicam.power_on_state import (
     features_of,
     write_power_on_state,
 )
-from tests.genicam_descriptions import description, names, needs_descriptions
-from tests.genicam_reference import Port, genapi
+from tests.support.genicam_descriptions import description, names, needs_descriptions
+from tests.support.genicam_reference import Port, genapi
 
 pytestmark = [needs_descriptions, pytest.mark.peer]
 
