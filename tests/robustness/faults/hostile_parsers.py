@@ -5,9 +5,8 @@ from __future__ import annotations
 import random
 import socket
 import struct
-import sys
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -197,11 +196,11 @@ def septentrio() -> Parser:
 
 
 def sbg() -> Parser:
-    return _receiver("sbg", SbgReceiver, SbgDecoder("r"), reseal_sbg, 0.07)
+    return _receiver("sbg", SbgReceiver, SbgDecoder("r"), reseal_sbg, 0.05)
 
 
 def vectornav() -> Parser:
-    return _receiver("vectornav", VectornavReceiver, VectornavDecoder("r"), reseal_vectornav, 0.07)
+    return _receiver("vectornav", VectornavReceiver, VectornavDecoder("r"), reseal_vectornav, 0.05)
 
 
 def xsens() -> Parser:
@@ -482,28 +481,3 @@ PARSERS: Mapping[str, Callable[[], Parser]] = {
     "gvcp-answer": gvcp_answers,
     "gvcp-command": gvcp_commands,
 }
-
-
-def retained_nbytes(roots: Iterable[object]) -> int:
-    """Bytes held in the data that parsers keep: containers, text and numbers, each once."""
-    seen: set[int] = set()
-    waiting = list(roots)
-    total = 0
-    while waiting:
-        item = waiting.pop()
-        if id(item) in seen or isinstance(item, type) or callable(item):
-            continue
-        seen.add(id(item))
-        total += sys.getsizeof(item)
-        if isinstance(item, Mapping):
-            waiting += [*item.keys(), *item.values()]
-        elif isinstance(item, list | tuple | set | frozenset | deque):
-            waiting += item
-        elif hasattr(item, "__dict__") and type(item).__module__.split(".")[0] in _OURS:
-            waiting.append(vars(item))
-        elif hasattr(item, "__slots__"):
-            waiting += [getattr(item, name, None) for name in item.__slots__]
-    return total
-
-
-_OURS = frozenset(("drivers", "sim_hw", "tests"))

@@ -14,7 +14,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from tests.robustness.faults.hostile_parsers import PARSERS, Mutator, Parser, retained_nbytes
+from tests.robustness.faults.hostile_parsers import PARSERS, Mutator, Parser
+from tests.robustness.faults.retained_memory import retained_nbytes
 
 MESSAGES = 1_000_000
 SOAK_MESSAGES = 10_000_000
@@ -93,7 +94,7 @@ def run(name: str, total: int) -> None:
 
 
 def test_the_shares_of_all_parsers_are_the_whole() -> None:
-    assert sum(make().share for name, make in PARSERS.items() if name != "mavlink") <= 1.0
+    assert sum(make().share for name, make in PARSERS.items() if name != "mavlink") <= 1.0 + 1e-9
 
 
 @pytest.mark.parametrize("name", list(PARSERS))
