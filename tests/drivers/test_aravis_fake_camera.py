@@ -113,7 +113,7 @@ def test_settings_that_the_head_refuses_come_all_at_once_and_let_it_go() -> None
     assert "gain_db is 6; the head has no gain in dB; it has GainRaw in steps of its own" in four
     assert "tdi_shifts is 12; the head has no feature TdiShifts, set 0" in four
     assert "serial number is 'T1' where 'T2' is configured" in serial
-    assert "trigger_line = 'Line7' is refused" in line
+    assert "trigger_line is refused (TriggerSource has no entry Line7" in line
     assert "a frame has 524288 bytes, its slot 1000" in small
     assert "nothing answers at 127.0.0.1; check the head's power, cable" in absent
     assert outcome["privilege_afterwards"] == 0

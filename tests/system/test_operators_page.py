@@ -341,13 +341,16 @@ def test_a_mission_of_waypoints_is_exposed_and_a_head_that_goes_is_seen_and_ackn
                 lambda e: e["event"] == "device" and e["fault"] and e["name"] == "lost", 60
             )
             name = json.dumps(f"device {fault['device']}")
+            seen = f"[data-fault={name}] .acknowledge"
             browser.wait_for(f"document.querySelector('[data-fault={name}]') !== null", 30)
             seen_s = (time.monotonic_ns() - int(fault["mono_ns"])) * 1e-9
             assert seen_s < SEEN_WITHIN_S + watch.withheld_s
             browser.evaluate(f"sessionStorage.setItem('token', {json.dumps(token)})")
-            browser.click(f"[data-fault={name}] button")
+            browser.click(seen)
             # It stands still, so it stays; but somebody has seen it.
-            browser.wait_for(f"document.querySelector('[data-fault={name}] button') === null", 30)
+            browser.wait_for(
+                f"document.querySelector('[data-fault={name}] .acknowledge') === null", 30
+            )
             assert "acknowledged" in browser.text(f"[data-fault={name}]")
             pictures_folder = os.environ.get("SYNTOPIC_PICTURES")
             browser.picture(

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import ipaddress
 from dataclasses import dataclass
+from typing import Any
 
 from drivers.cameras.aravis.gvcp import is_ip_address
 from drivers.cameras.aravis.library import OPENING, aravis
+
+# A datagram of a busy head or network is lost now and then.
+PASSES = 2
 
 
 @dataclass(frozen=True)
@@ -24,35 +28,38 @@ class FoundHead:
 
 
 def heads() -> list[FoundHead]:
-    """Discover heads; takes about a second.
+    """Discover heads in two passes; takes about two seconds.
 
     Returns:
-        Every head that answers Aravis' discovery, sorted by address.
+        Every head that answers Aravis' discovery in one of them, sorted by address.
 
     Raises:
         DeviceError: Aravis is not installed.
     """
     library = aravis()
-    found = []
+    found: dict[FoundHead, None] = {}
     with OPENING:
-        library.update_device_list()
-        for index in range(library.get_n_devices()):
-            protocol = str(library.get_device_protocol(index) or "")
-            if protocol == "Fake":
-                continue
-            # USB heads have no persistent address; they are opened by their name.
-            name = library.get_device_id(index)
-            address = library.get_device_address(index) if protocol == "GigEVision" else name
-            found.append(
-                FoundHead(
-                    _printable(address or name),
-                    _printable(library.get_device_vendor(index)),
-                    _printable(library.get_device_model(index)),
-                    _printable(library.get_device_serial_nbr(index)),
-                    protocol,
-                )
-            )
+        for _ in range(PASSES):
+            library.update_device_list()
+            for index in range(library.get_n_devices()):
+                head = _head(library, index)
+                if head.protocol != "Fake":
+                    found[head] = None
     return sorted(found, key=_by_address)
+
+
+def _head(library: Any, index: int) -> FoundHead:
+    protocol = str(library.get_device_protocol(index) or "")
+    # USB heads have no persistent address; they are opened by their name.
+    name = library.get_device_id(index)
+    address = library.get_device_address(index) if protocol == "GigEVision" else name
+    return FoundHead(
+        _printable(address or name),
+        _printable(library.get_device_vendor(index)),
+        _printable(library.get_device_model(index)),
+        _printable(library.get_device_serial_nbr(index)),
+        protocol,
+    )
 
 
 def _printable(text: str | None) -> str:

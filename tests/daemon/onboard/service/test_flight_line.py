@@ -89,7 +89,7 @@ def test_a_position_counts_for_its_own_instant_once_the_clock_knows_it(tmp_path:
     line = make_line(tmp_path, count=1)
     sample = nav(1.0)
     line._flight.take(sample)
-    placed = line._position()
+    placed = line.position()
     assert placed is not None
     # Messages alone do not reveal their delay.
     assert placed.mono_ns == sample.mono_ns
@@ -97,7 +97,7 @@ def test_a_position_counts_for_its_own_instant_once_the_clock_knows_it(tmp_path:
     for second in range(-3, 1):
         clock.pps_edge(second * 1_000_000_000, 1_000)
     line._flight.take(nav(1.2))
-    placed = line._position()
+    placed = line.position()
     assert placed is not None
     assert placed.mono_ns == pytest.approx(1_200_000_000, abs=100_000)
-    assert line._position() is placed
+    assert line.position() is placed
