@@ -10,7 +10,7 @@ Source: docs/explanation/mathematics/coordinates.md#from-sensor-to-virtual-image
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -48,6 +48,42 @@ class SensorPlacement:
     physical: Similarity
     f_ratio: float
     tdi_shifts: int
+
+
+def head_placement(
+    cone: Cone,
+    sensor: Sensor,
+    image: VirtualImage,
+    temperatures_c: Mapping[str, float],
+    tdi_shifts: int = 0,
+) -> SensorPlacement:
+    """Placement of a sensor in its own head alone: no mounting, no rotation.
+
+    Args:
+        cone: the head.
+        sensor: one of its sensors.
+        image: the perspective it is placed in.
+        temperatures_c: temperature by probe name, as for `nominal_placements`.
+        tdi_shifts: N of the frame.
+
+    Returns:
+        The placement as if the head were the whole rig.
+    """
+    alone = replace(cone, role="pan", rotation_rad=(0.0, 0.0, 0.0), position_mm=(0.0, 0.0, 0.0))
+    rig = Rig(
+        name=cone.name,
+        title="",
+        timing="synchronous",
+        frame_interval_s=1.0,
+        master_cone=cone.name,
+        colour_master_cone=None,
+        reference_cone=cone.name,
+        calibration_id="",
+        calibration_date="",
+        virtual_image=image,
+        cones=(alone,),
+    )
+    return nominal_placements(rig, temperatures_c, {sensor.name: tdi_shifts})[sensor.name]
 
 
 def nominal_placements(

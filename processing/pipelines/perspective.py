@@ -12,14 +12,14 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from processing.geometry.conditions import Conditions
-from processing.geometry.placement import nominal_placements, raw_from_vip_mm, vip_mm_from_px
+from processing.geometry.placement import head_placement, raw_from_vip_mm, vip_mm_from_px
 from processing.geometry.rotation import rotation_matrix
 from processing.image.kernels import DEFAULT_INTERPOLATION, Interpolation
 from processing.image.lattice import OUTSIDE
@@ -148,7 +148,8 @@ def raw_of_perspective(
         Raw column and row, (n, 2); NaN where the lens folds.
     """
     image = perspective_of(cone)
-    return raw_from_vip_mm(_placement(cone, temperatures_c), vip_mm_from_px(image, colrow))
+    placed = head_placement(cone, cone.sensors[0], image, temperatures_c)
+    return raw_from_vip_mm(placed, vip_mm_from_px(image, colrow))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -342,27 +343,6 @@ def _planes(cone: Cone, level1: NDArray[np.uint16]) -> dict[str, NDArray[np.uint
 
 def _bands(cone: Cone) -> Sequence[str]:
     return BAYER_BANDS if is_bayer(cone.sensors[0]) else cone.bands[:1]
-
-
-def _placement(cone: Cone, temperatures_c: Mapping[str, float]) -> Any:
-    """The head as if it alone were the rig: no rotation, its own perspective."""
-    single_cone = replace(
-        cone, role="pan", rotation_rad=(0.0, 0.0, 0.0), position_mm=(0.0, 0.0, 0.0)
-    )
-    rig = Rig(
-        name=cone.name,
-        title="",
-        timing="synchronous",
-        frame_interval_s=1.0,
-        master_cone=cone.name,
-        colour_master_cone=None,
-        reference_cone=cone.name,
-        calibration_id="",
-        calibration_date="",
-        virtual_image=perspective_of(cone),
-        cones=(single_cone,),
-    )
-    return nominal_placements(rig, temperatures_c, {})[cone.sensors[0].name]
 
 
 def _lattice_of(cone: Cone, known: Mapping[str, float]) -> Array:

@@ -14,6 +14,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -34,17 +35,22 @@ WIDTH_PX, HEIGHT_PX = 128, 96
 STROBE_EVERY_S = 1.0
 OUTPUTS = ("0", "1")
 
+RECEIVERS: Mapping[str, tuple[str, str]] = {
+    "ublox": ("ublox_receiver", "UbloxReceiver"),
+    "nmea": ("nmea_receiver", "NmeaReceiver"),
+    "novatel": ("novatel_receiver", "NovatelReceiver"),
+    "septentrio": ("septentrio_receiver", "SeptentrioReceiver"),
+    "sbg": ("sbg_receiver", "SbgReceiver"),
+    "vectornav": ("vectornav_receiver", "VectornavReceiver"),
+    "xsens": ("xsens_receiver", "XsensReceiver"),
+    "applanix": ("applanix_receiver", "ApplanixReceiver"),
+    "gsof": ("gsof_receiver", "GsofReceiver"),
+    "mavlink": ("mavlink_autopilot", "MavlinkAutopilot"),
+}
+"""Module in `sim_hw.receivers` and class, by kind."""
+
 KINDS: Mapping[str, DeviceKind] = {
-    "ublox": RECEIVER,
-    "nmea": RECEIVER,
-    "novatel": RECEIVER,
-    "septentrio": RECEIVER,
-    "sbg": RECEIVER,
-    "vectornav": RECEIVER,
-    "xsens": RECEIVER,
-    "applanix": RECEIVER,
-    "gsof": RECEIVER,
-    "mavlink": RECEIVER,
+    **dict.fromkeys(RECEIVERS, RECEIVER),
     "modbus": THERMOMETER,
     "ascii": THERMOMETER,
     "head": HEAD,
@@ -134,47 +140,13 @@ def _line_device(
     def state(own_gps_ns: int) -> ReceiverState:
         return _state(clock.world_gps_ns(own_gps_ns) - clock.gps_ns_at_start)
 
-    # Imported one by one: a device comes up as fast as it can, and needs no other.
-    if kind == "ublox":
-        from sim_hw.receivers.ublox_receiver import UbloxReceiver
-
-        return UbloxReceiver(clock, state, line=line)
-    if kind == "nmea":
-        from sim_hw.receivers.nmea_receiver import NmeaReceiver
-
-        return NmeaReceiver(clock, state, line=line)
-    if kind == "novatel":
-        from sim_hw.receivers.novatel_receiver import NovatelReceiver
-
-        return NovatelReceiver(clock, state, line=line)
-    if kind == "septentrio":
-        from sim_hw.receivers.septentrio_receiver import SeptentrioReceiver
-
-        return SeptentrioReceiver(clock, state, line=line)
-    if kind == "sbg":
-        from sim_hw.receivers.sbg_receiver import SbgReceiver
-
-        return SbgReceiver(clock, state, line=line)
-    if kind == "vectornav":
-        from sim_hw.receivers.vectornav_receiver import VectornavReceiver
-
-        return VectornavReceiver(clock, state, line=line)
-    if kind == "xsens":
-        from sim_hw.receivers.xsens_receiver import XsensReceiver
-
-        return XsensReceiver(clock, state, line=line)
-    if kind == "applanix":
-        from sim_hw.receivers.applanix_receiver import ApplanixReceiver
-
-        return ApplanixReceiver(clock, state, line=line)
-    if kind == "gsof":
-        from sim_hw.receivers.gsof_receiver import GsofReceiver
-
-        return GsofReceiver(clock, state, line=line)
-    if kind == "mavlink":
-        from sim_hw.receivers.mavlink_autopilot import MavlinkAutopilot
-
-        return MavlinkAutopilot(clock, state, line=line)
+    if kind in RECEIVERS:
+        # Imported one by one: a device comes up as fast as it can, and needs no other.
+        module, name = RECEIVERS[kind]
+        receiver: LineDevice = getattr(import_module(f"sim_hw.receivers.{module}"), name)(
+            clock, state, line=line
+        )
+        return receiver
     if kind == "modbus":
         from sim_hw.devices.modbus_probe import ModbusProbe
 

@@ -12,21 +12,14 @@ import time
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 from fastapi import FastAPI, WebSocket
 from fastapi.responses import FileResponse
-from starlette.requests import HTTPConnection
 from starlette.websockets import WebSocketDisconnect
 
 from daemon.onboard.monitoring.flight_state import FlightState
-from daemon.onboard.monitoring.web.connections import (
-    WATCHERS_MAX,
-    ClientConnection,
-    Connections,
-    ConnectionUse,
-)
-from daemon.onboard.monitoring.web.request_filter import CONNECTION
+from daemon.onboard.monitoring.web.watch_admission import WatchAccess, admit_watcher
 
 TICK_S: Final = 0.02
 WINDOW: Final = 6
@@ -34,15 +27,6 @@ WINDOW: Final = 6
 KEEPALIVE_S: Final = 1.0
 """Without a new frame the last one is sent again with its age."""
 SEND_TIMEOUT_S: Final = 5.0
-SUBPROTOCOL: Final = "syntopic.v1"
-
-
-class WatchAccess(Protocol):
-    """Decides who may read; implemented by the application."""
-
-    connections: Connections
-
-    def may_watch(self, http: HTTPConnection) -> bool: ...
 
 
 @dataclass
@@ -111,21 +95,8 @@ def add_guidance(app: FastAPI, state: FlightState, access: WatchAccess, page: Pa
     @app.websocket("/api/v1/guidance")
     async def guidance(socket: WebSocket) -> None:
         """Frames as in docs/reference/flight/guidance.md, until the client disconnects."""
-        if "token" in socket.query_params:
-            await socket.close(1008, "a token belongs into a header, not into the address")
+        if not await admit_watcher(socket, access):
             return
-        if not access.may_watch(socket):
-            await socket.close(1008, "a token is needed")
-            return
-        found = socket.scope.get("state", {}).get(CONNECTION)
-        connection = found if isinstance(found, ClientConnection) else None
-        if not access.connections.may_watch(connection):
-            await socket.close(1013, f"too many clients: {WATCHERS_MAX}")
-            return
-        if connection is not None:
-            connection.enter(ConnectionUse.WATCHER)
-        offered = socket.scope.get("subprotocols", [])
-        await socket.accept(SUBPROTOCOL if SUBPROTOCOL in offered else None)
         window = FrameWindow()
         answers = asyncio.ensure_future(_read_answers(socket, window))
         try:

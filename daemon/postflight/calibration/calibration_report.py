@@ -14,9 +14,11 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 import jinja2
+import numpy as np
+from numpy.typing import NDArray
 from scipy.stats import norm
 
 from daemon import DaemonError
@@ -28,6 +30,9 @@ CALIBRATION_FORMAT: Final = 1
 CALIBRATION_MAX_BYTES: Final = 50_000_000
 FAMILY_ALPHA: Final = 0.01
 """Probability that a comparison of two equal calibrations calls any change significant."""
+
+HIGH_CORRELATION: Final = 0.9
+CORRELATION_ROWS_MAX: Final = 30
 
 Cell = str | float | int | None
 
@@ -83,6 +88,45 @@ class ReportTable:
     headings: tuple[str, ...]
     rows: Sequence[Sequence[Cell]]
     note: str = ""
+
+
+class NamedParameter(Protocol):
+    """An estimated number: of what, and which."""
+
+    @property
+    def where(self) -> str: ...
+
+    @property
+    def what(self) -> str: ...
+
+
+def correlation_table(
+    parameters: Sequence[NamedParameter], covariance: NDArray[np.float64]
+) -> ReportTable:
+    """The pairs of parameters that the measurement hardly separates.
+
+    Args:
+        parameters: names of the rows, n.
+        covariance: (n, n), positive definite.
+
+    Returns:
+        Pairs with a correlation beyond `HIGH_CORRELATION`, the highest first.
+    """
+    spread = np.sqrt(np.diag(covariance))
+    correlation = covariance / spread[:, None] / spread
+    i, j = np.triu_indices(len(parameters), 1)
+    order = np.argsort(-np.abs(correlation[i, j]))
+    high = [k for k in order.tolist() if abs(correlation[i[k], j[k]]) > HIGH_CORRELATION]
+    names = [f"{one.where} {one.what}" for one in parameters]
+    return ReportTable(
+        f"Correlations beyond {HIGH_CORRELATION:g}",
+        ("one", "other", "correlation"),
+        [
+            (names[i[k]], names[j[k]], f"{correlation[i[k], j[k]]:+.3f}")
+            for k in high[:CORRELATION_ROWS_MAX]
+        ],
+        f"{len(high)} of {len(i)} pairs; all of them are in covariance.npz.",
+    )
 
 
 @dataclass(frozen=True)

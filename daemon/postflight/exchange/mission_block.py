@@ -27,7 +27,7 @@ from processing.geometry.forward_distortion import ForwardDistortion
 from processing.geometry.placement import (
     SensorPlacement,
     corrected_mm_from_raw,
-    nominal_placements,
+    head_placement,
 )
 from processing.geometry.rotation import rotation_from_angles
 from processing.geometry.similarity import apply_similarity
@@ -233,13 +233,16 @@ def _raw_head(
         np.linspace(-0.5, sensor.height_px - 0.5, _GRID),
     )
     pixels = np.stack([columns.ravel(), rows.ravel()], axis=1)
-    placed = _placement(cone, sensor, mean, shifts)
+    own = VirtualImage(sensor.width_px, sensor.height_px, sensor.pitch_um, cone.lens.f_mm, 1)
+    placed = head_placement(cone, sensor, own, mean, shifts)
     turn = rotation_from_angles("Z", [placed.similarity.rotation_rad])
     rays = _rays(placed, pixels, turn)
     f_px = cone.lens.f_mm / sensor.pitch_mm
     centre = pixels.mean(axis=0) - f_px * rays.mean(axis=0)
     drift_px = max(
-        float(np.abs(_rays(_placement(cone, sensor, end, shifts), pixels, turn) - rays).max())
+        float(
+            np.abs(_rays(head_placement(cone, sensor, own, end, shifts), pixels, turn) - rays).max()
+        )
         for end in (*ends, mean)
     )
     camera = BlockCamera(
@@ -263,25 +266,3 @@ def _rays(placed: SensorPlacement, pixels: Array, turn: Array) -> Array:
     ideal = apply_similarity(placed.similarity, corrected_mm_from_raw(placed, pixels))
     about = np.column_stack([ideal, np.full(len(ideal), -placed.cone.lens.f_mm)]) @ turn
     return np.column_stack([-about[:, 0] / about[:, 2], about[:, 1] / about[:, 2]])
-
-
-def _placement(
-    cone: Cone, sensor: Sensor, temperatures_c: Mapping[str, float], shifts: int
-) -> SensorPlacement:
-    """The sensor in the perspective of its own cone, without the cone's mounting."""
-    alone = replace(cone, role="pan", rotation_rad=(0.0, 0.0, 0.0), position_mm=(0.0, 0.0, 0.0))
-    image = VirtualImage(sensor.width_px, sensor.height_px, sensor.pitch_um, cone.lens.f_mm, 1)
-    rig = Rig(
-        name=cone.name,
-        title="",
-        timing="synchronous",
-        frame_interval_s=1.0,
-        master_cone=cone.name,
-        colour_master_cone=None,
-        reference_cone=cone.name,
-        calibration_id="",
-        calibration_date="",
-        virtual_image=image,
-        cones=(alone,),
-    )
-    return nominal_placements(rig, temperatures_c, {sensor.name: shifts})[sensor.name]

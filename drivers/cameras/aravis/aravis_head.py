@@ -526,7 +526,3 @@ class AravisHead(AravisSettings, HeadDevice):
             session.stream.close()
             session.camera.release()
             gc.collect()
-
-
-def _rate_text(rate_mbps: float | None) -> str:
-    return "" if rate_mbps is None else f"{rate_mbps:g} Mbit/s"

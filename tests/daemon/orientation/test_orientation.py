@@ -34,23 +34,11 @@ from daemon.postflight.export.orientation_set import export_orientation
 from drivers.contract import NavSample
 from processing.geometry.rotation import rotation_matrix as r
 from processing.rig import load_rig, shipped_rigs
-from sim_hw.world.flight import FlightPlan, SimulatedFlight, enu_from_body
+from sim_hw.world.flight import enu_from_body
 from sim_hw.world.true_camera import BODY_FROM_CAMERA, projection_centre_m
+from tests.daemon.postflight.exchange.flown_block import EPOCH_NS, FLIGHT, PLAN
 
-EPOCH_NS = 1_479_300_000_000_000_000
 STEP_NS = 100_000_000
-# Where the UTM grid is as long as the ground, 180 km east of its meridian; north leans by 1.7 deg.
-PLAN = FlightPlan(
-    height_m=1000.0,
-    ground_speed_mps=60.0,
-    line_length_m=2000.0,
-    line_spacing_m=500.0,
-    heading_deg=37.0,
-    latitude_deg=47.07,
-    longitude_deg=17.37,
-    attitude_rms_deg=2.0,
-)
-FLIGHT = SimulatedFlight(PLAN, seed=3, epoch_gps_ns=EPOCH_NS)
 MID_NS = EPOCH_NS + 5_034_567_890
 ANTENNA_M = (0.4, -0.2, -1.3)
 BORESIGHT_DEG = (0.21, -0.13, 0.35)

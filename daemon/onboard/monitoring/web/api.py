@@ -43,15 +43,13 @@ from daemon.onboard.monitoring.metrics import exposition
 from daemon.onboard.monitoring.plan_routes import add_plan
 from daemon.onboard.monitoring.telemetry import MIN_BYTES_PER_S, Subscription, packed
 from daemon.onboard.monitoring.web.connections import (
-    WATCHERS_MAX,
-    ClientConnection,
     Connections,
-    ConnectionUse,
     source_of,
 )
 from daemon.onboard.monitoring.web.page_files import PAGE, add_security_headers
 from daemon.onboard.monitoring.web.request_body import COMMAND_OPENAPI, command_body
-from daemon.onboard.monitoring.web.request_filter import CONNECTION, bearer_token
+from daemon.onboard.monitoring.web.request_filter import bearer_token
+from daemon.onboard.monitoring.web.watch_admission import admit_watcher, connection_of
 
 PROBLEM_JSON = "application/problem+json"
 TELEMETRY_TICK_S = 0.05
@@ -61,7 +59,6 @@ SEND_TIMEOUT_S = 5.0
 LEAST_COMMAND = "arm"
 """A command with the lowest required role."""
 
-SUBPROTOCOL = "syntopic.v1"
 """Subprotocol that a browser offers for telemetry, in addition to its token."""
 
 IMAGES = {
@@ -221,7 +218,7 @@ class _AccessControl:
                 raise HTTPException(429, "too many wrong tokens from this address; wait a minute")
             self._attempts.failed(source, now_s)
             raise HTTPException(401, "token rejected", {"WWW-Authenticate": "Bearer"})
-        connection = _connection(http)
+        connection = connection_of(http)
         if connection is not None:
             connection.is_authenticated = True
         return holder
@@ -377,20 +374,8 @@ def _add_telemetry(app: FastAPI, state: FlightState, access: _AccessControl) -> 
 
         The first record holds the complete state.
         """
-        if "token" in socket.query_params:
-            await socket.close(1008, "a token belongs into a header, not into the address")
+        if not await admit_watcher(socket, access):
             return
-        if not access.may_watch(socket):
-            await socket.close(1008, "a token is needed")
-            return
-        connection = _connection(socket)
-        if not access.connections.may_watch(connection):
-            await socket.close(1013, f"too many clients: {WATCHERS_MAX}")
-            return
-        if connection is not None:
-            connection.enter(ConnectionUse.WATCHER)
-        offered = socket.scope.get("subprotocols", [])
-        await socket.accept(SUBPROTOCOL if SUBPROTOCOL in offered else None)
         # JSON clients fetch pictures over HTTP.
         parts = PARTS if form == "json" else (*PARTS, *PREVIEW_PARTS)
         subscription = Subscription(max(bytes_per_s, MIN_BYTES_PER_S), parts)
@@ -471,9 +456,3 @@ def _title(status: int) -> str:
 
 def _address(http: HTTPConnection) -> str:
     return http.client.host if http.client else ""
-
-
-def _connection(http: HTTPConnection) -> ClientConnection | None:
-    """The TCP connection it came on; None in tests without a server."""
-    found = http.scope.get("state", {}).get(CONNECTION)
-    return found if isinstance(found, ClientConnection) else None

@@ -21,6 +21,7 @@ from daemon.postflight.calibration.calibration_report import (
     Quantity,
     ReportTable,
     changes_between,
+    correlation_table,
     serial_warnings,
 )
 from daemon.postflight.calibration.laboratory.laboratory_series import part_serials
@@ -36,8 +37,6 @@ from processing.rig import Cone, Rig
 Array = NDArray[np.float64]
 
 KIND: Final = "board"
-HIGH_CORRELATION: Final = 0.9
-_MAX_PAIRS: Final = 30
 _UNITS: Final = {
     "k1": "mm^-2",
     "k2": "mm^-4",
@@ -240,7 +239,7 @@ def board_report(
         warnings=warnings,
         tables=[
             _parameters(rows, quantities),
-            _correlated(rows, covariance_of(found, rows)),
+            correlation_table(rows, covariance_of(found, rows)),
             _coverage(findings),
             _focus(findings),
         ],
@@ -356,27 +355,6 @@ def _parameters(rows: Sequence[BoardParameter], quantities: Sequence[Quantity]) 
         ],
         "x, y: centre of the sensor about the principal point; f: principal distance; the others "
         "after Heier et al. (2002), eq. 5.1, ideal from measured.",
-    )
-
-
-def _correlated(rows: Sequence[BoardParameter], covariance: Array) -> ReportTable:
-    spread = np.sqrt(np.diag(covariance))
-    correlation = covariance / spread[:, None] / spread
-    i, j = np.triu_indices(len(rows), 1)
-    order = np.argsort(-np.abs(correlation[i, j]))
-    high = [k for k in order.tolist() if abs(correlation[i[k], j[k]]) > HIGH_CORRELATION]
-    return ReportTable(
-        f"Correlations beyond {HIGH_CORRELATION:g}",
-        ("one", "other", "correlation"),
-        [
-            (
-                f"{rows[i[k]].where} {rows[i[k]].what}",
-                f"{rows[j[k]].where} {rows[j[k]].what}",
-                f"{correlation[i[k], j[k]]:+.3f}",
-            )
-            for k in high[:_MAX_PAIRS]
-        ],
-        f"{len(high)} of {len(i)} pairs; all of them are in covariance.npz.",
     )
 
 

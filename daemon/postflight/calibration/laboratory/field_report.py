@@ -17,6 +17,7 @@ from daemon.postflight.calibration.calibration_report import (
     Previous,
     Quantity,
     ReportTable,
+    correlation_table,
 )
 from daemon.postflight.calibration.laboratory.calibration_field import RigCalibration
 from daemon.postflight.calibration.laboratory.field_network import LENS_FREE
@@ -30,9 +31,7 @@ from processing.rig import Rig
 
 Array = NDArray[np.float64]
 
-HIGH_CORRELATION: Final = 0.9
 _CELLS: Final = (16, 12)
-_MAX_PAIRS: Final = 30
 
 _KINDS: Final = {
     "shift-x": ("x", "um", 1e3),
@@ -191,7 +190,7 @@ def field_report(
             "each cone not turned, the master cone not rotated.",
         ],
         warnings=warnings,
-        tables=[_parameters(rows, sigma), _correlated(rows, covariance), _cones(found)],
+        tables=[_parameters(rows, sigma), correlation_table(rows, covariance), _cones(found)],
         plots=_plots(found, rows, covariance),
     )
     return of_series(
@@ -222,27 +221,6 @@ def _parameters(rows: Sequence[EstimatedParameter], sigma: Array) -> ReportTable
         ],
         "Places and rotations of CCDs in their layers, scale less one, skew: x, y of a CCD about "
         "its centre times (1 + skew x u + skew y v).",
-    )
-
-
-def _correlated(rows: Sequence[EstimatedParameter], covariance: Array) -> ReportTable:
-    spread = np.sqrt(np.diag(covariance))
-    correlation = covariance / spread[:, None] / spread
-    i, j = np.triu_indices(len(rows), 1)
-    order = np.argsort(-np.abs(correlation[i, j]))
-    high = [k for k in order.tolist() if abs(correlation[i[k], j[k]]) > HIGH_CORRELATION]
-    return ReportTable(
-        f"Correlations beyond {HIGH_CORRELATION:g}",
-        ("one", "other", "correlation"),
-        [
-            (
-                f"{rows[i[k]].where} {rows[i[k]].what}",
-                f"{rows[j[k]].where} {rows[j[k]].what}",
-                f"{correlation[i[k], j[k]]:+.3f}",
-            )
-            for k in high[:_MAX_PAIRS]
-        ],
-        f"{len(high)} of {len(i)} pairs; all of them are in covariance.npz.",
     )
 
 

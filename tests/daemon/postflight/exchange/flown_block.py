@@ -22,6 +22,7 @@ from sim_hw.world.flight import FlightPlan, SimulatedFlight
 from sim_hw.world.true_camera import BODY_FROM_CAMERA, TrueCamera, projection_centre_m
 
 EPOCH_NS = 1_479_300_000_000_000_000
+# Where the UTM grid is as long as the ground, 180 km east of its meridian; north leans by 1.7 deg.
 PLAN = FlightPlan(
     height_m=1000.0,
     ground_speed_mps=60.0,
