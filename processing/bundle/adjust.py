@@ -39,12 +39,15 @@ from processing.bundle.normal_equations import ReducedEquations, cofactor_matrix
 from processing.bundle.rank_diagnosis import RankDefect, rank_defects
 from processing.bundle.robust_weights import WeightFunction, robust_exclusions
 from processing.bundle.statistics import ObservationGroup, groups_of, spread_of
+from processing.bundle.step_control import points_in_front
 from processing.bundle.undetermined_points import undetermined_points
 from processing.bundle.unknowns import ParameterLayout, ParameterValues, initial_values, layout_of
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
+_MIN_POINTS: Final = 4
+_MIN_SHARE: Final = 0.3
 _MAX_COMPONENT_ROUNDS: Final = 12
 _COMPONENT_CONVERGED: Final = 0.02
 
@@ -72,7 +75,7 @@ class AdjustmentSettings:
         datum_names: the points and stations of those inner constraints; empty: all.
     """
 
-    max_iterations: int = 30
+    max_iterations: int = 50
     robust: bool = False
     weight_function: WeightFunction = "huber"
     reject_beyond: float | None = None
@@ -190,7 +193,7 @@ def adjust(
     settings = settings or AdjustmentSettings()
     _validate_settings(settings)
     selection = _Selection(network, nothing_excluded(network), nothing_excluded(network))
-    state = initial_values(network)
+    state = points_in_front(network, initial_values(network))
     report_progress = progress or (lambda _what, _iteration, _value: None)
     history: list[float] = []
     robust = settings.robust
@@ -220,6 +223,7 @@ def adjust(
         except WeakPointsError as error:
             weak[error.points] = True
             state = run.state
+            _refuse_without_points(active, weak)
             report_progress(f"weak points set aside: {int(weak.sum())}", len(history), history[-1])
             continue
         state = run.state
@@ -234,6 +238,20 @@ def adjust(
                 tests=selection.tests,
             )
         report_progress(what, selection.rounds, history[-1])
+
+
+def _refuse_without_points(network: Network, weak: Flags) -> None:
+    """Refuse a block of which nearly parallel rays leave next to no object points."""
+    seen = np.unique(network.image_points.point)
+    left = int((~weak[seen]).sum())
+    if left < max(_MIN_POINTS, _MIN_SHARE * len(seen)):
+        raise NetworkError(
+            [
+                f"rays are nearly parallel: {len(seen) - left} of {len(seen)} object points have "
+                "no place in front of the cameras; images with larger distances between them, or "
+                "better starting values, are needed"
+            ]
+        )
 
 
 def _validate_settings(settings: AdjustmentSettings) -> None:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from processing.bundle.adjust import Adjustment
 from processing.bundle.network import INTERIOR
+from processing.bundle.normal_equations import point_normals
 from processing.bundle.terms import UNITS
 from processing.geometry.rotation import angles_by_rotation_vector, omega_phi_kappa
 
@@ -21,6 +22,7 @@ Array = NDArray[np.float64]
 
 HIGH_CORRELATION = 0.95
 SIGNIFICANT_T = 2.0
+NARROW_DEG = 1.0
 
 
 @dataclass(frozen=True)
@@ -242,6 +244,30 @@ def control_residuals(result: Adjustment) -> PointDifferences:
         sigma[rows],
         float(np.nanmean(weighted**2)) if weighted.size else math.nan,
     )
+
+
+def narrow_points(
+    result: Adjustment, below_deg: float = NARROW_DEG
+) -> tuple[tuple[str, float], ...]:
+    """Object points whose rays are nearly parallel: their depth is hardly determined.
+
+    Args:
+        result: the adjustment.
+        below_deg: angle between rays, degrees.
+
+    Returns:
+        Name and angle of two rays that fix a depth as well, degrees, narrowest first.
+
+    Source: docs/explanation/mathematics/bundle.md#points-of-nearly-parallel-rays.
+    """
+    values = np.linalg.eigvalsh(point_normals(result.equations, result.layout))
+    points = result.layout.eliminated_points
+    free = ~result.layout.locked[points].any(axis=1) & ~result.network.points.at_infinity[points]
+    share = np.clip(values[:, 0] / np.maximum(values[:, 2], 1e-300), 0.0, 1.0)
+    angle = np.degrees(2.0 * np.arctan(np.sqrt(share)))
+    own = np.flatnonzero(free & (angle < below_deg))
+    own = own[np.argsort(angle[own], kind="stable")]
+    return tuple((result.network.points.names[points[k]], float(angle[k])) for k in own)
 
 
 def image_residuals_mm(result: Adjustment) -> Array:

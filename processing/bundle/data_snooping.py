@@ -29,6 +29,8 @@ _AMBIGUOUS: Final = 9.0
 """Difference of squared sizes below which two image points of an object point explain its
 contradiction alike: three standard deviations."""
 
+_EQUAL_DECIMALS: Final = 4
+
 _AXES: Final = ("X", "Y", "Z")
 _ROTATIONS: Final = ("about x", "about y", "about z")
 
@@ -220,7 +222,7 @@ def contradicted(
     around = largest.surroundings(np.maximum(in_image, largest.of_image), of_point)
     beyond_other = single[other] > limit
     chosen = other[beyond_other & (single[other] >= around)]
-    chosen = _largest_of_lines(network, rows, chosen, single)
+    chosen = _largest_of_lines(network, rows, chosen, single, redundancy_number)
     for flags, groups in zip(worst._tables()[1:], _GROUPS_OF, strict=True):
         own = chosen[np.isin(rows.group[chosen], groups)]
         flags[rows.source[own], rows.axis[own]] = True
@@ -326,12 +328,18 @@ def _where(flags: Flags) -> list[tuple[int, int]]:
     return [(int(k), int(axis)) for k, axis in np.argwhere(flags)]
 
 
-def _largest_of_lines(network: Network, rows: Equations, chosen: Indices, size: Array) -> Indices:
-    """Without GNSS positions that another of their line surpasses: they share shift and drift."""
+def _largest_of_lines(
+    network: Network, rows: Equations, chosen: Indices, size: Array, redundancy_number: Array
+) -> Indices:
+    """Without GNSS positions that another of their line surpasses: they share shift and drift.
+
+    With one redundant position the tests of a line are equal; the best controlled goes.
+    """
     line = np.full(len(chosen), -1, dtype=np.int64)
     own = np.isin(rows.group[chosen], _GROUPS_OF[1])
     line[own] = network.gnss.line[rows.source[chosen[own]]]
-    first = np.lexsort((-size[chosen], line))
+    with_share = np.round(size[chosen], _EQUAL_DECIMALS), redundancy_number[chosen]
+    first = np.lexsort((-with_share[1], -with_share[0], line))
     _, begin = np.unique(line[first], return_index=True)
     largest = np.isin(np.arange(len(chosen)), first[begin])
     return chosen[(line < 0) | largest]

@@ -1,4 +1,4 @@
-"""Gauss-Newton iterations of a network: steps that always lower the sum of squares.
+"""Gauss-Newton iterations of a network, damped where a step does not lower the sum of squares.
 
 The selection of observations is in `adjust`, robust weights are in `robust_weights`.
 """
@@ -25,7 +25,16 @@ from processing.bundle.normal_equations import (
     solve,
 )
 from processing.bundle.rank_diagnosis import RankDefectError, rank_defects
-from processing.bundle.unknowns import ParameterLayout, ParameterValues, apply_corrections
+from processing.bundle.step_control import (
+    RECIPROCAL_BELOW,
+    Damping,
+    Rays,
+    held_depths,
+    lowering_step,
+    rays_of,
+    weakest_share,
+)
+from processing.bundle.unknowns import ParameterLayout, ParameterValues
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -40,15 +49,10 @@ _OBJECTIVE_CONVERGED: Final = 1e-10
 _SLOW_CONVERGED: Final = 1e-6
 """After the last iteration: every unknown is within a thousandth of its a priori sigma."""
 
-_MAX_HALVINGS: Final = 12
-_WEAK_AFTER: Final = 12
-"""Iterations after which a point with rays that are nearly parallel is set aside if it moves."""
-
 _WEAK_INFORMATION: Final = 1e-3
 """Smallest over largest eigenvalue of a point's normal matrix: rays about 3 degrees apart."""
 
 _FLAT: Final = 1e-12
-_MAX_OWN_SHARE: Final = 0.1
 _WEAK_MOVE: Final = 1e-3
 """Correction of a point over its distance from a camera that saw it."""
 
@@ -101,24 +105,30 @@ def iterate(run: Run) -> tuple[Equations, ReducedEquations]:
         RankDefectError: directions without information.
         WeakPointsError: object points that keep the others from converging.
     """
+    damping = Damping()
+    rays = rays_of(run.network, run.layout)
     for iteration in range(run.max_iterations + 1):
         rows = front(run, run.state)
         objective = float(rows.misclosure @ rows.misclosure)
         run.history.append(objective)
         run.report_progress("iteration", iteration, objective)
-        _refuse_flat(run, rows)
-        reduced = reduced_equations(rows, run.layout)
-        step = solved(run, reduced)
-        if step.predicted_decrease <= max(_CONVERGED * objective, _OBJECTIVE_CONVERGED):
+        trial = _Trial(run, rows, rays)
+        reduced, step = trial.step(damping.value)
+        small = max(_CONVERGED * objective, _OBJECTIVE_CONVERGED)
+        if damping.value > 0.0 and step.predicted_decrease <= 1e6 * small:
+            damping.value = 0.0
+            reduced, step = trial.step(0.0)
+        slow = iteration == run.max_iterations and step.predicted_decrease <= _SLOW_CONVERGED
+        if step.predicted_decrease <= small or slow:
+            trial.refuse_held()
             return rows, reduced
-        if iteration >= min(_WEAK_AFTER, run.max_iterations):
-            _refuse_moving(run, rows, step.dpoints)
-        if iteration == run.max_iterations and step.predicted_decrease <= _SLOW_CONVERGED:
-            return rows, reduced
-        run.state = take_step(run, step.dx, step.dpoints, objective, step.predicted_decrease)
+        if iteration == run.max_iterations:
+            trial.refuse_moving(step.dpoints)
+        elif not trial.take(step, damping):
+            break
     raise NetworkError(
         [
-            f"no convergence after {run.max_iterations} iterations; starting values are "
+            f"no convergence after {len(run.history) - 1} iterations; starting values are "
             "far off, or blunders too large: try robust weights"
         ]
     )
@@ -175,75 +185,81 @@ def front(run: Run, state: ParameterValues) -> Equations:
         ) from None
 
 
-def take_step(
-    run: Run, dx: Array, dpoints: Array, objective: float, predicted_decrease: float
-) -> ParameterValues:
-    """The full step, or shorter ones of single points or of all until the sum of squares falls.
+class _Trial:
+    """Steps from one state: their reduced equations, and the points that must not move freely."""
+
+    def __init__(self, run: Run, rows: Equations, rays: Rays) -> None:
+        self._run, self._rows, self._rays = run, rows, rays
+        normals = point_normals(rows, run.layout)
+        self._share = weakest_share(normals)
+        self._reciprocal = rays.free & (self._share < RECIPROCAL_BELOW)
+        self._held = held_depths(rows, run.layout, run.state, rays, normals)
+        flat = (self._share <= _FLAT) & ~self._held.any(axis=1)
+        if flat.any():
+            raise WeakPointsError(run.layout.eliminated_points[flat])
+
+    def step(self, damping: float) -> tuple[ReducedEquations, GaussNewtonStep]:
+        """Reduced equations with damping, and the corrections."""
+        held = self._held if self._held.any() else None
+        reduced = reduced_equations(self._rows, self._run.layout, damping, held)
+        return reduced, solved(self._run, reduced)
+
+    def take(self, step: GaussNewtonStep, damping: Damping) -> bool:
+        """Take the step, or a damped one that lowers the sum of squares; whether there is one."""
+        run = self._run
+        objective = float(self._rows.misclosure @ self._rows.misclosure)
+        while True:
+            found = lowering_step(
+                lambda state: run.rows(state, derivatives=False),
+                run.network,
+                run.layout,
+                run.state,
+                step,
+                self._rays,
+                self._reciprocal,
+                self._rows,
+            )
+            if found is not None:
+                run.state, value = found
+                damping.adapt(objective - value, step.predicted_decrease)
+                return True
+            if not damping.raise_():
+                return False
+            _, step = self.step(damping.value)
+
+    def refuse_held(self) -> None:
+        """Points whose rays meet nowhere in front of the cameras."""
+        held = self._held.any(axis=1)
+        if held.any():
+            raise WeakPointsError(self._run.layout.eliminated_points[held])
+
+    def refuse_moving(self, dpoints: Array) -> None:
+        """Points of nearly parallel rays that still move."""
+        points = self._run.layout.eliminated_points
+        mean, _ = self._rays.centres(self._run.state)
+        distance = np.linalg.norm(self._run.state.points[points] - mean, axis=1)
+        moving = np.linalg.norm(dpoints, axis=1) > _WEAK_MOVE * distance
+        weak = self._rays.free & moving & (self._share < _WEAK_INFORMATION)
+        if weak.any():
+            raise WeakPointsError(points[weak])
+
+
+def robust_step(run: Run, rows: Equations, damping: Damping) -> GaussNewtonStep:
+    """Take one damped step of a run whose weights change.
 
     Args:
-        run: variables of the adjustment; not changed.
-        dx: corrections of the columns, shape (c,).
-        dpoints: corrections of the eliminated points, shape (p, 3), m.
-        objective: sum of squares before the step.
-        predicted_decrease: by the linear model.
+        run: variables of the adjustment; its state is changed if a step lowers the sum of squares.
+        rows: at the state.
+        damping: is adapted.
 
     Returns:
-        The state after the step.
+        The step of the linear model.
+
+    Raises:
+        RankDefectError: directions without information.
+        WeakPointsError: object points without information in a direction.
     """
-    length = 1.0
-    own = np.ones(len(dpoints))
-    before = _by_point(run, run.rows(run.state, derivatives=False))
-    for _ in range(_MAX_HALVINGS):
-        state = apply_corrections(run.state, run.layout, length * dx, own[:, None] * dpoints)
-        try:
-            rows = run.rows(state, derivatives=False)
-        except BehindCameraError as error:
-            who = run.layout.eliminated[run.network.image_points.point[error.image_points]]
-            behind = np.unique(who[who >= 0])
-            own[behind] *= 0.5
-            if not len(behind) or len(behind) > _MAX_OWN_SHARE * len(own):
-                length, own = 0.5 * length, 0.5 * own
-            continue
-        value = float(rows.misclosure @ rows.misclosure)
-        if (
-            value <= objective - 1e-4 * length * predicted_decrease
-            or predicted_decrease < 1e-7 * objective
-        ):
-            return state
-        # A point that a few rays fix badly must not shorten the step of all others.
-        worse = _by_point(run, rows) > before + 0.5 * (value - objective)
-        if 0 < worse.sum() <= _MAX_OWN_SHARE * len(own) and value > objective:
-            own[worse] *= 0.5
-        else:
-            length, own = 0.5 * length, 0.5 * own
-    return state
-
-
-def _by_point(run: Run, rows: Equations) -> Array:
-    """Sum of squares of the rows of each eliminated point."""
-    there = rows.point >= 0
-    squares = rows.misclosure[there] ** 2
-    count = len(run.layout.eliminated_points)
-    return np.bincount(rows.point[there], weights=squares, minlength=count).astype(np.float64)
-
-
-def _refuse_flat(run: Run, rows: Equations) -> None:
-    """Points that have no information left in a direction, to working precision."""
-    values = np.linalg.eigvalsh(point_normals(rows, run.layout))
-    flat = values[:, 0] <= _FLAT * values[:, 2]
-    if flat.any():
-        raise WeakPointsError(run.layout.eliminated_points[flat])
-
-
-def _refuse_moving(run: Run, rows: Equations, dpoints: Array) -> None:
-    """Points of nearly parallel rays that still move, if they are few."""
-    points = run.layout.eliminated_points
-    values = np.linalg.eigvalsh(point_normals(rows, run.layout))
-    table, images = run.network.image_points, run.network.images
-    distance = np.full(len(run.layout.locked), np.inf)
-    ray = run.state.points[table.point] - run.state.station[images.station[table.image]]
-    np.minimum.at(distance, table.point, np.linalg.norm(ray, axis=1))
-    moving = np.linalg.norm(dpoints, axis=1) > _WEAK_MOVE * distance[points]
-    weak = moving & (values[:, 0] < _WEAK_INFORMATION * values[:, 2])
-    if weak.any():
-        raise WeakPointsError(points[weak])
+    trial = _Trial(run, rows, rays_of(run.network, run.layout))
+    _, step = trial.step(damping.value)
+    trial.take(step, damping)
+    return step

@@ -25,6 +25,7 @@ MAX_COLUMNS = 15_000
 """Beyond this the reduced matrix takes more than 1.7 GiB."""
 
 _DENSE_FILL = 0.04
+_HELD_WEIGHT = 1e6
 MIN_INFORMATION = 1e-11
 """Of the reduced matrix over the diagonal it had before points were eliminated; a datum defect
 leaves 1e-14."""
@@ -53,6 +54,8 @@ class ReducedEquations:
         point_right: (3p,) right-hand side of the orthonormal point unknowns.
         sparse_columns, dense_columns: which columns are which.
         design_sparse, design_dense: the rows themselves, split.
+        damping: share of the diagonal that was added to it.
+        point_diagonal: (p, 3) that diagonal of the points.
     """
 
     matrix: Array
@@ -67,6 +70,8 @@ class ReducedEquations:
     dense_columns: Indices
     design_sparse: sparse.csr_array
     design_dense: Array
+    damping: float
+    point_diagonal: Array
 
 
 @dataclass(frozen=True)
@@ -105,12 +110,20 @@ def point_normals(equations: Equations, layout: ParameterLayout) -> Array:
     return result
 
 
-def reduced_equations(equations: Equations, layout: ParameterLayout) -> ReducedEquations:
+def reduced_equations(
+    equations: Equations,
+    layout: ParameterLayout,
+    damping: float = 0.0,
+    held: Array | None = None,
+) -> ReducedEquations:
     """Eliminate the points.
 
     Args:
         equations: the rows.
         layout: their columns and points.
+        damping: share of the diagonal that is added to it (Levenberg-Marquardt).
+        held: directions in which points do not move, times the root of their information, shape
+            (p, 3), zero where there is none; None: all zero.
 
     Returns:
         Normal equations of the columns, with what leads back to the points.
@@ -132,7 +145,12 @@ def reduced_equations(equations: Equations, layout: ParameterLayout) -> ReducedE
     design_sparse = by_column[:, thin].tocsr()
     design_dense = by_column[:, dense].toarray()
 
-    factor = np.linalg.inv(np.linalg.cholesky(point_normals(equations, layout)))
+    normals = point_normals(equations, layout)
+    of_points = normals[:, range(3), range(3)].copy()
+    normals[:, range(3), range(3)] += damping * of_points
+    if held is not None:
+        normals += _HELD_WEIGHT * held[:, :, None] * held[:, None, :]
+    factor = np.linalg.inv(np.linalg.cholesky(normals))
     factor = np.swapaxes(factor, 1, 2)
     at = np.clip(equations.point, 0, None)
     if points:
@@ -162,6 +180,7 @@ def reduced_equations(equations: Equations, layout: ParameterLayout) -> ReducedE
     matrix[np.ix_(thin, dense)] = cross
     matrix[np.ix_(dense, thin)] = cross.T
     matrix[np.ix_(dense, dense)] = own_dense
+    matrix[range(columns), range(columns)] += damping * diagonal
     right = np.zeros(columns)
     right[thin] = design_sparse.T @ equations.misclosure - coupling_sparse.T @ point_right
     right[dense] = design_dense.T @ equations.misclosure - coupling_dense.T @ point_right
@@ -178,6 +197,8 @@ def reduced_equations(equations: Equations, layout: ParameterLayout) -> ReducedE
         dense_columns=dense,
         design_sparse=design_sparse,
         design_dense=design_dense,
+        damping=damping,
+        point_diagonal=of_points,
     )
 
 
@@ -257,6 +278,10 @@ def solve(
     )
     dpoints = np.einsum("pij,pj->pi", reduced.point_factor, back.reshape(-1, 3))
     predicted_decrease = float(reduced.right @ dx + reduced.point_right @ reduced.point_right)
+    if reduced.damping > 0.0:
+        added = float((reduced.scale * dx) @ (reduced.scale * dx))
+        added += float((reduced.point_diagonal * dpoints**2).sum())
+        predicted_decrease += reduced.damping * added
     return GaussNewtonStep(dx, dpoints, predicted_decrease)
 
 

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from processing.bundle.data_snooping import Excluded, nothing_excluded
 from processing.bundle.equations import Equations
-from processing.bundle.gauss_newton import Run, front, solved, take_step
+from processing.bundle.gauss_newton import Run, front, robust_step
 from processing.bundle.network import Network
-from processing.bundle.normal_equations import reduced_equations
+from processing.bundle.step_control import Damping
 
 Array = NDArray[np.float64]
 WeightFunction = Literal["huber", "cauchy", "tukey", "danish"]
@@ -105,13 +105,12 @@ def robust_exclusions(run: Run, function: WeightFunction) -> Excluded:
 def _iterate(run: Run, plain: Network, function: WeightFunction, taken: Array) -> tuple[Array, ...]:
     """Renew weights at every iteration until they stay; sizes of all residuals by table."""
     sizes: tuple[Array, ...] = ()
+    damping = Damping()
     for iteration in range(run.max_iterations):
         rows = front(run, run.state)
         objective = float(rows.misclosure @ rows.misclosure)
         run.report_progress("robust iteration", iteration, objective)
-        reduced = reduced_equations(rows, run.layout)
-        step = solved(run, reduced)
-        run.state = take_step(run, step.dx, step.dpoints, objective, step.predicted_decrease)
+        step = robust_step(run, rows, damping)
         unweighted = replace(run, network=plain, weight=taken)
         sizes = _sizes(plain, unweighted.rows(run.state, derivatives=False))
         weights = [np.maximum(weight_of(function, size), _LEAST) for size in sizes]

@@ -37,7 +37,7 @@ class AdjustSection(_ProjectSection):
     minimum_norm: bool = False
     free_datum: FreeDatum = "unknowns"
     datum_names: tuple[str, ...] = ()
-    max_iterations: int = Field(default=30, ge=1, le=1000)
+    max_iterations: int = Field(default=50, ge=1, le=1000)
     image_sigma_um: float = Field(default=1.0, gt=0.0)
     gnss: Literal["none", "shift", "linear"] = "none"
     earth_radius_m: float | None = Field(default=None, gt=1e6)

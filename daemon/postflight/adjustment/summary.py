@@ -16,10 +16,12 @@ from daemon.postflight.adjustment.reliability_report import reliability_summary,
 from daemon.terminal.console import Console, light_table
 from processing.bundle.adjust import Adjustment
 from processing.bundle.adjustment_results import (
+    NARROW_DEG,
     PointDifferences,
     check_point_differences,
     control_residuals,
     heads_of,
+    narrow_points,
     parameters_of,
 )
 from processing.bundle.data_snooping import names_of
@@ -118,6 +120,9 @@ def report_of(
             "problems": result.problems,
             "reliability": reliability_summary(result),
             "left_out": [network.points.names[k] for k in np.flatnonzero(result.left_out)],
+            "narrow_points": [
+                {"point": name, "angle_deg": angle} for name, angle in narrow_points(result)
+            ],
             "not_determined": [d.sentence for d in result.rank_defects],
         }
     )
@@ -223,6 +228,17 @@ def print_report(console: Console, report: Mapping[str, Any]) -> None:
         console.print(
             f"{len(report['left_out'])} object points that their rays do not fix: {listed}",
             markup=False,
+        )
+    if report["narrow_points"]:
+        listed = ", ".join(
+            f"{p['point']} ({p['angle_deg']:.2g} deg)"
+            for p in report["narrow_points"][:_MAX_LISTED]
+        )
+        console.print(
+            f"{len(report['narrow_points'])} object points have rays less than {NARROW_DEG:g} "
+            f"degree apart, their depth is weak: {listed}",
+            markup=False,
+            highlight=False,
         )
     for sentence in report["problems"]:
         console.print(sentence, style="red", markup=False, highlight=False)
