@@ -11,6 +11,7 @@ from rich.progress import Progress
 
 from daemon.cli.exit_status import exit_if_failed
 from daemon.cli.export_block import BLOCK_HELP, block
+from daemon.cli.export_gis import GIS_HELP, STAC_HELP, gis, stac
 from daemon.cli.export_gnss import RINEX_HELP, TRAJECTORY_HELP, rinex, trajectory
 from daemon.cli.options import AsJson
 from daemon.terminal.console import Console, light_table
@@ -66,6 +67,8 @@ def export() -> None:
 
 
 app.command("block", help=BLOCK_HELP)(block)
+app.command("stac", help=STAC_HELP)(stac)
+app.command("gis", help=GIS_HELP)(gis)
 app.command("rinex", help=RINEX_HELP)(rinex)
 app.command("trajectory", help=TRAJECTORY_HELP)(trajectory)
 

@@ -1,4 +1,4 @@
-"""Ground footprints of images, as GeoJSON and as STAC items.
+"""Ground footprints of images, as GeoJSON.
 
 Rays are followed to level ground in the local east, north, up of the projection centre; relief and
 the curvature of the earth (8 cm at 1 km) are left out. `rings_on_terrain` follows them to the
@@ -16,7 +16,6 @@ import numpy as np
 
 from daemon.configuration.model import MountSection
 from daemon.mission.exposure import NavigationRecord
-from daemon.mission.layout import Mission
 from daemon.orientation.exterior_orientation import ExteriorOrientation
 from daemon.orientation.georeference import Georeference
 from daemon.orientation.local_frame import LocalFrame
@@ -33,13 +32,6 @@ ALONG_EDGE = 8
 Ring = Sequence[tuple[float, float]]
 
 GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC)
-STAC_VERSION = "1.0.0"
-ASSETS = {
-    "pan.tif": ("image/tiff", "panchromatic", ["data"]),
-    "rgbn.tif": ("image/tiff", "colour", ["data"]),
-    "quicklook.jpg": ("image/jpeg", "quick look", ["thumbnail"]),
-    "quality.json": ("application/json", "quality report", ["metadata"]),
-}
 
 
 def footprint(
@@ -141,77 +133,17 @@ def geojson(
             "simulated": simulated,
         }
         ring = footprint(eo, rig, ground_m) if rings is None else rings.get(eo.name)
-        geometry = _polygon(ring)
+        geometry = polygon(ring)
         features.append({"type": "Feature", "geometry": geometry, "properties": properties})
     return {"type": "FeatureCollection", "features": features}
 
 
-def stac_items(
-    mission: Mission,
-    oriented: Sequence[ExteriorOrientation],
-    rig: Rig,
-    ground_m: float,
-    *,
-    simulated: bool,
-    base_href: str,
-) -> dict[str, Any]:
-    """A STAC ItemCollection of the stitched images there are, with links to their files.
-
-    Args:
-        base_href: from the collection's folder to the mission folder.
-    """
-    items = []
-    for eo in oriented:
-        corners = footprint(eo, rig, ground_m)
-        folder = mission.level2(eo.exposure)
-        if not eo.is_virtual or corners is None:
-            continue
-        longitudes, latitudes = zip(*corners, strict=True)
-        items.append(
-            {
-                "type": "Feature",
-                "stac_version": STAC_VERSION,
-                "stac_extensions": [],
-                "id": f"{mission.id}-{eo.name}",
-                "geometry": _polygon(corners),
-                "bbox": [min(longitudes), min(latitudes), max(longitudes), max(latitudes)],
-                "properties": {
-                    "datetime": utc_text(eo.gps_ns),
-                    "platform": "aircraft",
-                    "instruments": [rig.name],
-                    "gsd": ground_sample_m(eo, rig, ground_m),
-                    "syntopic:off_nadir_deg": _off_nadir_deg(eo),
-                    "syntopic:exposure": eo.exposure,
-                    "syntopic:line": eo.line_id,
-                    "syntopic:strip": eo.strip_id,
-                    "syntopic:simulated": simulated,
-                },
-                "links": [],
-                "assets": {
-                    name.split(".")[0]: {
-                        "href": f"{base_href}/L2/{folder.name}/{name}",
-                        "type": kind,
-                        "title": title,
-                        "roles": roles,
-                    }
-                    for name, (kind, title, roles) in ASSETS.items()
-                    if (folder / name).exists()
-                },
-            }
-        )
-    return {"type": "FeatureCollection", "features": items}
-
-
-def _polygon(corners: Sequence[tuple[float, float]] | None) -> dict[str, Any] | None:
+def polygon(corners: Ring | None) -> dict[str, Any] | None:
+    """A GeoJSON polygon of (longitude, latitude); None without corners."""
     if corners is None:
         return None
     ring = [[round(longitude, 9), round(latitude, 9)] for longitude, latitude in corners]
     return {"type": "Polygon", "coordinates": [[*ring, ring[0]]]}
-
-
-def _off_nadir_deg(eo: ExteriorOrientation) -> float:
-    """Angle between the camera's axis and straight down."""
-    return math.degrees(math.acos(max(-1.0, min(1.0, float(eo.rotation[2, 2])))))
 
 
 def rings_on_terrain(

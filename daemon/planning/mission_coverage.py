@@ -19,8 +19,11 @@ from processing.rig import load_rig
 WIDTH_PX = 560.0
 
 
-def coverage_of(mission: Mission) -> dict[str, Any] | None:
-    """Segments with their reasons, and a drawing of lines and holes; None without a plan.
+def advice_of(mission: Mission) -> tuple[Plan, ReflightPlan, str] | None:
+    """The mission's own plan, what must be flown again, and a note on the height model.
+
+    Returns:
+        None without a plan; the note is empty where there is nothing to state.
 
     Raises:
         DaemonError, RigError, OSError: the mission's plan, rig or configuration cannot be used.
@@ -37,6 +40,19 @@ def coverage_of(mission: Mission) -> dict[str, Any] | None:
         image_across_m=across_m,
         relief=relief,
     )
+    return plan, advice, level
+
+
+def coverage_of(mission: Mission) -> dict[str, Any] | None:
+    """Segments with their reasons, and a drawing of lines and holes; None without a plan.
+
+    Raises:
+        DaemonError, RigError, OSError: the mission's plan, rig or configuration cannot be used.
+    """
+    found = advice_of(mission)
+    if found is None:
+        return None
+    plan, advice, level = found
     return {
         "planned_km": advice.planned_m / 1000.0,
         "share": advice.covered_m / advice.planned_m if advice.planned_m else 1.0,

@@ -1,4 +1,4 @@
-"""Elevation of the sun to some hundredths of a degree: enough for shadows and for a specification.
+"""Elevation and azimuth of the sun to some hundredths of a degree: enough for a specification.
 
 Refraction and the observer's height are left out.
 """
@@ -33,6 +33,41 @@ def sun_elevation_rad(unix_s: float, latitude_rad: float, longitude_rad: float) 
         >>> round(math.degrees(sun_elevation_rad(1_710_936_445.0, 0.0, 0.0)), 1)
         89.8
     """
+    declination, hour_angle = _declination_and_hour_angle(unix_s, longitude_rad)
+    return math.asin(
+        math.sin(latitude_rad) * math.sin(declination)
+        + math.cos(latitude_rad) * math.cos(declination) * math.cos(hour_angle)
+    )
+
+
+def sun_azimuth_rad(unix_s: float, latitude_rad: float, longitude_rad: float) -> float:
+    """Direction of the sun's centre, clockwise from true north.
+
+    Args:
+        unix_s: UTC, seconds since 1970.
+        latitude_rad: of the place, north positive.
+        longitude_rad: of the place, east positive.
+
+    Returns:
+        Azimuth, rad, from 0 to 2 pi; without meaning where the sun is in the zenith.
+
+    Source: as `sun_elevation_rad`.
+
+    Example:
+        Three hours after sunrise of the equinox the sun stands between east and south at 47 N.
+
+        >>> round(math.degrees(sun_azimuth_rad(1_710_925_645.0, math.radians(47.0), 0.0)))
+        126
+    """
+    declination, hour_angle = _declination_and_hour_angle(unix_s, longitude_rad)
+    east = -math.cos(declination) * math.sin(hour_angle)
+    north = math.cos(latitude_rad) * math.sin(declination) - math.sin(latitude_rad) * math.cos(
+        declination
+    ) * math.cos(hour_angle)
+    return math.atan2(east, north) % math.tau
+
+
+def _declination_and_hour_angle(unix_s: float, longitude_rad: float) -> tuple[float, float]:
     days = (unix_s - J2000_UNIX_S) / DAY_S
     anomaly = math.radians(357.528 + 0.985_600_3 * days)
     longitude = math.radians(280.460 + 0.985_647_4 * days) + math.radians(
@@ -43,7 +78,4 @@ def sun_elevation_rad(unix_s: float, latitude_rad: float, longitude_rad: float) 
     declination = math.asin(math.sin(obliquity) * math.sin(longitude))
     sidereal = math.radians(280.460_618_37 + 360.985_647_366_29 * days)
     hour_angle = sidereal + longitude_rad - ascension
-    return math.asin(
-        math.sin(latitude_rad) * math.sin(declination)
-        + math.cos(latitude_rad) * math.cos(declination) * math.cos(hour_angle)
-    )
+    return declination, hour_angle

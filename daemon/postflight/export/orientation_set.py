@@ -41,6 +41,7 @@ from daemon.orientation.orientation_files import (
     patb_text,
 )
 from daemon.orientation.orientation_inputs import OrientationError, read_orientation_inputs
+from daemon.orientation.stac_items import ItemContext, item_collection
 from daemon.orientation.trajectory import flown_trajectory
 from processing.geometry.rotation import vectors_from_rotations
 from processing.rig import Rig
@@ -142,9 +143,8 @@ def export_orientation(
     features = footprints.geojson(
         oriented, rig, ground_m, simulated=simulated, verdicts=verdicts, rings=rings
     )
-    items = footprints.stac_items(
-        mission, oriented, rig, ground_m, simulated=simulated, base_href="../../.."
-    )
+    context = ItemContext(mission.id, rig, ground_m, simulated)
+    items = item_collection(mission, context, oriented, verdicts=verdicts, base_href="../../..")
     texts = {
         "orientation.csv": csv_text(about, oriented),
         "orientation.ori": patb_text(about, oriented),
