@@ -31,6 +31,10 @@ EXTRAS: Final[Mapping[str, OptionalDependency]] = {
         "gir1.2-aravis-0.8 libgirepository1.0-dev",
     ),
     "geotiff": OptionalDependency("GeoTIFF files need rasterio", ("rasterio",)),
+    "catalog": OptionalDependency(
+        "tables of missions need geopandas and pyarrow", ("geopandas", "pyarrow")
+    ),
+    "stores": OptionalDependency("object stores need obstore", ("obstore",)),
     "plots": OptionalDependency("plots of reports need matplotlib", ("matplotlib",)),
     "colmap": OptionalDependency("COLMAP's database needs pycolmap", ("pycolmap",)),
     "mavlink": OptionalDependency("MAVLink needs pymavlink", ("pymavlink",)),
