@@ -27,7 +27,7 @@ PAGE: Final = ROOT / "docs/reference/contributing/licences.md"
 PERMISSIVE: Final = frozenset(
     {
         *("0BSD", "Apache-2.0", "Apache-2.0 WITH LLVM-exception", "BSD-2-Clause", "BSD-3-Clause"),
-        *("BSD", "CC0-1.0", "ISC", "MIT", "MIT-CMU", "PSF-2.0", "Zlib"),
+        *("BSD", "CC0-1.0", "ISC", "MIT", "MIT-0", "MIT-CMU", "PSF-2.0", "Zlib"),
     }
 )
 """May be part of anything. BSD: one of its permissive forms, not stated which."""
@@ -119,7 +119,7 @@ def stated(expression: str, text: str, classifiers: Iterable[str]) -> str:
         if entry.startswith("License ::")
         and (name := entry.rpartition("::")[2].strip()) not in ("OSI Approved", "DFSG approved")
     ]
-    if "\n" not in text and _SPDX.fullmatch(text.partition(" OR ")[0]) and "-" in text:
+    if "\n" not in text and _SPDX.fullmatch(re.split(" OR | AND ", text)[0]) and "-" in text:
         return text
     return " AND ".join(classified) or (text if text in PERMISSIVE else "")
 
