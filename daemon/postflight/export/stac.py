@@ -83,7 +83,7 @@ def export_stac(
 
     Raises:
         OrientationError: no exposure could be oriented.
-        RasterError: an orthoimage cannot be read.
+        AssetError: an orthoimage cannot be read.
         TrajectoryError, GeoreferenceError: as their modules say.
     """
     read = sealed_exposures(mission)

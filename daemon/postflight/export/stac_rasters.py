@@ -20,7 +20,7 @@ _BLOCK_BYTES = 4 << 20
 _USER_DEFINED = 32767
 
 
-class RasterError(DaemonError):
+class AssetError(DaemonError):
     """A raster cannot be described; the message names the file."""
 
 
@@ -47,7 +47,7 @@ def raster_asset(
         bands: names, one a plane.
 
     Raises:
-        RasterError: the file is no TIFF, or has another number of planes.
+        AssetError: the file is no TIFF, or has another number of planes.
 
     Source: STAC 1.1.0 common metadata; extensions projection 2.0.0 and file 2.1.0.
     """
@@ -62,9 +62,9 @@ def raster_asset(
             planes = max(planes, len(tiff.pages)) if planes == 1 and len(bands) > 1 else planes
             data_type = str(page.dtype)
     except (TiffFileError, OSError, ValueError, IndexError) as error:
-        raise RasterError(f"{path}: cannot be read as TIFF ({error}); export it again") from error
+        raise AssetError(f"{path}: cannot be read as TIFF ({error}); export it again") from error
     if planes != len(bands):
-        raise RasterError(f"{path}: has {planes} planes and {len(bands)} bands; export it again")
+        raise AssetError(f"{path}: has {planes} planes and {len(bands)} bands; export it again")
     return {
         "href": href,
         "type": media_type,

@@ -129,7 +129,7 @@ def test_the_kmz_opens_and_has_the_same_shapes(exported: Exported, package: Path
     assert b"SIMULATED" in document
 
 
-def test_names_of_strangers_do_not_break_the_documents(tmp_path: Path) -> None:
+def test_foreign_names_do_not_break_the_documents(tmp_path: Path) -> None:
     name = 'a"b<c>&\x00\x07 \u202e;DROP TABLE footprints'
     layer = GisLayer(
         "lines", "Lines", "LineString", {"line": "TEXT"},
