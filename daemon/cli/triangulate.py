@@ -39,7 +39,10 @@ docs/reference/formats.md names.
 If the heads of a rig have diverging axes, heads with equal pixels and principal distance form a
 block (--head). Views of similar direction are matched, oblique ones by the plane of the ground.
 
-Examples: `syntopic triangulate MISSION --trajectory sbet.out`,
+With --live, the mission is triangulated as in flight: exposure by exposure, by the navigation of
+each record. Results are in export/triangulation/live: live.json, orientations.csv and report.html.
+
+Examples: `syntopic triangulate MISSION --trajectory sbet.out`, `syntopic triangulate MISSION --live`,
 `syntopic triangulate MISSION --head 5 --head 8`,
 `syntopic triangulate MISSION --set sensors-full --points points.csv --measured measured.csv`
 """
@@ -88,8 +91,16 @@ def triangulate(
     out: Annotated[
         Path | None, typer.Option(help="Folder for results (default: in the mission's export).")
     ] = None,
+    live: Annotated[
+        bool, typer.Option("--live", help="Triangulation exposure by exposure, as in flight.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
+    if live:
+        from daemon.cli.triangulate_live import triangulate_live
+
+        triangulate_live(mission, position_sigma, attitude_sigma, as_json=as_json)
+        return
     from daemon.cli.adjust import _peak_mib
     from daemon.mission.layout import Mission
     from daemon.postflight.adjustment.csv_tables import ProjectError

@@ -7,7 +7,7 @@ whole trajectory and in a customer's system it is the work of
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -39,7 +39,7 @@ def orientation_json(
         ground_m: height of level ground above the ellipsoid.
     """
     heads, unoriented = [], []
-    for one in orient(exposure, rig, mount, _Recorded(exposure.navigation), _Local()):
+    for one in recorded_orientations(exposure, rig, mount):
         if isinstance(one, MissingOrientation):
             unoriented.append({"cone": one.cone, "why": one.reason})
         else:
@@ -57,6 +57,13 @@ def orientation_json(
         "heads": heads,
         "unoriented": unoriented,
     }
+
+
+def recorded_orientations(
+    exposure: Exposure, rig: Rig, mount: MountSection
+) -> Iterator[ExteriorOrientation | MissingOrientation]:
+    """Orientation of every cone by the exposure's own record, in local east, north, up."""
+    return orient(exposure, rig, mount, _Recorded(exposure.navigation), _Local())
 
 
 def _head(one: ExteriorOrientation, rig: Rig, ground_m: float) -> dict[str, Any]:

@@ -112,7 +112,7 @@ def match_block(
             progress(k + 1)
             continue
         own = places.astype(np.float64)
-        rays = _rays(image, rotation[k], own)
+        rays = rays_of(image, rotation[k], own)
         ground = station_m[k] + rays * ((ground_m - station_m[k, 2]) / rays[:, 2:])
         known = np.zeros(len(places), dtype=bool)
         seen = np.zeros(len(places), dtype=np.int64)
@@ -133,7 +133,7 @@ def match_block(
             new = rows[~known[rows]]
             ground[new] = _intersected(
                 (station_m[k], rays[new]),
-                (station_m[j], _rays(image, rotation[j], at[new])),
+                (station_m[j], rays_of(image, rotation[j], at[new])),
                 ground[new],
             )
             known[new] = True
@@ -176,14 +176,33 @@ def image_mm(image: VirtualImage, px: Array) -> Array:
     )
 
 
-def _rays(image: VirtualImage, rotation: Array, px: Array) -> Array:
-    """Rays (n, 3) of pixels (n, 2), object axes."""
+def rays_of(image: VirtualImage, rotation: Array, px: Array) -> Array:
+    """Rays of pixels.
+
+    Args:
+        image: size, pixel pitch and principal distance.
+        rotation: (3, 3) from camera.
+        px: column and row, (n, 2).
+
+    Returns:
+        Directions, shape (n, 3), object axes.
+    """
     xy = image_mm(image, px)
     return np.asarray(np.column_stack([xy, np.full(len(xy), -image.f_mm)]) @ rotation.T)
 
 
-def _pixels_of(image: VirtualImage, station_m: Array, rotation: Array, xyz_m: Array) -> Array:
-    """Pixels (n, 2) where an image sees points (n, 3), m; NaN where a point is behind it."""
+def pixels_of(image: VirtualImage, station_m: Array, rotation: Array, xyz_m: Array) -> Array:
+    """Pixels where an image sees points.
+
+    Args:
+        image: size, pixel pitch and principal distance.
+        station_m: (3,) projection centre.
+        rotation: (3, 3) from camera.
+        xyz_m: (n, 3) points.
+
+    Returns:
+        Column and row, shape (n, 2), NaN where a point is behind the image.
+    """
     seen = (xyz_m - station_m) @ rotation
     with np.errstate(all="ignore"):
         xy = -image.f_mm * seen[:, :2] / seen[:, 2:]
@@ -289,7 +308,7 @@ def _matched_in(
 ) -> tuple[int, Array]:
     """Number of places searched in another image, and where they are in it (n, 2), else NaN."""
     rotated, into, back = rectified
-    seen = _pixels_of(image, station_m, rotation, ground)
+    seen = pixels_of(image, station_m, rotation, ground)
     predicted = into(seen)
     margin_px = settings.window_px // 2 + MARGIN_PX + 2
     last = np.array([rotated.shape[1] - 1, rotated.shape[0] - 1])
@@ -327,14 +346,14 @@ def _overlapping(
     c, r = np.meshgrid(
         np.linspace(0, image.width_px - 1, 9), np.linspace(0, image.height_px - 1, 9)
     )
-    rays = _rays(image, rotation[k], np.stack([c.ravel(), r.ravel()], axis=1))
+    rays = rays_of(image, rotation[k], np.stack([c.ravel(), r.ravel()], axis=1))
     level = station_m[k] + rays * ((ground_m - station_m[k, 2]) / rays[:, 2:])
     last = np.array([image.width_px - 1, image.height_px - 1])
     found = []
     for j in range(k + 1, len(station_m)):
         if rotation[j][:, 2] @ rotation[k][:, 2] < _SIMILAR_VIEW_COSINE:
             continue
-        at = _pixels_of(image, station_m[j], rotation[j], level)
+        at = pixels_of(image, station_m[j], rotation[j], level)
         if ((at >= 0.0) & (at <= last)).all(axis=1).any():
             found.append((float(np.linalg.norm(station_m[j] - station_m[k])), j))
     return [j for _, j in sorted(found)]

@@ -1,0 +1,96 @@
+"""`syntopic triangulate --live`: the triangulation of a flight, replayed from its mission."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import typer
+from rich.progress import Progress
+
+from daemon.cli.exit_status import ExitStatus, exit_if_failed
+from daemon.terminal.console import Console, light_table
+
+
+def triangulate_live(
+    mission: Path,
+    position_sigma: tuple[float, float, float],
+    attitude_sigma: tuple[float, float, float],
+    *,
+    as_json: bool,
+) -> None:
+    """Replay the live triangulation of a mission and write its files."""
+    from daemon.mission.layout import Mission
+    from daemon.onboard.triangulation.live_record import summary_json, write_live
+    from daemon.onboard.triangulation.measured_images import SensorSigmas
+    from daemon.onboard.triangulation.mission_triangulation import MissionTriangulation
+    from daemon.orientation.exterior_orientation import sealed_exposures
+    from processing.pipelines.live_triangulation import LiveSettings
+
+    folder = Mission.open(mission)
+    plan_m = float(np.hypot(*position_sigma[:2]) / np.sqrt(2.0))
+    sigmas = SensorSigmas(plan_m, position_sigma[2], attitude_sigma)
+    read = sealed_exposures(folder)
+    done = MissionTriangulation(folder, LiveSettings(), sigmas)
+    seconds: list[float] = []
+    with folder.held(), Progress(console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task("triangulating", total=len(read.results))
+        for number in sorted(read.results):
+            one = done.add(read.results[number])
+            if one.orientation is not None:
+                seconds.append(one.seconds)
+            progress.advance(task)
+        begun = time.perf_counter()
+        done.land()
+        write_live(done)
+        landing_s = time.perf_counter() - begun
+    found = summary_json(done) | {
+        "exposure_seconds": {
+            "median": float(np.median(seconds)) if seconds else None,
+            "99": float(np.percentile(seconds, 99)) if seconds else None,
+        },
+        "landing_seconds": landing_s,
+        "failures": [failure.as_json() for failure in read.failures],
+        "folder": str(done.folder),
+    }
+    if as_json:
+        typer.echo(json.dumps(found))
+    else:
+        _print(found)
+    exit_if_failed(read.failures)
+    if found["accuracy"] is None:
+        raise typer.Exit(ExitStatus.PROBLEM)
+
+
+def _print(found: dict[str, Any]) -> None:
+    console = Console()
+    accuracy = found["accuracy"]
+    console.print(
+        f"{found['exposures']} exposures of {len(found['lines'])} lines, "
+        f"{found['adjusted']} in the last adjustment",
+        highlight=False,
+    )
+    if accuracy is not None:
+        console.print(
+            f"Expected accuracy without control, median: plan {accuracy['plan_m']:.3f} m, height "
+            f"{accuracy['height_m']:.3f} m ({accuracy['points']} tie points), sigma0 "
+            f"{found['sigma0']:.3f}",
+            highlight=False,
+        )
+    if found["drifts"]:
+        table = light_table("Against the calibration", ("quantity",), ("value", "sigma", "unit"))
+        for one in found["drifts"]:
+            known = one["value"] is not None
+            value = f"{one['value']:.4g}" if known else "not determined"
+            sigma = f"{one['sigma']:.3g}" if known else ""
+            table.add_row(one["name"], value, sigma, one["unit"])
+        console.print(table)
+    for one in found["findings"]:
+        console.print(f"{one['name']}: {one['sentence']}", highlight=False)
+    console.print(
+        f"Results: {found['folder']}, report {Path(found['folder']) / 'report.html'}",
+        soft_wrap=True,
+    )

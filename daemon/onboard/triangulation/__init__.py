@@ -1,0 +1,1 @@
+"""Triangulation of a mission while it is flown, or replayed from its files."""

@@ -1,0 +1,249 @@
+"""The live triangulation of one mission: exposures in, orientations, findings and files out.
+
+Used in flight and to replay a mission. It reads records and Level-2, and writes only below
+`export/triangulation/live`.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from daemon import DaemonError
+from daemon.configuration.model import MountSection, PlanSection
+from daemon.mission.exposure import Exposure
+from daemon.mission.layout import Mission
+from daemon.mission.store.level0 import read_tiff
+from daemon.onboard.triangulation.drifts import Drift, drifts_of
+from daemon.onboard.triangulation.findings import (
+    HeightModelCheck,
+    TriangulationFinding,
+    findings_of,
+)
+from daemon.onboard.triangulation.measured_images import SensorSigmas, measured_image, oriented
+from daemon.orientation.exterior_orientation import mount_of
+from daemon.orientation.local_frame import LocalFrame
+from daemon.planning.plan_readers import read_plan
+from daemon.planning.relief import TerrainRelief, relief_of
+from processing import ProcessingError
+from processing.matching.patch_tracks import usable
+from processing.pipelines.live_triangulation import (
+    LiveOrientation,
+    LiveSettings,
+    LiveTriangulation,
+)
+from processing.rig import Rig, load_rig
+
+FOLDER: Final = "triangulation/live"
+"""Below a mission's `export`."""
+_NO_IMAGE: Final = "no stitched image"
+_HEIGHT_SAMPLES: Final = 400
+
+
+class LiveTriangulationError(DaemonError, ValueError):
+    """A mission that cannot be triangulated live; the message states why."""
+
+
+@dataclass(frozen=True)
+class ExposureTriangulated:
+    """What one exposure became: its orientation, or why it has none."""
+
+    number: int
+    orientation: LiveOrientation | None
+    reason: str
+    seconds: float
+
+
+@dataclass(frozen=True)
+class GroundAccuracy:
+    """Expected standard deviations of tie points in m: median and 95th percentile."""
+
+    points: int
+    plan_m: float
+    height_m: float
+    plan_95_m: float
+    height_95_m: float
+
+    def as_json(self) -> dict[str, Any]:
+        return vars(self)
+
+
+@dataclass
+class MissionTriangulation:
+    """The block of a mission.
+
+    Args:
+        mission: its folder.
+        settings: of the triangulation.
+        sigmas: of navigation, where the receiver states none.
+
+    Raises:
+        LiveTriangulationError: the rig has no stitched image.
+        ConfigurationError, RigError: as their modules say.
+    """
+
+    mission: Mission
+    settings: LiveSettings = field(default_factory=LiveSettings)
+    sigmas: SensorSigmas = field(default_factory=SensorSigmas)
+
+    def __post_init__(self) -> None:
+        self.rig: Rig = load_rig(self.mission.rig_path)
+        if self.rig.virtual_image is None:
+            raise LiveTriangulationError(
+                f"rig {self.rig.name} stitches no PAN image, so no block grows in flight; run "
+                "`syntopic triangulate MISSION --head HEAD` after landing"
+            )
+        self.mount: MountSection
+        self.plan: PlanSection
+        self.mount, self.plan = mount_of(self.mission)
+        self.frame: LocalFrame | None = None
+        self.live: LiveTriangulation | None = None
+        self.skipped: dict[int, str] = {}
+        self.drifts: tuple[Drift, ...] = ()
+        self.findings: tuple[TriangulationFinding, ...] = ()
+        self.heights: HeightModelCheck | None = None
+        self.block_seconds = 0.0
+        self.has_landed = False
+        self._relief = self._read_relief()
+        self._planned_lines = self._read_plan()
+
+    @property
+    def folder(self) -> Path:
+        """Where its files are."""
+        return self.mission.export_dir / FOLDER
+
+    def add(self, exposure: Exposure) -> ExposureTriangulated:
+        """Add an exposure that has its products; a new line first adjusts the block.
+
+        One that came before is ignored: it keeps its orientation.
+        """
+        begun = time.perf_counter()
+        number = exposure.number
+        if self.live is not None and any(one.number == number for one in self.live.images):
+            return ExposureTriangulated(number, None, "came before", 0.0)
+        eo = oriented(exposure, self.rig, self.mount)
+        if isinstance(eo, str):
+            return self._skip(number, eo, begun)
+        image = self.rig.virtual_image
+        assert image is not None
+        try:
+            pixels = read_tiff(
+                self.mission.level2(number) / "pan.tif",
+                width_px=image.width_px,
+                height_px=image.height_px,
+            )
+        except FileNotFoundError:
+            return self._skip(number, _NO_IMAGE, begun)
+        except (OSError, ValueError) as error:
+            return self._skip(number, f"its image cannot be read ({error})", begun)
+        if self.frame is None or self.live is None:
+            self.frame = LocalFrame(eo.latitude_deg, eo.longitude_deg)
+            ground = self.frame.from_geodetic(
+                np.array(eo.latitude_deg),
+                np.array(eo.longitude_deg),
+                np.array(self.plan.ground_height_m),
+            )
+            self.live = LiveTriangulation(image, float(ground[2]), self.settings)
+        measured = measured_image(exposure, eo, self.frame, self.sigmas)
+        if self.live.images and self.live.images[-1].line != measured.line:
+            self.adjust_block()
+        try:
+            orientation = self.live.add(measured, usable(pixels))
+        except ProcessingError as error:
+            return self._skip(number, f"it cannot be tied ({error})", begun)
+        self.skipped.pop(number, None)
+        return ExposureTriangulated(number, orientation, "", time.perf_counter() - begun)
+
+    def adjust_block(self) -> None:
+        """Adjust the whole block and look for what is wrong."""
+        if self.live is None:
+            self._find()
+            return
+        begun = time.perf_counter()
+        self.live.adjust_block()
+        self.block_seconds = time.perf_counter() - begun
+        self._find()
+
+    def land(self) -> None:
+        """The last adjustment of the block, with what was planned and not flown."""
+        self.has_landed = True
+        self.adjust_block()
+
+    def accuracy(self) -> GroundAccuracy | None:
+        """Expected accuracy on the ground without control; None before the block is adjusted."""
+        if self.live is None:
+            return None
+        _, _, sigma = self.live.tied_points()
+        if not len(sigma):
+            return None
+        plan = np.sqrt(np.mean(np.square(sigma[:, :2]), axis=1))
+        return GroundAccuracy(
+            len(sigma),
+            float(np.median(plan)),
+            float(np.median(sigma[:, 2])),
+            float(np.percentile(plan, 95)),
+            float(np.percentile(sigma[:, 2], 95)),
+        )
+
+    def _skip(self, number: int, reason: str, begun: float) -> ExposureTriangulated:
+        self.skipped[number] = reason
+        return ExposureTriangulated(number, None, reason, time.perf_counter() - begun)
+
+    def _find(self) -> None:
+        if self.live is None:
+            image = self.rig.virtual_image
+            assert image is not None
+            empty = LiveTriangulation(image, 0.0, self.settings)
+            self.findings = findings_of(
+                empty, (), skipped=self.skipped, planned_lines=self._planned_lines,
+                heights=self.heights, has_landed=self.has_landed,
+            )  # fmt: skip
+            return
+        self.drifts = drifts_of(self.live)
+        self.heights = self._check_heights()
+        self.findings = findings_of(
+            self.live,
+            self.drifts,
+            skipped=self.skipped,
+            planned_lines=self._planned_lines,
+            heights=self.heights,
+            has_landed=self.has_landed,
+        )
+
+    def _read_relief(self) -> TerrainRelief | None:
+        try:
+            return relief_of(self.plan)
+        except (OSError, DaemonError, ValueError) as error:
+            self.heights = HeightModelCheck(problem=str(error))
+            return None
+
+    def _read_plan(self) -> tuple[str, ...]:
+        if self.mission.plan_path is None:
+            return ()
+        try:
+            return tuple(line.id for line in read_plan(self.mission.plan_path).lines)
+        except (OSError, DaemonError):
+            return ()
+
+    def _check_heights(self) -> HeightModelCheck | None:
+        """Tie points against the height model."""
+        if self._relief is None or self.live is None or self.frame is None:
+            return self.heights
+        _, xyz, sigma = self.live.tied_points()
+        if not len(xyz):
+            return self.heights
+        step = max(1, len(xyz) // _HEIGHT_SAMPLES)
+        differences = []
+        for latitude, longitude, height in self.frame.to_geodetic(xyz[::step]):
+            place = self._relief.system.place(float(latitude), float(longitude), float(height))
+            model = self._relief.model.at(np.array([[place.east_m, place.north_m]]))
+            differences.append(place.height_m - float(model[0]))
+        known = np.array(differences)
+        known = known[np.isfinite(known)]
+        if not len(known):
+            return HeightModelCheck(problem="it does not cover the block")
+        return HeightModelCheck(float(np.median(known)), float(np.median(sigma[:, 2])))

@@ -1,0 +1,358 @@
+"""Adjustment of images with measured orientations and tie points, and what follows from it.
+
+The images share one mounting (boresight and lever arm), estimated with its calibration as an
+observation. Orientations carry their full covariance. Systematic errors that are not unknowns are
+estimated afterwards from the same equations (`added_parameters`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.bundle.adjust import Adjustment, AdjustmentSettings, adjust
+from processing.bundle.initial_values import intersect
+from processing.bundle.network import (
+    Attitudes,
+    CameraModel,
+    Gnss,
+    HeadMounting,
+    ImagePoints,
+    Images,
+    MeasuredAttitudes,
+    Network,
+    Points,
+    Stations,
+)
+from processing.geometry.rotation import skew, vectors_from_rotations
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+_GNSS_GROUPS: Final = (4, 5)
+_ATTITUDE_GROUP: Final = 6
+
+
+@dataclass(frozen=True)
+class MeasuredOrientations:
+    """Orientations of n images as measured.
+
+    Attributes:
+        position_m: (n, 3) projection centres, object system.
+        rotation: (n, 3, 3) object from camera.
+        position_sigma_m: (n, 3); infinite where nothing was measured.
+        attitude_sigma_rad: (n, 3) about the camera's axes; infinite likewise.
+        is_mounted: (n,) the mounting applies; not so to orientations that were adjusted before.
+    """
+
+    position_m: Array
+    rotation: Array
+    position_sigma_m: Array
+    attitude_sigma_rad: Array
+    is_mounted: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class MountingPrior:
+    """Standard deviations of the calibrated boresight (rad) and lever arm (m), by coordinate."""
+
+    boresight_sigma_rad: float = 1e-4
+    lever_arm_sigma_m: float = 0.02
+
+
+@dataclass(frozen=True)
+class TieObservations:
+    """Image points (m,): image, point, coordinates in mm (m, 2), and sigmas of x and y in mm."""
+
+    image: Indices
+    point: Indices
+    xy_mm: Array
+    sigma_mm: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class AdjustedMounting:
+    """Corrections of boresight (rad) and lever arm (m) about and along the camera's axes, (6,).
+
+    Attributes:
+        correction, sigma: (6,).
+        share_of_prior: (6,) sigma over that of the calibration; near one, the images contribute
+            nothing.
+    """
+
+    correction: Array
+    sigma: Array
+    share_of_prior: Array
+
+
+@dataclass(frozen=True)
+class BlockAdjustment:
+    """Adjusted images and points.
+
+    Attributes:
+        result: the adjustment with all its statistics.
+        station_m, rotation: (n, 3), (n, 3, 3), of the camera, mounting applied.
+        jacobian: (6 n, columns) of projection centres (m) and rotation vectors about the camera's
+            axes (rad), three and three by image.
+        points: the points that were adjusted, as numbered by the caller.
+        xyz_m, xyz_sigma_m: (points, 3).
+        rejected: (m,) image points that contradict the others.
+        image_factors: variance factors of image x and y.
+        mounting: None without any.
+    """
+
+    result: Adjustment
+    station_m: Array
+    rotation: Array
+    jacobian: Array
+    points: Indices
+    xyz_m: Array
+    xyz_sigma_m: Array
+    rejected: NDArray[np.bool_]
+    image_factors: tuple[float, float]
+    mounting: AdjustedMounting | None
+
+    @property
+    def sigma0(self) -> float:
+        """A posteriori standard deviation of unit weight."""
+        return self.result.sigma0
+
+    @property
+    def variance_factor(self) -> float:
+        """Factor on cofactors: never below one, since the measured orientations keep their sigmas
+        where image points fit better than expected."""
+        return max(1.0, self.sigma0) ** 2
+
+    def covariance(self) -> Array:
+        """Full covariance of all orientations.
+
+        Returns:
+            Shape (6 n, 6 n), m and rad.
+        """
+        return np.asarray(
+            self.variance_factor * self.jacobian @ self.result.cofactor @ self.jacobian.T
+        )
+
+    def covariances(self) -> Array:
+        """Covariance of each orientation by itself.
+
+        Returns:
+            Shape (n, 6, 6), m and rad.
+        """
+        n = len(self.station_m)
+        own = np.empty((n, 6, 6))
+        for k in range(n):
+            part = self.jacobian[6 * k : 6 * k + 6]
+            columns = np.flatnonzero(part.any(axis=0))
+            block = part[:, columns]
+            own[k] = block @ self.result.cofactor[np.ix_(columns, columns)] @ block.T
+        return np.asarray(self.variance_factor * own)
+
+
+@dataclass(frozen=True)
+class AddedParameters:
+    """Estimates of parameters that were not among the unknowns, (k,), with covariance (k, k)."""
+
+    value: Array
+    covariance: Array
+
+    @property
+    def sigma(self) -> Array:
+        """Standard deviations, (k,); infinite where the observations do not contain them."""
+        return np.sqrt(np.diag(self.covariance))
+
+
+def adjust_images(
+    f_mm: float,
+    measured: MeasuredOrientations,
+    ties: TieObservations,
+    xyz_m: Array,
+    prior: MountingPrior | None,
+    *,
+    reject_beyond: float = 4.0,
+    rounds: int = 8,
+    start: tuple[Array, Array] | None = None,
+) -> BlockAdjustment:
+    """Adjust images with their measured orientations and tie points.
+
+    Args:
+        f_mm: principal distance.
+        measured: orientations of the images.
+        ties: image points; points are numbered by the rows of `xyz_m`.
+        xyz_m: (p, 3) starting values; points without an image point are ignored.
+        prior: of the mounting; None holds it.
+        reject_beyond: standardised residual beyond which an image point is left out.
+        rounds: adjustments that may leave something out.
+        start: stations (n, 3) and rotations (n, 3, 3) to begin with; None: as measured.
+
+    Returns:
+        Adjusted orientations and points.
+
+    Raises:
+        NetworkError, RankDefectError: as `processing.bundle.adjust.adjust`.
+
+    Source: docs/explanation/mathematics/bundle.md#adjustment.
+    """
+    station, rotation = start or (measured.position_m, measured.rotation)
+    points, point = np.unique(ties.point, return_inverse=True)
+    n = len(station)
+    names = tuple(str(k) for k in range(n))
+    every = np.arange(n)
+    head = np.where(measured.is_mounted & (prior is not None), 0, -1)
+    mount: tuple[HeadMounting, ...] = ()
+    if prior is not None and (head == 0).any():
+        mount = (
+            HeadMounting(
+                "mounting", np.eye(3), np.zeros(3),
+                rotation_free=True, offset_free=True,
+                rotation_sigma_rad=prior.boresight_sigma_rad,
+                offset_sigma_m=prior.lever_arm_sigma_m,
+            ),
+        )  # fmt: skip
+    else:
+        head = np.full(n, -1)
+    sigma = np.tile(ties.sigma_mm, (len(ties.xy_mm), 1))
+    network = Network(
+        cameras=(CameraModel("camera", f_mm),),
+        stations=Stations(names, station, np.zeros(n, dtype=bool)),
+        attitudes=Attitudes(names, rotation, np.zeros(n, dtype=bool)),
+        images=Images(names, every, every, np.zeros(n, dtype=np.int64), head.astype(np.int64)),
+        points=Points(
+            tuple(str(k) for k in range(len(points))),
+            xyz_m[points],
+            np.full((len(points), 3), np.nan),
+            np.zeros(len(points), dtype=bool),
+        ),
+        image_points=ImagePoints(ties.image, point.astype(np.int64), ties.xy_mm, sigma),
+        heads=mount,
+        gnss=Gnss(
+            every, every, measured.position_m, measured.position_sigma_m, np.zeros((n, 3)),
+            np.full(n, -1), np.zeros(n),
+        ),
+        measured_attitudes=MeasuredAttitudes(
+            every, measured.rotation, measured.attitude_sigma_rad
+        ),
+    )  # fmt: skip
+    result = adjust(network, AdjustmentSettings(reject_beyond=reject_beyond, max_rounds=rounds))
+    return _of(result, points, prior)
+
+
+def intersected(
+    f_mm: float, station_m: Array, rotation: Array, ties: TieObservations, points: int
+) -> Array:
+    """Points nearest to all their rays.
+
+    Args:
+        f_mm: principal distance.
+        station_m: (n, 3).
+        rotation: (n, 3, 3).
+        ties: image points.
+        points: their number.
+
+    Returns:
+        Shape (points, 3), m, NaN where rays are parallel or fewer than two.
+    """
+    ray = np.column_stack([ties.xy_mm, np.full(len(ties.xy_mm), -f_mm)])
+    direction = np.einsum("nij,nj->ni", rotation[ties.image], ray)
+    xyz, _ = intersect(points, ties.point, station_m[ties.image], direction)
+    return xyz
+
+
+def added_parameters(
+    result: Adjustment, position: Array, attitude: Array, sigma: Array
+) -> AddedParameters:
+    """Estimate effects on the measured orientations that the adjustment had no unknowns for.
+
+    One step of an adjustment with these unknowns, from the equations of the one without.
+
+    Args:
+        result: the adjustment.
+        position: (n, 3, k) derivatives of the measured positions by the parameters.
+        attitude: (n, 3, k) likewise of rotation vectors about the camera's axes.
+        sigma: (k,) a priori standard deviations, infinite for none.
+
+    Returns:
+        Values and covariance; a parameter that the observations do not contain has an infinite
+        variance or keeps that of its prior.
+
+    Source: docs/explanation/mathematics/bundle.md#added-parameters.
+    """
+    rows = result.equations
+    count = position.shape[2]
+    design = np.zeros((len(rows.misclosure), count))
+    for table, groups in ((position, _GNSS_GROUPS), (attitude, (_ATTITUDE_GROUP,))):
+        own = np.flatnonzero(np.isin(rows.group, groups))
+        design[own] = table[rows.source[own], rows.axis[own]] / rows.sigma[own, None]
+    into = np.asarray(rows.reduced.T @ design)
+    normal = design.T @ design - into.T @ result.cofactor @ into
+    normal += np.diag(1.0 / np.square(sigma))
+    size = np.sqrt(np.clip(np.diag(design.T @ design) + 1.0 / np.square(sigma), 1e-300, None))
+    values, vectors = np.linalg.eigh(normal / size[:, None] / size)
+    known = values > 1e-9
+    inverse = (vectors[:, known] / values[known]) @ vectors[:, known].T / size[:, None] / size
+    # A parameter that takes part in an undetermined direction is not known.
+    open_share = np.square(vectors[:, ~known]).sum(axis=1)
+    inverse[np.diag_indices(count)] += np.where(open_share > 1e-6, np.inf, 0.0)
+    right = design.T @ rows.misclosure
+    found = np.where(np.isfinite(inverse), inverse, 0.0) @ right
+    return AddedParameters(
+        np.where(open_share > 1e-6, np.nan, found), max(1.0, result.sigma0) ** 2 * inverse
+    )
+
+
+def _of(result: Adjustment, points: Indices, prior: MountingPrior | None) -> BlockAdjustment:
+    network, layout, state = result.network, result.layout, result.state
+    n, columns = len(network.images.names), layout.columns
+    station, rotation = state.station.copy(), state.attitude.copy()
+    jacobian = np.zeros((6 * n, columns))
+    mounting = None
+    for k in range(n):
+        rows = slice(6 * k, 6 * k + 3), slice(6 * k + 3, 6 * k + 6)
+        turn, offset = np.eye(3), np.zeros(3)
+        if network.images.head[k] == 0:
+            turn, offset = state.head_rotation[0], state.head_offset[0]
+            _fill(jacobian, rows[0], layout.head_offset[0], state.attitude[k])
+            _fill(jacobian, rows[1], layout.head_rotation[0], np.eye(3))
+        _fill(jacobian, rows[0], layout.station[k], np.eye(3))
+        _fill(jacobian, rows[0], layout.attitude[k], -state.attitude[k] @ skew(offset[None])[0])
+        _fill(jacobian, rows[1], layout.attitude[k], turn.T)
+        station[k] = state.station[k] + state.attitude[k] @ offset
+        rotation[k] = state.attitude[k] @ turn
+    if network.heads and prior is not None:
+        mounting = _mounting(result, prior)
+    factor = {g.name: g.factor for g in result.groups if np.isfinite(g.factor)}
+    unit = max(1.0, result.sigma0)
+    spread = np.sqrt(np.clip(np.einsum("pii->pi", result.point_cofactor), 0.0, None))
+    return BlockAdjustment(
+        result,
+        station,
+        rotation,
+        jacobian,
+        points,
+        state.points,
+        np.where(result.left_out[:, None], np.nan, unit * spread),
+        result.rejected | result.left_out[network.image_points.point],
+        (float(factor.get("image x", 1.0)), float(factor.get("image y", 1.0))),
+        mounting,
+    )
+
+
+def _fill(jacobian: Array, rows: slice, columns: Indices, block: Array) -> None:
+    if (columns >= 0).all():
+        jacobian[rows, columns] = block
+
+
+def _mounting(result: Adjustment, prior: MountingPrior) -> AdjustedMounting:
+    layout, state = result.layout, result.state
+    columns = np.concatenate([layout.head_rotation[0], layout.head_offset[0]])
+    spread = np.sqrt(np.clip(np.diag(result.cofactor)[columns], 0.0, None))
+    given = np.repeat([prior.boresight_sigma_rad, prior.lever_arm_sigma_m], 3)
+    return AdjustedMounting(
+        np.concatenate([vectors_from_rotations(state.head_rotation[0][None])[0],
+                        state.head_offset[0]]),
+        max(1.0, result.sigma0) * spread,
+        spread / given,
+    )  # fmt: skip
