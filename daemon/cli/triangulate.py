@@ -42,7 +42,8 @@ block (--head). Views of similar direction are matched, oblique ones by the plan
 With --live, the mission is triangulated as in flight: exposure by exposure, by the navigation of
 each record. Results are in export/triangulation/live: live.json, orientations.csv and report.html.
 
-Examples: `syntopic triangulate MISSION --trajectory sbet.out`, `syntopic triangulate MISSION --live`,
+Examples: `syntopic triangulate MISSION --trajectory sbet.out`,
+`syntopic triangulate MISSION --live`,
 `syntopic triangulate MISSION --head 5 --head 8`,
 `syntopic triangulate MISSION --set sensors-full --points points.csv --measured measured.csv`
 """

@@ -30,20 +30,25 @@ _UNDETERMINED_SHARE: Final = 0.9
 @dataclass(frozen=True)
 class Drift:
     """One quantity: correction to the calibration, its standard deviation, and whether the flight
-    determines it."""
+    determines it. `calibration_sigma` is that of the calibration, 0 where there is none."""
 
     name: str
     unit: str
     value: float | None
     sigma: float | None
     is_determined: bool
+    calibration_sigma: float = 0.0
 
     @property
     def significance(self) -> float:
-        """The value over its standard deviation."""
-        if self.value is None or not self.sigma:
+        """The value over the standard deviation that a right calibration gives it."""
+        if self.value is None or not self.sigma or not self.is_determined:
             return 0.0
-        return abs(self.value) / self.sigma
+        if not self.calibration_sigma:
+            return abs(self.value) / self.sigma
+        # An estimate with the calibration as an observation varies by what the images add.
+        expected = max(self.calibration_sigma**2 - self.sigma**2, 1e-30) ** 0.5
+        return abs(self.value) / expected
 
     def as_json(self) -> dict[str, Any]:
         return {
@@ -62,10 +67,13 @@ def drifts_of(live: LiveTriangulation) -> tuple[Drift, ...]:
     found: list[Drift] = []
     mounting = live.last.mounting
     if mounting is not None:
+        prior_of = live.settings.prior
+        given = np.repeat([prior_of.boresight_sigma_rad, prior_of.lever_arm_sigma_m], 3)
         for k, (name, unit, factor) in enumerate(MOUNTING):
             determined = bool(mounting.share_of_prior[k] < _UNDETERMINED_SHARE)
             value, sigma = float(mounting.correction[k]), float(mounting.sigma[k])
-            found.append(Drift(name, unit, value * factor, sigma * factor, determined))
+            prior = float(given[k]) * factor
+            found.append(Drift(name, unit, value * factor, sigma * factor, determined, prior))
     return (*found, *_added(live))
 
 

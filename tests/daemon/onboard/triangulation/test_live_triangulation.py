@@ -1,0 +1,307 @@
+"""The triangulation of a flight, held against the truth of the emulator, and its bad cases."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import stats
+from typer.testing import CliRunner
+
+from daemon.cli import app
+from daemon.mission.layout import Mission
+from daemon.onboard.triangulation.live_record import live_json, summary_json, write_live
+from daemon.onboard.triangulation.mission_triangulation import MissionTriangulation
+from daemon.orientation.exterior_orientation import sealed_exposures
+from daemon.orientation.local_frame import LocalFrame
+from processing.bundle.block_adjustment import added_parameters
+from processing.geometry.rotation import vectors_from_rotations
+from tests.daemon.flown_block import (
+    FlownBlock,
+    flown_block,
+    read_record,
+    write_image,
+    write_record,
+)
+
+RUN = CliRunner()
+EACH, LINES = 5, 2
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory) -> FlownBlock:
+    return flown_block(tmp_path_factory.mktemp("live"), EACH, LINES)
+
+
+@pytest.fixture(scope="module")
+def triangulated(flown) -> MissionTriangulation:
+    return _replayed(flown.mission)
+
+
+@pytest.fixture
+def copied(flown, tmp_path) -> Path:
+    shutil.copytree(flown.mission, tmp_path / "mission")
+    return tmp_path / "mission"
+
+
+def _replayed(mission: Path, numbers: range | None = None) -> MissionTriangulation:
+    folder = Mission.open(mission)
+    done = MissionTriangulation(folder)
+    read = sealed_exposures(folder).results
+    for number in sorted(read) if numbers is None else numbers:
+        done.add(read[number])
+    done.land()
+    return done
+
+
+def _names(done: MissionTriangulation) -> set[str]:
+    return {one.name for one in done.findings}
+
+
+def _errors(flown: FlownBlock, done: MissionTriangulation) -> np.ndarray:
+    """Errors (n, 6) of projection centres, m, and of rotations about the camera's axes, rad."""
+    frame = done.frame
+    errors = []
+    for one in done.live.orientations:
+        k = one.image.number - 1
+        truth = frame.from_geodetic(*(np.array(v) for v in flown.place[k]))
+        origin = LocalFrame(
+            flown.world.flight.plan.latitude_deg, flown.world.flight.plan.longitude_deg
+        )
+        rotation = (
+            frame.local_from_enu(origin.latitude_deg, origin.longitude_deg)
+            @ flown.enu_from_camera[k]
+        )
+        turn = vectors_from_rotations((rotation.T @ one.rotation)[None])[0]
+        errors.append(np.concatenate([one.position_m - truth, turn]))
+    return np.array(errors)
+
+
+def test_adjusted_orientations_err_as_their_full_covariance_states(flown, triangulated) -> None:
+    errors = _errors(flown, triangulated)
+    covariance = triangulated.live.last.covariance()
+    flat = errors.ravel()
+    squares = flat @ np.linalg.solve(covariance, flat) / len(flat)
+    low, high = stats.chi2.ppf([0.0005, 0.9995], len(flat)) / len(flat)
+    assert low < squares < high
+    sigma = np.sqrt(np.diag(covariance)).reshape(-1, 6)
+    assert (np.abs(errors) < 4.5 * sigma).all()
+    # Tie points improve on what was measured.
+    assert (sigma[:, 3:5] < 0.6 * math.radians(0.0076)).all()
+
+
+def test_lines_flown_there_and_back_tie_and_nothing_is_wrong(triangulated) -> None:
+    found = summary_json(triangulated)
+    assert found["exposures"] == EACH * LINES and found["adjusted"] == EACH * LINES
+    (pair,) = found["line_ties"]
+    assert pair["found"] > 0.5 * pair["tried"] > 10
+    assert found["findings"] == [] and found["reflights"] == []
+    assert found["accuracy"]["plan_m"] < 0.1 < found["accuracy"]["height_m"] < 1.0
+    assert all(one.source == "block" for one in triangulated.live.orientations)
+    assert max(found["image_sigma_px"]) < 0.05
+
+
+def test_each_exposure_has_an_orientation_before_the_next_is_taken(flown) -> None:
+    mission = Mission.open(flown.mission)
+    done = MissionTriangulation(mission)
+    read = sealed_exposures(mission).results
+    sources = [done.add(read[number]).orientation.source for number in sorted(read)]
+    assert sources[0] == "measured" and set(sources[1:EACH]) == {"window"}
+    squares = [
+        float(e @ np.linalg.solve(o.covariance, e)) / 6
+        for e, o in zip(_errors(flown, done), done.live.orientations, strict=True)
+    ]
+    assert np.mean(squares) < 2.0
+
+
+def test_the_command_writes_the_record_and_a_page_and_repeats_to_the_byte(copied) -> None:
+    done = RUN.invoke(app, ["triangulate", str(copied), "--live", "--json"])
+    assert done.exit_code == 0, done.output + str(done.exception)
+    found = json.loads(done.stdout)
+    folder = Path(found["folder"])
+    record = json.loads((folder / "live.json").read_text())
+    assert len(record["orientations"]) == EACH * LINES and not record["is_preliminary"]
+    assert len(record["orientations"][0]["covariance"]) == 36
+    rows = (folder / "orientations.csv").read_text().splitlines()
+    assert len(rows) == EACH * LINES + 3
+    page = (folder / "report.html").read_text()
+    assert "Expected accuracy without control points" in page and "<script" not in page
+    first = {p.name: p.read_bytes() for p in folder.iterdir() if p.name == "orientations.csv"}
+    again = RUN.invoke(app, ["triangulate", str(copied), "--live"])
+    assert again.exit_code == 0 and "Expected accuracy" in again.output
+    assert {name: (folder / name).read_bytes() for name in first} == first
+
+
+def test_a_single_strip_says_what_it_cannot_determine(flown) -> None:
+    done = _replayed(flown.mission, range(1, EACH + 1))
+    (finding,) = [f for f in done.findings if f.name == "SINGLE_STRIP"]
+    assert "lever arm along the camera's x" in finding.sentence
+    assert "cross line" in finding.sentence
+
+
+def test_exposures_without_navigation_are_named_and_the_others_are_adjusted(copied) -> None:
+    for number in (2, 3):
+        record = read_record(copied, number)
+        del record["navigation"]
+        write_record(copied, record)
+    done = _replayed(copied)
+    (finding,) = [f for f in done.findings if f.name == "NO_GNSS"]
+    assert finding.exposures == (2, 3) and "Exposures 2-3 are not in the block" in finding.sentence
+    assert len(done.live.images) == EACH * LINES - 2
+    assert {"kind": "exposures", "line": None, "from": 2, "to": 3,
+            "reason": "no navigation"} in summary_json(done)["reflights"]  # fmt: skip
+
+
+def test_a_flight_without_any_position_reports_that_there_is_no_block(copied) -> None:
+    for number in range(1, EACH * LINES + 1):
+        record = read_record(copied, number)
+        del record["navigation"]
+        write_record(copied, record)
+    done = RUN.invoke(app, ["triangulate", str(copied), "--live", "--json"])
+    assert done.exit_code == 1
+    found = json.loads(done.stdout)
+    assert found["findings"][0]["name"] == "NO_GNSS" and found["accuracy"] is None
+    assert "There is no block" in found["findings"][0]["sentence"]
+
+
+def test_an_exposure_of_water_is_measured_only_and_to_be_flown_again(copied) -> None:
+    noise = np.random.default_rng(1)
+    shape = (1620, 1182)
+    for number in (3, 4, 5):
+        water = noise.normal(3000.0, 20.0, shape).clip(2, 60000).astype(np.uint16)
+        write_image(copied, number, water & 0xFFFE)
+    done = _replayed(copied)
+    (finding,) = [f for f in done.findings if f.name == "UNTIED_EXPOSURES"]
+    assert set(finding.exposures) >= {4, 5} and set(finding.exposures) <= {2, 3, 4, 5}
+    sources = {o.image.number: o.source for o in done.live.orientations}
+    assert sources[4] == "measured" and sources[7] == "block"
+    assert summary_json(done)["reflights"][0]["line"] == "line 1"
+
+
+def test_swapped_images_are_not_adjusted_as_if_right(copied) -> None:
+    a, b = copied / "L2/000002/pan.tif", copied / "L2/000008/pan.tif"
+    first, second = a.read_bytes(), b.read_bytes()
+    a.write_bytes(second)
+    b.write_bytes(first)
+    done = _replayed(copied)
+    (finding,) = [f for f in done.findings if f.name == "UNTIED_EXPOSURES"]
+    assert set(finding.exposures) >= {2, 8}
+
+
+def test_a_drifting_inertial_unit_is_named(copied) -> None:
+    for number in range(1, EACH * LINES + 1):
+        record = read_record(copied, number)
+        record["navigation"]["roll_rad"] += math.radians(0.01) * number
+        write_record(copied, record)
+    assert _names(_replayed(copied)) & {"ATTITUDE_DRIFT", "ATTITUDE_CONTRADICTED"}
+
+
+def test_a_boresight_that_changed_is_named_and_estimated(copied) -> None:
+    for number in range(1, EACH * LINES + 1):
+        record = read_record(copied, number)
+        record["navigation"]["roll_rad"] += math.radians(0.05)
+        write_record(copied, record)
+    done = _replayed(copied)
+    assert "BORESIGHT_CHANGED" in _names(done)
+    boresight = max(abs(d.value) for d in done.drifts if d.name.startswith("boresight"))
+    assert boresight == pytest.approx(50.0, abs=12.0)
+
+
+def test_an_image_that_cannot_be_read_is_left_out_and_named(copied) -> None:
+    image = copied / "L2/000004/pan.tif"
+    image.write_bytes(image.read_bytes()[:-100])
+    (copied / "L2/000005/pan.tif").unlink()
+    done = _replayed(copied)
+    numbers = {n for f in done.findings if f.name == "NO_IMAGE" for n in f.exposures}
+    assert numbers == {4, 5}
+    assert {o.image.number for o in done.live.orientations} == {1, 2, 3, 6, 7, 8, 9, 10}
+
+
+def test_an_exposure_that_comes_twice_counts_once(flown) -> None:
+    mission = Mission.open(flown.mission)
+    read = sealed_exposures(mission).results
+    done = MissionTriangulation(mission)
+    for number in (1, 2, 2, 3, 1):
+        done.add(read[number])
+    assert [i.number for i in done.live.images] == [1, 2, 3]
+
+
+def test_a_height_model_that_fails_or_lies_is_named(copied, tmp_path) -> None:
+    cells = "ncols 3\nnrows 3\nxllcorner 0\nyllcorner 0\ncellsize 1000000\n"
+    heights = " ".join(["900"] * 9)
+    (tmp_path / "model.asc").write_text(f"{cells}{heights}\n")
+    done = _with_model(copied, "model.asc")
+    assert "HEIGHT_MODEL_CONTRADICTED" in _names(done)
+    (copied / "model.asc").write_text("no grid")
+    assert "HEIGHT_MODEL_FAILED" in _names(_replayed(copied))
+
+
+def _with_model(mission: Path, name: str) -> MissionTriangulation:
+    shutil.copy(mission.parent / name, mission / name)
+    text = (mission / "service.toml").read_text()
+    text += f'elevation = "{name}"\nelevation_crs = "EPSG:32633"\n'
+    (mission / "service.toml").write_text(text)
+    return _replayed(mission)
+
+
+def test_lines_that_were_not_flown_are_named_at_landing(flown, triangulated) -> None:
+    done = _replayed(flown.mission, range(1, EACH + 1))
+    done._planned_lines = ("line 1", "line 2", "line 3")
+    done.land()
+    (finding,) = [f for f in done.findings if f.name == "PLAN_CUT_SHORT"]
+    assert finding.lines == ("line 2", "line 3")
+
+
+def test_a_failed_disk_leaves_the_last_record(copied, monkeypatch) -> None:
+    done = _replayed(copied, range(1, 4))
+    write_live(done)
+    before = (done.folder / "live.json").read_bytes()
+    monkeypatch.setattr("daemon.onboard.triangulation.live_record.quality_page", lambda _: "\ud800")
+    with pytest.raises(UnicodeEncodeError):
+        write_live(done)
+    assert (done.folder / "live.json").read_bytes() == before
+
+
+def test_an_added_parameter_is_what_an_unknown_would_be(triangulated) -> None:
+    """A shift of all measured positions is nowhere in the images; a rotation is in the others."""
+    result = triangulated.live.last.result
+    n = len(triangulated.live.images)
+    position = np.zeros((n, 3, 1))
+    position[:, 2, 0] = 1.0
+    done = added_parameters(result, position, np.zeros((n, 3, 1)), np.array([np.inf]))
+    assert not np.isfinite(done.sigma[0]) or done.sigma[0] > 1.0
+    moved = replace(
+        result.equations,
+        misclosure=result.equations.misclosure.copy(),
+    )
+    own = (moved.group == 4) & (moved.axis == 0)
+    plant = np.zeros((n, 3, 1))
+    plant[:, 0, 0] = np.linspace(-1.0, 1.0, n)
+    moved.misclosure[own] += 0.5 * plant[moved.source[own], 0, 0] / moved.sigma[own]
+    before = added_parameters(result, plant, np.zeros((n, 3, 1)), np.array([np.inf]))
+    # What the adjustment would absorb is taken off by the same projection.
+    into = np.asarray(moved.reduced.T @ (moved.misclosure - result.equations.misclosure))
+    residual = moved.misclosure - np.asarray(moved.reduced @ (result.cofactor @ into))
+    after = added_parameters(
+        replace(result, equations=replace(moved, misclosure=residual)),
+        plant, np.zeros((n, 3, 1)), np.array([np.inf]),
+    )  # fmt: skip
+    assert after.value[0] - before.value[0] == pytest.approx(0.5, rel=1e-6)
+
+
+def test_the_record_holds_what_the_format_names(triangulated) -> None:
+    record = live_json(triangulated)
+    assert record["format"] == 1 and record["simulated"]
+    one = record["orientations"][0]
+    assert set(one) == {
+        "exposure", "line", "source", "tie_points", "latitude_deg", "longitude_deg", "height_m",
+        "omega_phi_kappa_deg", "sigma_m", "sigma_mdeg", "covariance",
+    }  # fmt: skip
+    covariance = np.array(one["covariance"]).reshape(6, 6)
+    assert np.allclose(covariance, covariance.T)
+    assert np.sqrt(np.diag(covariance))[:3] == pytest.approx(one["sigma_m"])
