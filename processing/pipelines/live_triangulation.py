@@ -258,27 +258,16 @@ class LiveTriangulation:
             (self._sigma_px[0] * self.image.pitch_mm, self._sigma_px[1] * self.image.pitch_mm),
         )
 
-    def _measured(self, own: Indices, source: Source) -> MeasuredOrientations:
-        """Orientations as observations: of a window, earlier lines as they were adjusted."""
-        adjusted = np.array(
-            [source == "window" and self.orientations[k].source == "block" for k in own]
-        )
-        position, rotation, sigma, spread = [], [], [], []
-        for k, is_adjusted in zip(own, adjusted, strict=True):
-            image, one = self.images[k], self.orientations[k]
-            if is_adjusted:
-                own_sigma = np.sqrt(np.diag(one.covariance))
-                position.append(one.position_m)
-                rotation.append(one.rotation)
-                sigma.append(own_sigma[:3])
-                spread.append(own_sigma[3:])
-            else:
-                position.append(image.position_m)
-                rotation.append(image.rotation)
-                sigma.append(image.position_sigma_m)
-                spread.append(image.attitude_sigma_rad)
+    def _measured(self, own: Indices) -> MeasuredOrientations:
+        """Orientations as measured, also of images that were adjusted before: adjusted ones share
+        errors that their own covariances do not contain."""
+        images = [self.images[k] for k in own]
         return MeasuredOrientations(
-            np.array(position), np.array(rotation), np.array(sigma), np.array(spread), ~adjusted
+            np.array([one.position_m for one in images]),
+            np.array([one.rotation for one in images]),
+            np.array([one.position_sigma_m for one in images]),
+            np.array([one.attitude_sigma_rad for one in images]),
+            np.ones(len(images), dtype=bool),
         )
 
     def _adjust(self, own: Indices, source: Source) -> BlockAdjustment | None:
@@ -298,7 +287,7 @@ class LiveTriangulation:
         if not len(ties.image):
             return None
         prior = self.settings.prior
-        measured = self._measured(own, source)
+        measured = self._measured(own)
         try:
             done = adjust_images(
                 self.image.f_mm, measured, ties, xyz, prior, start=start,

@@ -33,7 +33,7 @@ BORESIGHT_DEG = 0.0057
 
 @dataclass(frozen=True)
 class FlownBlock:
-    """The mission's folder, and geodetic places (n, 3) and ENU rotations (n, 3, 3) of the camera."""
+    """The mission's folder; geodetic places (n, 3) and ENU rotations (n, 3, 3) of the camera."""
 
     mission: Path
     world: World

@@ -103,10 +103,17 @@ def line_ties(live: LiveTriangulation) -> dict[tuple[str, str], tuple[int, int]]
 
 
 def untied_numbers(live: LiveTriangulation) -> tuple[int, ...]:
-    """Exposures that share fewer than `MIN_TIES` points with others."""
+    """Exposures that share fewer than `MIN_TIES` points with others, or whose own line is not found
+    in them."""
     if len(live.images) < 2:
         return ()
-    return tuple(o.image.number for o in live.orientations if o.ties < MIN_TIES)
+    found = []
+    for one, ties in zip(live.orientations, live.ties, strict=True):
+        tried = ties.tried.get(one.image.line, 0)
+        matched = ties.found.get(one.image.line, 0)
+        if one.ties < MIN_TIES or (tried >= MIN_TRIED and matched < MIN_FOUND_SHARE * tried):
+            found.append(one.image.number)
+    return tuple(found)
 
 
 def untied_pairs(live: LiveTriangulation) -> tuple[tuple[str, str], ...]:
@@ -155,9 +162,9 @@ def _untied(live: LiveTriangulation) -> list[TriangulationFinding]:
     return [
         TriangulationFinding(
             "UNTIED_EXPOSURES",
-            f"Exposures {ranges(numbers)} share fewer than {MIN_TIES} points with others (water, "
-            "cloud, uniform ground or no overlap). Their orientation is the measured one. Fly a "
-            "cross line over land, or fly them again.",
+            f"Exposures {ranges(numbers)} do not tie to their neighbours (water, cloud, uniform "
+            "ground, no overlap, or another exposure's image). Do not rely on more than their "
+            "measured orientation. Fly a cross line over land, or fly them again.",
             numbers,
         )
     ]

@@ -113,7 +113,7 @@ def live_json(done: MissionTriangulation) -> dict[str, Any]:
     own = [] if live is None or frame is None else live.orientations
     return {
         **summary_json(done),
-        "simulated": done.mission.is_simulated,
+        "simulated": done.is_simulated,
         "places": PLACES,
         "angles": ANGLES,
         "covariance": COVARIANCE,

@@ -108,6 +108,7 @@ class MissionTriangulation:
         self.heights: HeightModelCheck | None = None
         self.block_seconds = 0.0
         self.has_landed = False
+        self.is_simulated = False
         self._relief = self._read_relief()
         self._planned_lines = self._read_plan()
 
@@ -123,6 +124,7 @@ class MissionTriangulation:
         """
         begun = time.perf_counter()
         number = exposure.number
+        self.is_simulated |= exposure.simulated
         if self.live is not None and any(one.number == number for one in self.live.images):
             return ExposureTriangulated(number, None, "came before", 0.0)
         eo = oriented(exposure, self.rig, self.mount)

@@ -31,6 +31,7 @@ from tests.daemon.flown_block import (
 
 RUN = CliRunner()
 EACH, LINES = 5, 2
+DRIFT_DEG_H = 8.0
 
 
 @pytest.fixture(scope="module")
@@ -194,11 +195,16 @@ def test_swapped_images_are_not_adjusted_as_if_right(copied) -> None:
 
 
 def test_a_drifting_inertial_unit_is_named(copied) -> None:
+    first_ns = int(read_record(copied, 1)["mark_gps_ns"])
     for number in range(1, EACH * LINES + 1):
         record = read_record(copied, number)
-        record["navigation"]["roll_rad"] += math.radians(0.01) * number
+        seconds = (int(record["mark_gps_ns"]) - first_ns) * 1e-9
+        record["navigation"]["roll_rad"] += math.radians(DRIFT_DEG_H) * seconds / 3600.0
         write_record(copied, record)
-    assert _names(_replayed(copied)) & {"ATTITUDE_DRIFT", "ATTITUDE_CONTRADICTED"}
+    done = _replayed(copied)
+    assert "ATTITUDE_DRIFT" in _names(done)
+    drift = max(abs(d.value) for d in done.drifts if "per hour" in d.name)
+    assert drift == pytest.approx(1e3 * DRIFT_DEG_H, rel=0.3)
 
 
 def test_a_boresight_that_changed_is_named_and_estimated(copied) -> None:
@@ -232,8 +238,8 @@ def test_an_exposure_that_comes_twice_counts_once(flown) -> None:
 
 
 def test_a_height_model_that_fails_or_lies_is_named(copied, tmp_path) -> None:
-    cells = "ncols 3\nnrows 3\nxllcorner 0\nyllcorner 0\ncellsize 1000000\n"
-    heights = " ".join(["900"] * 9)
+    cells = "ncols 10\nnrows 5\nxllcorner 0\nyllcorner 5000000\ncellsize 100000\n"
+    heights = " ".join(["900"] * 50)
     (tmp_path / "model.asc").write_text(f"{cells}{heights}\n")
     done = _with_model(copied, "model.asc")
     assert "HEIGHT_MODEL_CONTRADICTED" in _names(done)
