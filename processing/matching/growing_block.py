@@ -46,7 +46,8 @@ class GrowingSettings:
         patches: window and limits of a match.
         cells: columns and rows of the grid of features of an image.
         attempts_per_cell: points of the same line, and as many of other lines, tried in a cell.
-        first_search_px: around a prediction without a known height or offset.
+        probe_search_px: around the predictions that the common offset of an image is found with.
+        first_search_px: around a prediction without a known height.
         search_px: around others.
         max_patches: memory; the patches of the oldest points are given up beyond.
     """
@@ -54,6 +55,7 @@ class GrowingSettings:
     patches: PatchMatching = field(default_factory=PatchMatching)
     cells: tuple[int, int] = (12, 8)
     attempts_per_cell: int = 2
+    probe_search_px: int = 40
     first_search_px: int = 24
     search_px: int = 6
     max_patches: int = 150_000
@@ -289,7 +291,7 @@ class GrowingBlock:
 
         best = np.argsort(~self._known[chosen], kind="stable")
         probes = np.unique(best[:: max(1, len(best) // _PROBES)][:_PROBES])
-        run(probes, np.zeros(2), first)
+        run(probes, np.zeros(2), self.settings.probe_search_px)
         rest = np.setdiff1d(np.arange(len(chosen)), probes)
         seen = probes[np.isfinite(at[probes]).all(axis=1)]
         if len(seen) < _MIN_PROBES:

@@ -123,7 +123,7 @@ class LiveTriangulation:
         ties: what each image added.
         last: the last adjustment of the block; None before the first.
         last_images: which images it holds.
-        problems: sentences of adjustments that failed, the newest last.
+        problems: sentences of adjustments that failed since the last one of the block.
     """
 
     def __init__(
@@ -189,6 +189,7 @@ class LiveTriangulation:
             self._sigma_px = np.maximum(self._sigma_px * np.sqrt(factor), _FLOOR_SIGMA_PX)
             done = self._adjust(own, "block") or done
         self.last, self.last_images = done, own
+        self.problems.clear()
         return done
 
     def tied_points(self) -> tuple[Indices, Array, Array]:

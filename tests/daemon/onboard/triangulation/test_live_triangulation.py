@@ -31,7 +31,7 @@ from tests.daemon.flown_block import (
 
 RUN = CliRunner()
 EACH, LINES = 5, 2
-DRIFT_DEG_H = 8.0
+DRIFT_DEG_H = 5.0
 
 
 @pytest.fixture(scope="module")
@@ -199,7 +199,7 @@ def test_a_drifting_inertial_unit_is_named(copied) -> None:
     for number in range(1, EACH * LINES + 1):
         record = read_record(copied, number)
         seconds = (int(record["mark_gps_ns"]) - first_ns) * 1e-9
-        record["navigation"]["roll_rad"] += math.radians(DRIFT_DEG_H) * seconds / 3600.0
+        record["navigation"]["pitch_rad"] += math.radians(DRIFT_DEG_H) * seconds / 3600.0
         write_record(copied, record)
     done = _replayed(copied)
     assert "ATTITUDE_DRIFT" in _names(done)
