@@ -100,7 +100,7 @@ def triangulate(
     if live:
         from daemon.cli.triangulate_live import triangulate_live
 
-        triangulate_live(mission, position_sigma, attitude_sigma, as_json=as_json)
+        triangulate_live(mission, position_sigma, attitude_sigma, trajectory, as_json=as_json)
         return
     from daemon.cli.adjust import _peak_mib
     from daemon.mission.layout import Mission

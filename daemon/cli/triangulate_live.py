@@ -19,6 +19,7 @@ def triangulate_live(
     mission: Path,
     position_sigma: tuple[float, float, float],
     attitude_sigma: tuple[float, float, float],
+    trajectory: Path | None,
     *,
     as_json: bool,
 ) -> None:
@@ -28,13 +29,17 @@ def triangulate_live(
     from daemon.onboard.triangulation.measured_images import SensorSigmas
     from daemon.onboard.triangulation.mission_triangulation import MissionTriangulation
     from daemon.orientation.exterior_orientation import sealed_exposures
+    from daemon.orientation.orientation_inputs import trajectory_of
     from processing.pipelines.live_triangulation import LiveSettings
 
     folder = Mission.open(mission)
     plan_m = float(np.hypot(*position_sigma[:2]) / np.sqrt(2.0))
     sigmas = SensorSigmas(plan_m, position_sigma[2], attitude_sigma)
     read = sealed_exposures(folder)
-    done = MissionTriangulation(folder, LiveSettings(), sigmas)
+    source = (
+        None if trajectory is None else trajectory_of(folder, read.results.values(), trajectory)
+    )
+    done = MissionTriangulation(folder, LiveSettings(), sigmas, source)
     seconds: list[float] = []
     with folder.held(), Progress(console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("triangulating", total=len(read.results))

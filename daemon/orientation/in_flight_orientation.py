@@ -13,7 +13,12 @@ from typing import Any, Final
 
 from daemon.configuration.model import MountSection
 from daemon.mission.exposure import Exposure, NavigationRecord
-from daemon.orientation.exterior_orientation import ExteriorOrientation, MissingOrientation, orient
+from daemon.orientation.exterior_orientation import (
+    ExteriorOrientation,
+    MissingOrientation,
+    NavigationSource,
+    orient,
+)
 from daemon.orientation.footprints import footprint
 from daemon.orientation.geodesy import metres_per_degree
 from daemon.orientation.georeference import ProjectedPoint
@@ -60,10 +65,12 @@ def orientation_json(
 
 
 def recorded_orientations(
-    exposure: Exposure, rig: Rig, mount: MountSection
+    exposure: Exposure, rig: Rig, mount: MountSection, trajectory: NavigationSource | None = None
 ) -> Iterator[ExteriorOrientation | MissingOrientation]:
-    """Orientation of every cone by the exposure's own record, in local east, north, up."""
-    return orient(exposure, rig, mount, _Recorded(exposure.navigation), _Local())
+    """Orientation of every cone by the exposure's own record, in local east, north, up; by a
+    trajectory in its place, if one is given."""
+    source = _Recorded(exposure.navigation) if trajectory is None else trajectory
+    return orient(exposure, rig, mount, source, _Local())
 
 
 def _head(one: ExteriorOrientation, rig: Rig, ground_m: float) -> dict[str, Any]:

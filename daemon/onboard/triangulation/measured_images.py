@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from daemon.configuration.model import MountSection
 from daemon.mission.exposure import Exposure
-from daemon.orientation.exterior_orientation import ExteriorOrientation
+from daemon.orientation.exterior_orientation import ExteriorOrientation, NavigationSource
 from daemon.orientation.in_flight_orientation import recorded_orientations
 from daemon.orientation.local_frame import LocalFrame
 from processing.pipelines.live_triangulation import MeasuredImage
@@ -35,9 +35,11 @@ class SensorSigmas:
         return np.array([pitch, roll, heading])
 
 
-def oriented(exposure: Exposure, rig: Rig, mount: MountSection) -> ExteriorOrientation | str:
+def oriented(
+    exposure: Exposure, rig: Rig, mount: MountSection, trajectory: NavigationSource | None = None
+) -> ExteriorOrientation | str:
     """Measured orientation of the stitched image; the reason where there is none."""
-    first = next(recorded_orientations(exposure, rig, mount))
+    first = next(recorded_orientations(exposure, rig, mount, trajectory))
     return first if isinstance(first, ExteriorOrientation) else first.reason
 
 

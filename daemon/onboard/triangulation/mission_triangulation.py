@@ -25,7 +25,7 @@ from daemon.onboard.triangulation.findings import (
     findings_of,
 )
 from daemon.onboard.triangulation.measured_images import SensorSigmas, measured_image, oriented
-from daemon.orientation.exterior_orientation import mount_of
+from daemon.orientation.exterior_orientation import NavigationSource, mount_of
 from daemon.orientation.local_frame import LocalFrame
 from daemon.planning.plan_readers import read_plan
 from daemon.planning.relief import TerrainRelief, relief_of
@@ -80,6 +80,7 @@ class MissionTriangulation:
         mission: its folder.
         settings: of the triangulation.
         sigmas: of navigation, where the receiver states none.
+        trajectory: in place of the navigation in the records.
 
     Raises:
         LiveTriangulationError: the rig has no stitched image.
@@ -89,6 +90,7 @@ class MissionTriangulation:
     mission: Mission
     settings: LiveSettings = field(default_factory=LiveSettings)
     sigmas: SensorSigmas = field(default_factory=SensorSigmas)
+    trajectory: NavigationSource | None = None
 
     def __post_init__(self) -> None:
         self.rig: Rig = load_rig(self.mission.rig_path)
@@ -127,7 +129,7 @@ class MissionTriangulation:
         self.is_simulated |= exposure.simulated
         if self.live is not None and any(one.number == number for one in self.live.images):
             return ExposureTriangulated(number, None, "came before", 0.0)
-        eo = oriented(exposure, self.rig, self.mount)
+        eo = oriented(exposure, self.rig, self.mount, self.trajectory)
         if isinstance(eo, str):
             return self._skip(number, eo, begun)
         image = self.rig.virtual_image

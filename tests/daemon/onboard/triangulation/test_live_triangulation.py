@@ -138,7 +138,7 @@ def test_the_command_writes_the_record_and_a_page_and_repeats_to_the_byte(copied
     assert {name: (folder / name).read_bytes() for name in first} == first
 
 
-def test_a_single_strip_says_what_it_cannot_determine(flown) -> None:
+def test_a_single_strip_states_what_it_cannot_determine(flown) -> None:
     done = _replayed(flown.mission, range(1, EACH + 1))
     (finding,) = [f for f in done.findings if f.name == "SINGLE_STRIP"]
     assert "lever arm along the camera's x" in finding.sentence
