@@ -47,7 +47,7 @@ class Drift:
         if not self.calibration_sigma:
             return abs(self.value) / self.sigma
         # An estimate with the calibration as an observation varies by what the images add.
-        expected = max(self.calibration_sigma**2 - self.sigma**2, 1e-30) ** 0.5
+        expected = math.sqrt(max(self.calibration_sigma**2 - self.sigma**2, 1e-30))
         return abs(self.value) / expected
 
     def as_json(self) -> dict[str, Any]:
