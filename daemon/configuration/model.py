@@ -288,6 +288,32 @@ class ProcessingSection(ConfigurationSection):
         return given
 
 
+class TriangulationSection(ConfigurationSection):
+    """Triangulation while flying (docs/how-to/flight/live-triangulation.md).
+
+    Its process has the lowest priority. Standard deviations hold where the receiver states none.
+    """
+
+    enabled: bool = False
+    """Whether exposures are triangulated in flight."""
+    position_sigma_m: float = Field(default=0.05, gt=0)
+    """Standard deviation of each horizontal coordinate of the antenna."""
+    height_sigma_m: float = Field(default=0.08, gt=0)
+    """Standard deviation of its height."""
+    attitude_sigma_mdeg: Vector = (5.0, 5.0, 8.0)
+    """Standard deviations of roll, pitch and heading."""
+    boresight_sigma_mdeg: float = Field(default=6.0, gt=0)
+    """Standard deviation of each angle of the calibrated boresight."""
+    lever_arm_sigma_m: float = Field(default=0.02, gt=0)
+    """Standard deviation of each coordinate of the lever arm."""
+    exposures_max: int = Field(default=600, ge=20, le=2000)
+    """Latest exposures that are adjusted as one block."""
+    memory_max_mb: int = Field(default=1500, ge=500)
+    """Private memory of the process."""
+    landing_timeout_s: float = Field(default=10.0, gt=0, le=600)
+    """Time for the last adjustment after landing."""
+
+
 class LimitsSection(ConfigurationSection):
     """Time limits, and the number of exposures in memory."""
 
@@ -344,6 +370,7 @@ class Configuration(ConfigurationSection):
     pps: Several[NamedDeviceSection] = Field(default=(), max_length=1)
     exposure: ExposureSection = ExposureSection()
     processing: ProcessingSection = ProcessingSection()
+    triangulation: TriangulationSection = TriangulationSection()
     limits: LimitsSection = LimitsSection()
     network: NetworkSection = NetworkSection()
     watch: WatchSection | None = None

@@ -278,6 +278,7 @@ _FAULT_OF_EVENT: Mapping[object, tuple[str, str]] = {
     "override": ("override", "service"),
     "deviation": ("deviation", "guidance"),
     "decisions": ("decisions", "service"),
+    "triangulation-failed": ("triangulation", "triangulation"),
 }
 """Faults and their device, by the event that raises them."""
 _KEYS = ("id", "device", "sentence", "count", "code", "severity")

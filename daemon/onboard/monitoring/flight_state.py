@@ -87,6 +87,7 @@ class FlightState:
         self._history: deque[Json] = deque(maxlen=HISTORY_MAX)
         self._track: deque[Json] = deque(maxlen=HISTORY_MAX)
         self._retakes: list[Json] = []
+        self._triangulation: Json = {}
         self.guidance: Mapping[str, Any] = {}
         """The last guidance; it has no sequence, since the next one replaces it."""
         self.guidance_count = 0
@@ -103,7 +104,14 @@ class FlightState:
         handler = _HANDLERS.get(kind)
         if handler is not None:
             handler(self, event)
-        if kind not in ("status", "counters", "judged", "processed"):
+        if kind not in (
+            "status",
+            "counters",
+            "judged",
+            "processed",
+            "triangulated",
+            "triangulation",
+        ):
             self._events.append({"sequence": self.sequence, **event})
 
     def brief(self) -> Json:
@@ -180,6 +188,10 @@ class FlightState:
                 self.sequence += 1
                 record |= {"sequence": self.sequence, "manual": summary_of(decision)}
 
+    def triangulation(self) -> Json:
+        """The last state of the live triangulation; empty where it is off."""
+        return self._triangulation
+
     def acknowledge(self, fault: str, by: str = "") -> bool:
         """Acknowledge a fault. A cleared one leaves the list; an active one stays."""
         self.sequence += 1
@@ -205,6 +217,7 @@ class FlightState:
         }
         self._phase = "idle"
         self._retakes.clear()
+        self._triangulation = {}
 
     def _on_bound(self, event: Mapping[str, Any]) -> None:
         device = self._device(str(event.get("device")))
@@ -320,6 +333,14 @@ class FlightState:
         keys = ("line", "of", "number", "by", "at", "places_m")
         self._retakes.append({key: event.get(key) for key in keys})
 
+    def _on_triangulated(self, event: Mapping[str, Any]) -> None:
+        latest = {key: value for key, value in event.items() if key not in ("event", "mono_ns")}
+        self._triangulation = {**self._triangulation, "latest": latest}
+
+    def _on_triangulation(self, event: Mapping[str, Any]) -> None:
+        block = {key: value for key, value in event.items() if key not in ("event", "mono_ns")}
+        self._triangulation = {**self._triangulation, "block": block}
+
     def _on_not_processed(self, event: Mapping[str, Any]) -> None:
         record = self._exposure(event)
         record |= {"step": "not processed", "sentence": event.get("sentence")}
@@ -393,6 +414,8 @@ _HANDLERS: Mapping[str, Callable[[FlightState, Mapping[str, Any]], None]] = {
     "sealed": FlightState._on_sealed,
     "judged": FlightState._on_verdict,
     "processed": FlightState._on_processed,
+    "triangulated": FlightState._on_triangulated,
+    "triangulation": FlightState._on_triangulation,
     "not-processed": FlightState._on_not_processed,
     "manual-verdict": FlightState._on_manual_verdict,
     "retake": FlightState._on_retake,

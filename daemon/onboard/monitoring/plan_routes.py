@@ -45,6 +45,11 @@ def add_plan(app: FastAPI, state: FlightState, coverage: Coverage, watcher: Depe
         """Lines, distance and light that are left."""
         return remaining_json(state, coverage)
 
+    @app.get("/api/v1/triangulation", dependencies=[watcher], tags=["plan"])
+    async def triangulation() -> dict[str, Any]:
+        """The live triangulation: accuracy, drifts, findings, what to fly again; empty if off."""
+        return state.triangulation()
+
     @app.get("/api/v1/advice", dependencies=[watcher], tags=["plan"])
     async def advice() -> dict[str, Any]:
         """Insufficient coverage of the plan: gaps, and segments still to be flown."""

@@ -424,3 +424,29 @@ class ProcessFailed:
     number: int
     sentence: str
     report: Mapping[str, Any] = field(default_factory=dict)
+
+
+# To the triangulation
+
+
+@dataclass(frozen=True)
+class TriangulateExposure:
+    """Take in this exposure, which has a sealed record and products."""
+
+    number: int
+
+
+@dataclass(frozen=True)
+class FinishTriangulation:
+    """No more exposures come: adjust the block and write its files."""
+
+
+# From the triangulation
+
+
+@dataclass(frozen=True)
+class TriangulationFinished:
+    """The answer to `FinishTriangulation`; `is_written`: the files are complete."""
+
+    seconds: float
+    is_written: bool

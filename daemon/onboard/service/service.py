@@ -68,6 +68,7 @@ from daemon.onboard.service.startup import (
     writer_process,
 )
 from daemon.onboard.service.supervisor import Supervisor
+from daemon.onboard.service.triangulation_link import TriangulationLink
 from daemon.onboard.storage.mirror import Mirror
 from processing.rig import Rig
 
@@ -101,6 +102,8 @@ class Service:
         self.latches = FaultLatches()
         self.unhandled: tuple[LatchedFault, ...] = ()
         self.monitoring = MonitoringLink(self.supervisor, watch_process(configuration))
+        section = configuration.triangulation
+        self.triangulation = TriangulationLink(self.supervisor, section, self._event)
         self.is_ready = False
         self.is_power_failing = False
         self.failure: str | None = None
@@ -206,7 +209,9 @@ class Service:
             flown_lines=Counter(one.line_id for one in report.finalized),
         )  # fmt: skip
         self.journal = OperatorJournal(
-            mission.path, self.line, self._save_decisions, self._event,
+            mission.path, self.line,
+            lambda content: self.mirror.save_now(f"{self.mission.id}/{DECISIONS_FILE}", content),
+            self._event,
             lambda: self.flight.last_number,
         )  # fmt: skip
         self._note_verdict = self.journal.note
@@ -229,7 +234,7 @@ class Service:
         self.preflight.on_override = self._record_override
         self._emit_previous_faults(mission)
         commands = CommandHandlers(self, self.monitoring.answer, send, self._event)
-        for part in (self.devices, self.sequence, self.mirror, commands):
+        for part in (self.devices, self.sequence, self.mirror, self.triangulation, commands):
             self.dispatcher.add(part.handlers)
         if self.mirror.is_on:
             self.mission_lock.close()  # the writer holds each copy, and never waits here for a disk
@@ -237,6 +242,7 @@ class Service:
         send("worker", BeginProcessing(mission.path))
         self.supervisor.spawn(*capture_process(self.configuration, self.rig, self.rings))
         identified = {"software": self.flight.identity.software, "resumed": self.is_resumed}
+        self.triangulation.start(self.mission.path)
         begin = Decision("begin", time.monotonic_ns(), report.next_number, identified)
         send("writer", AppendToLog(begin.message()))
 
@@ -245,6 +251,7 @@ class Service:
         if mission != self.mission:
             self.mission = mission
             self.supervisor.send("worker", UseMission(mission.path))
+            self.triangulation.use_mission(mission.path)
         self._event("mission", id=mission.id, path=str(mission.path), **self.mission_details)
 
     # Messages of the processes
@@ -277,6 +284,8 @@ class Service:
         if name == WATCH:
             if not self.stopping.is_set():
                 self.monitoring.died()
+        elif name == TriangulationLink.name:
+            self.triangulation.died()
         elif not self.stopping.is_set():
             self._fail(
                 f"process {name} died, and the service ends; what was stored is safe. "
@@ -288,9 +297,6 @@ class Service:
         problem = problem or head_link_problem(self.configuration, bound.name, bound.found)
         if problem is not None:
             self._fail(problem)
-
-    def _save_decisions(self, content: bytes) -> None:
-        self.mirror.save_now(f"{self.mission.id}/{DECISIONS_FILE}", content)
 
     # In flight
 
@@ -343,7 +349,7 @@ class Service:
         if self.line.is_running and (missing := self.preflight.missing_prerequisites()):
             self.preflight.override(IMMEDIATE_START, missing)
         self._follow_phase()
-        await self.line.fly(self._fire, self._disk_full)
+        await self.line.fly(self._fire, lambda why: self._event("disk", fault=True, sentence=why))
         await self._until(lambda: not self._is_unfinished(), NO_TIMEOUT_S)
         self._event("done")
         if self.configuration.mission.end_when_done:
@@ -408,9 +414,6 @@ class Service:
         self.exposure.ordered(order.number, self.flight.order_details(order.number)["line_id"])
         self.changed.set()
 
-    def _disk_full(self, sentence: str) -> None:
-        self._event("disk", fault=True, sentence=sentence)
-
     async def _until(self, condition: Callable[[], bool], limit_s: float) -> bool:
         """Wait for a condition that messages change; False after the time-out."""
         deadline = time.monotonic() + limit_s
@@ -443,6 +446,7 @@ class Service:
         await asyncio.gather(*tasks, return_exceptions=True)
         self.mirror.land(ends_mission=self.failure is None)
         await self.supervisor.end(("capture", "worker", "writer"))
+        await self.triangulation.land(adjusts=self.failure is None and not self.is_power_failing)
 
     def _power_fails(self) -> None:
         """Handle the power-fail signal: the supply ends within seconds.
@@ -487,6 +491,7 @@ class Service:
         self._note_verdict(message)
         self.events(message)
         self.monitoring.emit(message)
+        self.triangulation.note(message)
 
     def _fail(self, sentence: str) -> None:
         self.stopping.set()

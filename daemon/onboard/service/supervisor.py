@@ -17,7 +17,7 @@ from daemon.onboard.service.processes import ChildProcess
 ANSWER_LIMIT_S: Mapping[str, float] = {"capture": 10.0, "writer": 60.0, "worker": 120.0}
 """How long a process may be silent before the watchdog is no longer fed: a writer waits for its
 disk, a worker finishes its exposure."""
-RESTART_LIMIT_S: Mapping[str, float] = {"watch": 60.0}
+RESTART_LIMIT_S: Mapping[str, float] = {"watch": 60.0, "triangulation": 300.0}
 """How long a process on which no exposure depends may be silent before it is ended. It is started
 again as after any other end; the watchdog is fed meanwhile."""
 END_TIMEOUT_S = 5.0

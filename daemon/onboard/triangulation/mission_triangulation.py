@@ -109,6 +109,7 @@ class MissionTriangulation:
         self.findings: tuple[TriangulationFinding, ...] = ()
         self.heights: HeightModelCheck | None = None
         self.block_seconds = 0.0
+        self.block_count = 0
         self.has_landed = False
         self.is_simulated = False
         self._relief = self._read_relief()
@@ -170,6 +171,7 @@ class MissionTriangulation:
         begun = time.perf_counter()
         self.live.adjust_block()
         self.block_seconds = time.perf_counter() - begun
+        self.block_count += 1
         self._find()
 
     def land(self) -> None:

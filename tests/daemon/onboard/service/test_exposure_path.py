@@ -26,7 +26,7 @@ ANY_ORDER = {"Frame", "Fired"}
 """A software trigger answers after the first frames."""
 TRANSPORT = {"daemon/onboard/service/processes.py", "daemon/onboard/service/messages.py"}
 OTHER_EVENTS = re.compile(
-    r"/(fault_latches|event_table|devices|device_states|arming|phases|preflight|mirror|notify|operator_journal)\.py$"
+    r"/(fault_latches|event_table|devices|device_states|arming|phases|preflight|mirror|notify|operator_journal|triangulation_link)\.py$"
 )
 """What follows the state of devices, disks, faults and operators."""
 
