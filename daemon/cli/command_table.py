@@ -66,6 +66,7 @@ TABLE: Final = {
         _command("transfer", _GROUND, "Copy a mission to another disk and verify every file."),
         _command("report", _GROUND, "Write the mission report as one HTML file."),
         _command("process", _GROUND, "Process exposures again, Level-0 to Level-2."),
+        _command("worker", _GROUND, "Join a cluster with the cores of this machine."),
         _command("pansharpen", _GROUND, "Compute Level-3: pansharpened RGB and CIR images."),
         _command(
             "replay", _GROUND, "Replay a recorded flight through the code and compare hashes."

@@ -45,6 +45,7 @@ PROBLEMS: Final = {
     "transfer": "a copy differs from its source, or could not be written",
     "report": "a section of the report could not be computed",
     "process": "an exposure could not be processed; the others are done",
+    "worker": "no scheduler answers",
     "pansharpen": "an exposure could not be processed; the others are done",
     "replay": "a result differs from the recorded one",
     "orient": "the orientation of an exposure cannot be computed",

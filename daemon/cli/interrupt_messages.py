@@ -29,6 +29,7 @@ SENTENCES = {
         "the products of exposures processed so far are complete and all others are as before; "
         f"{RETRY_HINT}, or name the remaining exposures with --only"
     ),
+    "worker": f"exposures in work are finished or computed elsewhere; {RETRY_HINT} to join again",
     "pansharpen": (
         f"the images computed so far are complete and all others are as before; {RETRY_HINT} to "
         "compute the others"

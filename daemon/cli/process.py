@@ -3,15 +3,27 @@
 from __future__ import annotations
 
 import json
-import os
-import time
+from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from pydantic import ValidationError
-from rich.progress import Progress
 
+from daemon.cli.batch_options import (
+    DryRun,
+    Processes,
+    Scheduler,
+    Threads,
+    TlsCa,
+    TlsCertificate,
+    TlsKey,
+    cluster_executor,
+    executor_for,
+    process_plan,
+    shown_progress,
+)
 from daemon.cli.exit_status import exit_if_failed
 from daemon.cli.level2_tables import print_reports
 from daemon.cli.options import AsJson
@@ -23,17 +35,28 @@ from daemon.terminal.console import Console
 from processing.image.kernels import DEFAULT_INTERPOLATION, INTERPOLATIONS
 from processing.rig.problem_sentences import findings_of, sentences
 
+if TYPE_CHECKING:
+    from daemon.postflight.batch.capacity import ProcessAllocation
+    from daemon.postflight.batch.executor import BatchExecutor
+    from daemon.postflight.batch.level2_work import Level2Survey, Level2Work
+
 HELP = """Process the exposures of a mission folder again, Level-0 to Level-2.
 
 The folder is from a flight, imported, or written by hand after docs/reference/formats.md. Level-0
 is not changed; products are replaced. A rig without a virtual image gives one raster per band, or,
 if its heads have diverging axes, one perspective image per head.
 
+Products whose manifest has the key of the same inputs, calibration, settings, code and CPU family
+are complete and are not computed again (--again computes them). A run may be stopped, started
+again, and run twice at once.
+
 Every frame is compared with the hash in its record, and record, file and rig with each other
 (docs/reference/formats.md). An exposure that cannot be processed is listed at the end with its
-cause; the others are done. Only one command at a time writes into a mission.
+cause; the others are done. No other command writes into the mission at the same time.
 
-Examples: `syntopic process MISSION`, `syntopic process MISSION --only 3 --method fixed`
+Examples: `syntopic process MISSION`, `syntopic process MISSION --only 3 --method fixed`,
+`syntopic process MISSION --dry-run`, `syntopic process MISSION --processes 8 --json`,
+`syntopic process MISSION --scheduler tcp://127.0.0.1:8786`
 """
 
 
@@ -59,79 +82,161 @@ def process(
     baselines: Annotated[
         bool, typer.Option(help="Comparison with the fixed method, with and without TDM.")
     ] = False,
-    threads: Annotated[int, typer.Option(help="Number of threads.")] = 2,
+    threads: Threads = None,
+    processes: Processes = None,
+    again: Annotated[bool, typer.Option("--again", help="Compute complete products again.")] = (
+        False
+    ),
+    scheduler: Scheduler = None,
+    tls_ca: TlsCa = None,
+    tls_certificate: TlsCertificate = None,
+    tls_key: TlsKey = None,
+    dry_run: DryRun = False,
     as_json: AsJson = False,
 ) -> None:
-    os.environ.setdefault("NUMBA_NUM_THREADS", str(threads))
-    from daemon.mission.canonical_json import sha256_hex
-    from daemon.mission.exposure_batch import for_each_exposure
-    from daemon.mission.store import store
     from daemon.mission.store.level2 import recover_level2
-    from daemon.orientation.ground_model import ground_of
     from daemon.planning.overlaps import overlaps_of
-    from daemon.products.exposure_products import FlightGeometry, process_exposure
-    from daemon.products.processor import processor_for
-    from processing.radiometry.calibration import CalibrationError
+    from daemon.postflight.batch.level2_work import Level2Work, survey
+    from daemon.postflight.batch.software_identity import software_identity
     from processing.rig import load_rig
 
     if method not in ("free", "fixed") or interpolation not in INTERPOLATIONS:
         raise ConfigurationError(
             [f"--method is free or fixed, --interpolation one of {', '.join(INTERPOLATIONS)}"]
         )
+    cluster = None
+    if scheduler is not None:
+        cluster = cluster_executor(scheduler, tls_ca, tls_certificate, tls_key)
     folder = Mission.open(mission)
     rig = load_rig(rig_file or folder.rig_path)
-    calibration_sha256 = "" if rig_file else sha256_hex(folder.rig_path.read_bytes())
     plan, radiometry = as_flown(folder, radiometry, elevation)
     processing = ProcessingSection.model_validate(
         {
             "method": method,
             "interpolation": interpolation,
             "baselines": baselines,
-            "threads": threads,
             "thresholds": flown_thresholds(folder),
         }
     )
-    mount, _ = mount_of(folder)
-    overlaps = overlaps_of(folder, rig)
-    geometry = FlightGeometry(mount, plan, ground_of(rig, mount, plan))
-    with folder.held(), Progress(console=Console(stderr=True), transient=True) as progress:
-        recover_level2(folder)
-        task = progress.add_task("compiling kernels", total=None)
-        try:
-            processor = processor_for(rig, folder, processing, radiometry)
-        except ValueError as error:
-            raise ConfigurationError([str(error)]) from error
-        try:
-            processor.warm_up()
-        except CalibrationError as error:
-            raise ConfigurationError([str(error)]) from error
+    work = Level2Work(
+        mission=folder.path.absolute(),
+        rig_file=rig_file and rig_file.absolute(),
+        processing=processing,
+        plan=plan,
+        radiometry=radiometry and radiometry.absolute(),
+        identity=software_identity(),
+        recomputes=again,
+    )
+    with nullcontext() if dry_run else folder.held(is_shared=True):
+        if not dry_run:
+            recover_level2(folder)
+        found = survey(work, folder, only or folder.numbers(), overlaps_of(folder, rig))
+        placed = process_plan(work.memory_nbytes, len(found.pending), processes, threads)
+        if dry_run:
+            _print_dry_run(folder, found, placed, as_json=as_json)
+            return
+        executor = executor_for(placed, processes)
+        if cluster is not None:
+            executor, placed = cluster, replace(placed, threads=threads or 1, reason="its workers")
+        _run(folder, work.with_threads(placed.threads), found, executor, placed, as_json=as_json)
 
-        def process_one(number: int) -> dict[str, Any]:
-            started = time.monotonic()
-            frames, exposure = store.load_level0(
-                folder.level0(number), rig, calibration_sha256=calibration_sha256
-            )
-            report = process_exposure(
-                processor, folder, geometry, exposure, frames, overlaps.of(number)
-            )
-            return {**report, "duration_s": round(time.monotonic() - started, 3)}
 
-        numbers = only or folder.numbers()
-        progress.update(task, description="processing", total=len(numbers))
-        done = for_each_exposure(
-            numbers, process_one, lambda count: progress.update(task, completed=count)
+def _run(
+    folder: Mission,
+    work: Level2Work,
+    found: Level2Survey,
+    executor: BatchExecutor,
+    placed: ProcessAllocation,
+    *,
+    as_json: bool,
+) -> None:
+    """Compute what is pending and print the reports of all exposures."""
+    from daemon.postflight.batch.batch_run import BatchOutcome, run_batch
+    from daemon.postflight.batch.level2_work import replaced_meanwhile, report_of
+    from processing.radiometry.calibration import CalibrationError
+
+    outcome, console = BatchOutcome(), Console(stderr=True)
+    complete = len(found.complete)
+    if found.pending:
+        console.print(
+            f"{len(found.pending)} exposures to compute, {complete} complete; "
+            f"{executor.description}, {placed.threads} threads each ({placed.reason})",
+            highlight=False,
         )
-    reports = list(done.results.values())
+        with shown_progress("processing", complete + len(found.pending), complete) as show:
+            try:
+                outcome = run_batch(executor, work, found.pending, show)
+            except (ValueError, CalibrationError) as error:
+                raise ConfigurationError([str(error)]) from error
+    elif not complete:
+        _refuse_unsuitable(folder, work)
+    reports = dict(outcome.results)
+    for number, key in found.complete.items():
+        reports[number] = report_of(folder, number, key)
+    failures = [*outcome.failures, *replaced_meanwhile(folder, found, outcome)]
+    ordered = [reports[number] for number in sorted(reports)]
     if as_json:
-        failures = [failure.as_json() for failure in done.failures]
-        content = {"mission": str(folder.path), "exposures": reports, "failures": failures}
+        content = {
+            "mission": str(folder.path),
+            "exposures": ordered,
+            "failures": [failure.as_json() for failure in failures],
+            "complete_before": complete,
+            "executor": executor.description,
+            "threads": placed.threads,
+            "interrupted": outcome.is_interrupted,
+            **outcome.counts.as_json(),
+        }
         typer.echo(json.dumps(content))
     else:
-        console = Console()
-        if reports:
-            print_reports(console, f"Level-2 of {folder.id}", reports)
-        console.print(f"Products are in {folder.level2_root}")
-    exit_if_failed(done.failures)
+        output = Console()
+        if ordered:
+            print_reports(output, f"Level-2 of {folder.id}", ordered)
+        output.print(f"Products are in {folder.level2_root}")
+    if outcome.is_interrupted:
+        raise KeyboardInterrupt
+    exit_if_failed(failures)
+
+
+def _refuse_unsuitable(folder: Mission, work: Level2Work) -> None:
+    """Refuse a rig or calibration that cannot be used, where no exposure would show it."""
+    from daemon.products.processor import processor_for
+
+    try:
+        processor_for(work.rig, folder, work.processing, work.radiometry)
+    except ValueError as error:
+        raise ConfigurationError([str(error)]) from error
+
+
+def _print_dry_run(
+    folder: Mission, found: Level2Survey, placed: ProcessAllocation, *, as_json: bool
+) -> None:
+    count = len(found.pending)
+    expected_s = None
+    if found.expected_s is not None:
+        expected_s = round(found.expected_s * count / max(1, placed.processes), 1)
+    if as_json:
+        content = {
+            "mission": str(folder.path),
+            "complete": sorted(found.complete),
+            "pending": [task.number for task in found.pending],
+            "read_nbytes": found.pending_nbytes,
+            "processes": placed.processes,
+            "threads": placed.threads,
+            "expected_s": expected_s,
+        }
+        typer.echo(json.dumps(content))
+        return
+    console = Console(soft_wrap=True)
+    time_text = "unknown: no exposure of this mission was processed before"
+    if expected_s is not None:
+        time_text = f"{expected_s:.0f} s, from the durations of earlier runs"
+    console.print(
+        f"{count} exposures to compute, {len(found.complete)} complete\n"
+        f"To read: {found.pending_nbytes / 1e9:.3f} GB\n"
+        f"Processes: {placed.processes}, {placed.threads} threads each ({placed.reason})\n"
+        f"Expected time: {time_text}",
+        highlight=False,
+    )
 
 
 def flown_thresholds(folder: Mission) -> dict[str, float]:

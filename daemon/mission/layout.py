@@ -304,15 +304,18 @@ class Mission:
         return is_locked(self.path)
 
     @contextmanager
-    def held(self) -> Iterator[None]:
+    def held(self, *, is_shared: bool = False) -> Iterator[None]:
         """Keep other writers out of the mission until the block ends.
 
         Every writer of a mission holds this lock; readers do not.
 
+        Args:
+            is_shared: admit other holders that share: runs that commit by manifests.
+
         Raises:
             MissionError: another process holds it; the sentence names it.
         """
-        with writer_lock(self.path):
+        with writer_lock(self.path, is_shared=is_shared):
             yield
 
     def _used_numbers(self) -> Iterator[int]:

@@ -1,4 +1,4 @@
-"""One writer per mission: a lock file that names its holder.
+"""One writer per mission, or several runs that commit by manifests: a lock file with its holder.
 
 The kernel's lock (flock) decides; it ends with its process, however that dies. The file's content
 is only for the sentence that refuses a second writer.
@@ -31,8 +31,13 @@ class MissionError(DaemonError):
 
 
 @contextmanager
-def writer_lock(mission: Path) -> Iterator[None]:
+def writer_lock(mission: Path, *, is_shared: bool = False) -> Iterator[None]:
     """Hold a mission against every other writer until the block ends.
+
+    Args:
+        mission: its folder.
+        is_shared: admit other holders that share, which commit by manifests
+            (`daemon.mission.store.product_manifests`).
 
     Raises:
         MissionError: another process holds it; the sentence names that process. Or the lock
@@ -49,17 +54,19 @@ def writer_lock(mission: Path) -> Iterator[None]:
         ) from error
     try:
         try:
-            _lock(descriptor)
+            _lock(descriptor, fcntl.LOCK_SH if is_shared else fcntl.LOCK_EX)
         except BlockingIOError as error:
             raise MissionError(
                 f"mission {mission.resolve().name} is held by another process"
                 f"{_holder(descriptor)}. Wait until it has finished, or stop it first"
             ) from error
-        _write(descriptor, _myself())
+        own = _myself()
+        _write(descriptor, own)
         try:
             yield
         finally:
-            _write(descriptor, b"")
+            if os.pread(descriptor, _HOLDER_MAX_BYTES, 0) == own:
+                _write(descriptor, b"")
     finally:
         os.close(descriptor)
 
@@ -71,7 +78,7 @@ def is_locked(mission: Path) -> bool:
     except FileNotFoundError:
         return False
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         return True
     finally:
@@ -79,7 +86,7 @@ def is_locked(mission: Path) -> bool:
     return False
 
 
-def _lock(descriptor: int) -> None:
+def _lock(descriptor: int, how: int) -> None:
     """Take the lock. `is_locked` of another process may have it for an instant: ask again.
 
     Raises:
@@ -87,10 +94,10 @@ def _lock(descriptor: int) -> None:
     """
     for _ in range(_ATTEMPTS - 1):
         with suppress(BlockingIOError):
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(descriptor, how | fcntl.LOCK_NB)
             return
         time.sleep(_BETWEEN_ATTEMPTS_S)
-    fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    fcntl.flock(descriptor, how | fcntl.LOCK_NB)
 
 
 def _myself() -> bytes:

@@ -17,6 +17,15 @@ import numba
 Result = TypeVar("Result")
 
 
+def usable_count(count: int) -> int:
+    """Exposures that one process can have in work: one if numba has only its own thread pool.
+
+    Args:
+        count: as requested. Call it after the first kernel ran.
+    """
+    return 1 if numba.threading_layer() == "workqueue" else count
+
+
 class Cloneable(Protocol):
     """A processor of one exposure at a time that can be cloned."""
 
@@ -37,7 +46,7 @@ class PipelinePool(Generic[PipelineT]):
     """
 
     def __init__(self, first: PipelineT, count: int) -> None:
-        self.count = 1 if numba.threading_layer() == "workqueue" else count
+        self.count = usable_count(count)
         self._free: SimpleQueue[PipelineT] = SimpleQueue()
         self._free.put(first)
         for _ in range(self.count - 1):

@@ -35,6 +35,7 @@ EXTRAS: Final[Mapping[str, OptionalDependency]] = {
         "tables of missions need geopandas and pyarrow", ("geopandas", "pyarrow")
     ),
     "stores": OptionalDependency("object stores need obstore", ("obstore",)),
+    "cluster": OptionalDependency("clusters need dask.distributed", ("distributed",)),
     "plots": OptionalDependency("plots of reports need matplotlib", ("matplotlib",)),
     "colmap": OptionalDependency("COLMAP's database needs pycolmap", ("pycolmap",)),
     "mavlink": OptionalDependency("MAVLink needs pymavlink", ("pymavlink",)),

@@ -26,6 +26,7 @@ _REASONS: tuple[tuple[str, str], ...] = (
     (f"L0/{DISCARDED}/", "set aside by recovery; it was never stored"),
     ("L2/", "products, made again from Level-0 (syntopic process)"),
     ("L3/", "products, made again from Level-2 (syntopic pansharpen)"),
+    ("manifests/", "hashes of products, written again with them (syntopic process)"),
     ("export/", "derived from the mission for other programs"),
 )
 """Beginning of a path, and why such a file has no hash."""

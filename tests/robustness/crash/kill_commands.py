@@ -84,7 +84,7 @@ class CommandBench:
         """The command line."""
         options = {
             "transfer": [str(self.disk), "--remove-source"],
-            "process": ["--threads", "1"],
+            "process": ["--threads", "1", "--processes", "0", "--again"],
             "repair": ["--rebuild"],
         }
         return [command, str(self.mission), *options.get(command, [])]

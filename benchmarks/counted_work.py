@@ -1,0 +1,64 @@
+"""Level-2 whose attempts are noted, with a store that fails some of its calls.
+
+Used by `benchmarks.killed_workers`; worker processes import it by name.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import random
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from daemon.mission.layout import Mission
+from daemon.mission.store import product_manifests
+from daemon.postflight.batch.executor import BatchAction, BatchTask
+from daemon.postflight.batch.level2_work import Level2Work
+
+
+@dataclass(frozen=True)
+class CountedWork:
+    """Level-2 whose attempts are noted in a file, with a store that fails some calls."""
+
+    work: Level2Work
+    attempts: Path
+    failure_share: float
+
+    @property
+    def threads(self) -> int:
+        return self.work.threads
+
+    @property
+    def memory_nbytes(self) -> int:
+        return self.work.memory_nbytes
+
+    def open(self) -> CountedAction:
+        return CountedAction(self, self.work.open())
+
+
+class CountedAction:
+    """One line before each computation, with what happens to it."""
+
+    def __init__(self, counted: CountedWork, action: BatchAction) -> None:
+        self._counted, self._action = counted, action
+        flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT
+        self._attempts = os.open(counted.attempts, flags, 0o644)
+
+    def clone(self) -> CountedAction:
+        return CountedAction(self._counted, self._action.clone())
+
+    def __call__(self, task: BatchTask) -> Any:
+        mission = self._counted.work.mission
+        for call in ("read", "write"):
+            if random.random() < self._counted.failure_share:
+                os.write(self._attempts, f"{task.number} {call} failed\n".encode())
+                raise OSError(errno.ETIMEDOUT, os.strerror(errno.ETIMEDOUT), str(mission))
+        is_there = product_manifests.is_complete(
+            Mission(mission, mission.name), task.number, task.payload.key
+        )
+        line = "recognized" if is_there else "computed"
+        os.write(self._attempts, f"{task.number} {line}\n".encode())
+        result = self._action(task)
+        return {"exposure": result["exposure"]}

@@ -1,0 +1,284 @@
+"""Manifests of products: the commit of a computation, by the key of what it was computed from.
+
+The manifest of an exposure's products is `manifests/L2/000123/KEY.json`. It is written after the
+products have their final name, by link(2), so that of two writers one succeeds. A product set is
+complete when the manifest of its key exists and the files agree with it. Host, versions and
+duration are in `KEY.provenance.json`, outside of what is compared between two runs.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from daemon import DaemonError
+from daemon.mission.canonical_json import RecordError, canonical_bytes, parse_record, sha256_hex
+from daemon.mission.layout import Mission, exposure_name
+from daemon.mission.store import durable, level2
+from daemon.mission.store.publication import StagedFolder
+
+MANIFESTS: Final = "manifests"
+REPORT_FILE: Final = "quality.json"
+UNCOMPARED_KEYS: Final = frozenset({"timings_s", "duration_s"})
+"""Keys of quality.json that state how long things took."""
+
+_FORMAT: Final = 1
+_KEY_CHARACTERS: Final = 64
+
+Parts = Sequence[bytes | memoryview]
+
+
+class ClaimedElsewhereError(DaemonError):
+    """Another process computes the products of this exposure now."""
+
+
+@dataclass(frozen=True)
+class ProductFile:
+    """Size and hash of one file."""
+
+    nbytes: int
+    sha256: str
+
+
+@dataclass(frozen=True)
+class ProductManifest:
+    """Files of a complete product set, by name.
+
+    `compared_sha256` is the hash over all names and contents, without the durations in
+    quality.json: two computations of one key agree in it.
+    """
+
+    key: str
+    files: Mapping[str, ProductFile]
+    compared_sha256: str
+
+    def as_json(self) -> dict[str, Any]:
+        """As an object of JSON types."""
+        files = {
+            name: {"nbytes": file.nbytes, "sha256": file.sha256}
+            for name, file in self.files.items()
+        }
+        return {
+            "format": _FORMAT,
+            "key": self.key,
+            "compared_sha256": self.compared_sha256,
+            "files": files,
+        }
+
+
+def manifest_folder(mission: Mission, number: int) -> Path:
+    """The folder of an exposure's manifest."""
+    return mission.path / MANIFESTS / mission.level2_root.name / exposure_name(number)
+
+
+def read_manifest(mission: Mission, number: int, key: str) -> ProductManifest | None:
+    """The manifest of a key; None where there is none that can be read.
+
+    Args:
+        mission: of the exposure.
+        number: of the exposure.
+        key: SHA-256 of what the products are computed from.
+    """
+    path = manifest_folder(mission, number) / f"{key}.json"
+    try:
+        content = parse_record(path.read_bytes(), path.name)
+        files = {
+            str(name): ProductFile(int(file["nbytes"]), str(file["sha256"]))
+            for name, file in content["files"].items()
+        }
+        found = ProductManifest(str(content["key"]), files, str(content["compared_sha256"]))
+    except (OSError, RecordError, KeyError, TypeError, ValueError, AttributeError):
+        return None
+    return found if found.key == key else None
+
+
+def is_complete(mission: Mission, number: int, key: str) -> bool:
+    """Whether the products of this key are there, by looking at them.
+
+    Compared are the names and sizes of all files and the hash of the quality report, which is
+    different in every computation. `product_problems` compares every byte.
+
+    Args:
+        mission: of the exposure.
+        number: of the exposure.
+        key: SHA-256 of what the products are computed from.
+    """
+    manifest = read_manifest(mission, number, key) if key else None
+    if manifest is None:
+        return False
+    folder = mission.level2(number)
+    try:
+        with os.scandir(folder) as entries:
+            sizes = {
+                entry.name: entry.stat(follow_symlinks=False).st_size
+                for entry in entries
+                if entry.is_file(follow_symlinks=False)
+            }
+        report = (folder / REPORT_FILE).read_bytes()
+    except OSError:
+        return False
+    is_listed = sizes == {name: file.nbytes for name, file in manifest.files.items()}
+    return is_listed and sha256_hex(report) == manifest.files[REPORT_FILE].sha256
+
+
+def provenance_of(mission: Mission, number: int, key: str) -> dict[str, Any]:
+    """Host, versions and duration of a computation; empty where they are not known.
+
+    Args:
+        mission: of the exposure.
+        number: of the exposure.
+        key: SHA-256 of what the products are computed from.
+    """
+    path = manifest_folder(mission, number) / f"{key}.provenance.json"
+    try:
+        return parse_record(path.read_bytes(), path.name)
+    except (OSError, RecordError):
+        return {}
+
+
+@contextmanager
+def claimed(mission: Mission, number: int) -> Iterator[None]:
+    """Keep other processes from computing the same exposure until the block ends.
+
+    The kernel's lock ends with its process, however that dies. A file system without locks
+    permits two computations; the first manifest is the commit all the same.
+
+    Raises:
+        ClaimedElsewhereError: another process or thread computes it now.
+        OSError: the disk refused.
+    """
+    folder = manifest_folder(mission, number)
+    durable.make_directories(folder)
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+    try:
+        with suppress(OSError):
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise ClaimedElsewhereError(
+                    f"exposure {number} is being computed by another process"
+                ) from None
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def publish(
+    mission: Mission, number: int, key: str, contents: Mapping[str, Parts]
+) -> ProductManifest:
+    """Write products, give them their final name, and return their manifest, not yet committed.
+
+    Manifests of other keys are removed before: their products are replaced. Call it in `claimed`.
+
+    Args:
+        mission: of the exposure.
+        number: of the exposure.
+        key: SHA-256 of what the products are computed from.
+        contents: bytes by file name, with quality.json.
+
+    Raises:
+        OSError: the disk refused; an earlier product set is still there.
+    """
+    with closing(StagedFolder(mission.level2(number))) as staged, ThreadPoolExecutor(1) as hashing:
+        hashes = {name: hashing.submit(_sha256, parts) for name, parts in contents.items()}
+        sizes = level2.write_files(staged.part, contents)
+        files = {name: ProductFile(sizes[name], hashes[name].result()) for name in sorted(sizes)}
+        _revoke(mission, number)
+        staged.publish()
+    report = parse_record(b"".join(contents[REPORT_FILE]), REPORT_FILE)
+    return ProductManifest(key, files, _compared_sha256(files, report))
+
+
+def commit(
+    mission: Mission, number: int, manifest: ProductManifest, provenance: Mapping[str, Any]
+) -> bool:
+    """Commit published products: provenance first, the manifest last and at most once.
+
+    Args:
+        mission: of the exposure.
+        number: of the exposure.
+        manifest: as `publish` returned it.
+        provenance: host, versions and duration.
+
+    Returns:
+        Whether this call committed; False where the key was committed already.
+
+    Raises:
+        OSError: the disk refused.
+    """
+    folder = manifest_folder(mission, number)
+    path = folder / f"{manifest.key}.json"
+    try:
+        if path.exists():
+            return False
+        durable.replace_file(
+            folder / f"{manifest.key}.provenance.json", canonical_bytes(dict(provenance))
+        )
+        with durable.new_file(path, replaces=False) as part:
+            part.write_bytes(canonical_bytes(manifest.as_json()))
+    except FileExistsError:
+        return False
+    return True
+
+
+def product_problems(mission: Mission, number: int, key: str) -> list[str]:
+    """What of a committed product set is missing or was altered, one sentence each.
+
+    Args:
+        mission: of the exposure.
+        number: of the exposure.
+        key: SHA-256 of what the products were computed from.
+    """
+    manifest = read_manifest(mission, number, key)
+    if manifest is None:
+        return [f"exposure {number}: no manifest of key {key[:12]}"]
+    folder, problems = mission.level2(number), []
+    for name, file in manifest.files.items():
+        try:
+            with (folder / name).open("rb") as opened:
+                found = hashlib.file_digest(opened, "sha256").hexdigest()
+        except OSError as error:
+            problems.append(f"{folder.name}/{name}: {error.strerror}")
+            continue
+        if found != file.sha256:
+            problems.append(f"{folder.name}/{name}: differs from its manifest")
+    return problems
+
+
+def committed_keys(mission: Mission, number: int) -> list[str]:
+    """Keys with a manifest; there is at most one that the products agree with."""
+    try:
+        names = [path.stem for path in manifest_folder(mission, number).glob("*.json")]
+    except OSError:
+        return []
+    return sorted(name for name in names if len(name) == _KEY_CHARACTERS)
+
+
+def _revoke(mission: Mission, number: int) -> None:
+    folder = manifest_folder(mission, number)
+    found = list(folder.glob("*.json"))
+    for path in found:
+        path.unlink(missing_ok=True)
+    if found:
+        durable.sync_directory(folder)
+
+
+def _sha256(parts: Parts) -> str:
+    digest = hashlib.sha256()
+    for part in parts:
+        digest.update(part)
+    return digest.hexdigest()
+
+
+def _compared_sha256(files: Mapping[str, ProductFile], report: Mapping[str, Any]) -> str:
+    compared = {key: value for key, value in report.items() if key not in UNCOMPARED_KEYS}
+    hashes = {name: file.sha256 for name, file in files.items()}
+    hashes[REPORT_FILE] = sha256_hex(canonical_bytes(compared))
+    return sha256_hex(canonical_bytes(hashes))

@@ -1,0 +1,1 @@
+"""One action for every exposure of a mission: in process, in processes, on a cluster."""

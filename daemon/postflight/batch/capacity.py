@@ -1,0 +1,91 @@
+"""How many worker processes a machine has cores and memory for."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from processing.rig import Rig
+
+PROCESS_NBYTES: Final = 300_000_000
+"""Interpreter, libraries and kernels of one process."""
+FRAMES_FACTOR: Final = 5
+"""Memory of one exposure in work, in sizes of its raw frames (benchmarks/records/memory.json)."""
+MEMORY_SHARE: Final = 0.8
+"""Of the available memory; the rest is for the page cache that the disk is written through."""
+
+
+@dataclass(frozen=True)
+class ProcessAllocation:
+    """Processes and the threads of each; `reason` names what limits them."""
+
+    processes: int
+    threads: int
+    reason: str
+
+
+def exposure_nbytes(rig: Rig) -> int:
+    """Memory of a process with one exposure of this rig in work."""
+    frames = sum(2 * sensor.width_px * sensor.height_px for sensor in rig.sensors)
+    return PROCESS_NBYTES + FRAMES_FACTOR * frames
+
+
+def plan_processes(
+    task_nbytes: int,
+    tasks: int,
+    *,
+    cores: int,
+    available_nbytes: int,
+    threads: int | None = None,
+) -> ProcessAllocation:
+    """As many processes as cores, memory and tasks allow; at least one.
+
+    Args:
+        task_nbytes: memory of one process with a task.
+        tasks: number of tasks.
+        cores: that this process may use.
+        available_nbytes: memory that is free, or can be.
+        threads: of one process, where a person chose it.
+    """
+    by_cores = max(1, cores // (threads or 1))
+    by_memory = max(1, int(available_nbytes * MEMORY_SHARE) // max(1, task_nbytes))
+    count = max(1, min(by_cores, by_memory, tasks))
+    own_threads = threads or max(1, cores // count)
+    limit = "cores" if count == by_cores else "memory" if count == by_memory else "exposures"
+    reason = (
+        f"{cores} cores, {available_nbytes / 1e9:.1f} GB of memory available, "
+        f"{task_nbytes / 1e9:.1f} GB for an exposure; limited by {limit}"
+    )
+    return ProcessAllocation(count, own_threads, reason)
+
+
+def usable_cores() -> int:
+    """Cores that this process may run on."""
+    return len(os.sched_getaffinity(0))
+
+
+def available_memory_nbytes() -> int:
+    """Memory available to new work: of the machine, or of the control group if that is less.
+
+    Source: proc(5), MemAvailable; Linux kernel documentation, Control Group v2, memory.max.
+    """
+    fields = dict(
+        line.split(":", 1) for line in Path("/proc/meminfo").read_text("ascii").splitlines()
+    )
+    machine = int(fields["MemAvailable"].split()[0]) * 1024
+    group = _group_free_nbytes(Path("/sys/fs/cgroup"))
+    return machine if group is None else min(machine, group)
+
+
+def _group_free_nbytes(folder: Path) -> int | None:
+    try:
+        limit = int((folder / "memory.max").read_text("ascii"))
+        used = int((folder / "memory.current").read_text("ascii"))
+        statistics = dict(
+            line.split() for line in (folder / "memory.stat").read_text("ascii").splitlines()
+        )
+    except (OSError, ValueError):
+        return None
+    return max(0, limit - used + int(statistics.get("inactive_file", 0)))

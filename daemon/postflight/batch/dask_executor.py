@@ -1,0 +1,352 @@
+"""Executor on a dask.distributed cluster that the user started.
+
+The scheduler places tasks and remembers nothing that counts: products are committed by their
+manifests. When it dies and is started again at the same address, by whoever supervises it, the
+tasks that were in work are submitted again, and what was finished meanwhile is recognized.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import pickle
+import queue
+import threading
+import time
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any, Final
+
+import dask
+import distributed
+
+from daemon import DaemonError
+from daemon.postflight.batch.cluster_address import ClusterAddress, is_loopback
+from daemon.postflight.batch.executor import (
+    BatchAction,
+    BatchTask,
+    BatchWork,
+    TaskFailed,
+    TaskLost,
+    TaskOutcome,
+)
+from daemon.postflight.batch.local_processes import OPEN_TIMEOUT_S, outcome_of
+
+CONNECT_TIMEOUT_S: Final = 15.0
+WORKERS_TIMEOUT_S: Final = 60.0
+RECONNECT_TIMEOUT_S: Final = 120.0
+"""How long a scheduler may be away before the run ends."""
+RESULT_TIMEOUT_S: Final = 60.0
+QUEUED_FACTOR: Final = 2
+"""Tasks submitted for each thread of a worker: one in work, one waiting next to it."""
+CHECKED_PACKAGES: Final = ("dask", "distributed", "msgpack", "cloudpickle")
+"""Packages whose versions must be the same, for both sides to understand each other."""
+
+
+class ClusterError(DaemonError):
+    """A cluster that cannot be used; the message states what to do."""
+
+
+class WorkRefused:
+    """A worker that cannot do the work at all, and why."""
+
+    def __init__(self, error: Exception) -> None:
+        self.error = error
+
+
+_actions: dict[tuple[str, int], BatchAction] = {}
+_lock = threading.Lock()
+
+
+def run_on_worker(pickled_work: bytes, task: BatchTask | None) -> TaskOutcome | WorkRefused | None:
+    """Compute one task in a worker; the work is opened once for each of its threads.
+
+    Args:
+        pickled_work: the work.
+        task: None opens the work only.
+    """
+    key = (hashlib.sha256(pickled_work).hexdigest(), threading.get_ident())
+    with _lock:
+        action = _actions.get(key)
+        if action is None:
+            first = next((a for (work, _), a in _actions.items() if work == key[0]), None)
+            try:
+                action = first.clone() if first else pickle.loads(pickled_work).open()
+            except Exception as error:  # noqa: BLE001 - the command states it
+                return WorkRefused(error)
+            _actions[key] = action
+    return None if task is None else outcome_of(action, task)
+
+
+def security_of(address: ClusterAddress, role: str) -> distributed.Security | None:
+    """The TLS settings of one side; None without encryption.
+
+    Args:
+        address: of the scheduler.
+        role: client or worker.
+    """
+    if not address.is_encrypted:
+        return None
+    files = {f"tls_{role}_cert": str(address.certificate), f"tls_{role}_key": str(address.key)}
+    return distributed.Security(tls_ca_file=str(address.ca), require_encryption=True, **files)
+
+
+class DaskExecutor:
+    """Tasks on the workers of a scheduler, as many as they have threads for.
+
+    Args:
+        address: of the scheduler.
+        reconnect_timeout_s: how long it may be away before the run ends.
+    """
+
+    def __init__(
+        self, address: ClusterAddress, *, reconnect_timeout_s: float = RECONNECT_TIMEOUT_S
+    ) -> None:
+        self._address, self._reconnect_timeout_s = address, reconnect_timeout_s
+        self._client: distributed.Client | None = None
+        self._work = b""
+        self._futures: dict[int, distributed.Future] = {}
+        self._ended: queue.SimpleQueue[tuple[int, distributed.Future]] = queue.SimpleQueue()
+        self._submitted = 0
+        self._capacity, self._counted_s = 1, 0.0
+        self.dashboard = ""
+
+    @property
+    def capacity(self) -> int:
+        if time.monotonic() - self._counted_s > 1.0 and self._is_connected():
+            self._count_threads()
+        return self._capacity
+
+    @property
+    def description(self) -> str:
+        return f"cluster at {self._address.url}"
+
+    def start(self, work: BatchWork) -> None:
+        """Connect, check versions and memory, and open the work on one worker.
+
+        Raises:
+            ClusterError: no scheduler, no worker, other versions, or too little memory.
+            Exception: what `BatchWork.open` raised on a worker.
+        """
+        self._work = pickle.dumps(work)
+        client = self._connect(CONNECT_TIMEOUT_S)
+        self.dashboard = _dashboard_of(client, self._address)
+        _check_versions(client)
+        try:
+            client.wait_for_workers(1, timeout=WORKERS_TIMEOUT_S)
+        except TimeoutError as error:
+            raise ClusterError(
+                f"no worker joined {self._address.url} within {WORKERS_TIMEOUT_S:.0f} s. "
+                f"Run: syntopic worker {self._address.url}"
+            ) from error
+        _check_versions(client)
+        _check_memory(client, work)
+        # One worker opens the work before all others, so that kernels are compiled once.
+        opening: Any = client.submit(run_on_worker, self._work, None, pure=False)
+        try:
+            refused = opening.result(timeout=OPEN_TIMEOUT_S)
+        except (ImportError, AttributeError, RuntimeError, TimeoutError) as error:
+            raise ClusterError(
+                f"the cluster cannot load the code of this command ({error}). Install the same "
+                "version of syntopic[cluster] on all machines, and start workers with: "
+                "syntopic worker"
+            ) from error
+        if isinstance(refused, WorkRefused):
+            raise refused.error
+        self._count_threads()
+
+    def submit(self, task: BatchTask) -> None:
+        if self._client is None or not self._is_connected():
+            return  # `wait` finds it
+        self._submitted += 1
+        future = self._client.submit(
+            run_on_worker,
+            self._work,
+            task,
+            key=f"exposure-{task.number}-{self._submitted}",
+            pure=False,
+        )
+        self._futures[task.number] = future
+        future.add_done_callback(lambda ended: self._ended.put((task.number, ended)))
+
+    def wait(self, timeout_s: float) -> list[TaskOutcome]:
+        if not self._is_connected():
+            return self._reconnect()
+        limit_s = time.monotonic() + timeout_s
+        found: list[TaskOutcome] = []
+        while not found and self._is_connected():
+            try:
+                ended = self._ended.get(timeout=max(0.0, min(0.5, limit_s - time.monotonic())))
+            except queue.Empty:
+                found += self._missed()
+                if time.monotonic() >= limit_s:
+                    break
+                continue
+            found += self._outcome(*ended)
+            while not self._ended.empty():
+                found += self._outcome(*self._ended.get())
+        return found
+
+    def close(self, timeout_s: float) -> list[TaskOutcome]:
+        found: list[TaskOutcome] = []
+        limit_s = time.monotonic() + timeout_s
+        if self._client is None:
+            return found
+        try:
+            if self._is_connected():
+                waiting = _not_begun(self._client, self._futures)
+                self._client.cancel([self._futures.pop(number) for number in waiting])
+            while self._futures and self._is_connected() and time.monotonic() < limit_s:
+                found += self.wait(0.5)
+        finally:
+            self._drop_client()
+        return found
+
+    def _missed(self) -> list[TaskOutcome]:
+        """Outcomes that no callback reported: the client reconnected by itself meanwhile."""
+        ended = [(number, f) for number, f in self._futures.items() if f.status != "pending"]
+        return [outcome for number, future in ended for outcome in self._outcome(number, future)]
+
+    def _outcome(self, number: int, future: Any) -> list[TaskOutcome]:
+        if number not in self._futures or self._futures[number] is not future:
+            return []  # of a scheduler that is gone
+        try:
+            outcome: Any = future.result(timeout=RESULT_TIMEOUT_S)
+        except distributed.KilledWorker as error:
+            del self._futures[number]
+            return [TaskLost(number, "killed", f"its process was killed ({error.last_worker})")]
+        except (distributed.CancelledError, TimeoutError, OSError):
+            del self._futures[number]
+            return [TaskLost(number, "scheduler", "the scheduler lost it")]
+        except Exception as error:  # noqa: BLE001 - it is the outcome of this task
+            del self._futures[number]
+            return [TaskFailed(number, error)]
+        del self._futures[number]
+        if isinstance(outcome, WorkRefused):
+            raise outcome.error
+        return [outcome]
+
+    def _reconnect(self) -> list[TaskOutcome]:
+        """A new connection after the scheduler died; tasks in work are submitted again."""
+        lost: list[TaskOutcome] = [
+            TaskLost(number, "scheduler", "the scheduler died") for number in self._futures
+        ]
+        self._drop_client()
+        limit_s = time.monotonic() + self._reconnect_timeout_s
+        while True:
+            try:
+                client = self._connect(min(5.0, self._reconnect_timeout_s))
+                client.wait_for_workers(1, timeout=max(1.0, limit_s - time.monotonic()))
+                _check_versions(client)
+                self._count_threads()
+            except (ClusterError, TimeoutError, OSError) as error:
+                self._drop_client()
+                if time.monotonic() < limit_s:
+                    time.sleep(0.5)
+                    continue
+                raise ClusterError(
+                    f"the scheduler at {self._address.url} did not come back within "
+                    f"{self._reconnect_timeout_s:.0f} s. Start it and its workers, and run the "
+                    "same command again; complete exposures are not computed again"
+                ) from error
+            return lost
+
+    def _connect(self, timeout_s: float) -> distributed.Client:
+        # The client reports a lost scheduler by many messages; this executor reports it once.
+        logging.getLogger("distributed").setLevel(logging.CRITICAL)
+        with dask.config.set({"distributed.comm.timeouts.connect": timeout_s}):
+            try:
+                self._client = distributed.Client(
+                    self._address.url,
+                    security=security_of(self._address, "client"),
+                    timeout=timeout_s,
+                    set_as_default=False,
+                    heartbeat_interval="2s",
+                )
+            except (OSError, TimeoutError) as error:
+                raise ClusterError(
+                    f"no scheduler answers at {self._address.url}. "
+                    f"Start one: dask scheduler --host 127.0.0.1 --dashboard-address 127.0.0.1:8787"
+                ) from error
+        return self._client
+
+    def _drop_client(self) -> None:
+        client, self._client = self._client, None
+        self._futures.clear()
+        if client is not None:
+            client.close(timeout=2.0)
+
+    def _is_connected(self) -> bool:
+        return self._client is not None and self._client.status == "running"
+
+    def _count_threads(self) -> None:
+        self._counted_s = time.monotonic()
+        if self._client is not None:
+            try:
+                threads = sum(self._client.nthreads().values())
+            except (OSError, TimeoutError):
+                return
+            self._capacity = QUEUED_FACTOR * threads
+
+
+def _dashboard_of(client: distributed.Client, address: ClusterAddress) -> str:
+    link = str(client.dashboard_link or "")
+    host = link.partition("://")[2].partition(":")[0]
+    if link and not address.is_loopback and not is_loopback(host):
+        return (
+            f"{link} (open to the network: give dask scheduler --dashboard-address 127.0.0.1:8787)"
+        )
+    return link
+
+
+def _check_versions(client: distributed.Client) -> None:
+    """Compare the packages by which both sides understand each other.
+
+    Raises:
+        ClusterError: a version differs.
+    """
+    try:
+        theirs, ours = client.run_on_scheduler(version, "syntopic"), version("syntopic")
+    except PackageNotFoundError:
+        theirs, ours = "none", version("syntopic")
+    if theirs != ours:
+        raise ClusterError(
+            f"the scheduler has syntopic {theirs}, this command {ours}. Install the same version "
+            "where the scheduler runs: pip install 'syntopic[cluster]'"
+        )
+    found: dict[str, Any] = client.get_versions(check=False)
+    own = found["client"]["packages"]
+    sides = {"the scheduler": found["scheduler"]}
+    sides |= {f"worker {name}": about for name, about in found["workers"].items()}
+    for side, about in sides.items():
+        packages = about["packages"]
+        for name in (*CHECKED_PACKAGES, "python"):
+            # A Python version is three numbers with a suffix; the first two decide.
+            digits = 2 if name == "python" else 9
+            versions = [str(v.get(name)).split(".")[:digits] for v in (packages, own)]
+            if versions[0] != versions[1]:
+                raise ClusterError(
+                    f"{side} has {name} {packages.get(name)}, this command {own.get(name)}. "
+                    "Install the same versions: pip install 'syntopic[cluster]' on all machines"
+                )
+
+
+def _check_memory(client: distributed.Client, work: BatchWork) -> None:
+    for name, about in client.scheduler_info()["workers"].items():
+        threads, limit = max(1, about["nthreads"]), about["memory_limit"] or 0
+        if limit and limit < threads * work.memory_nbytes:
+            raise ClusterError(
+                f"worker {name} declares {limit / 1e9:.1f} GB for {threads} exposures at a time; "
+                f"{threads * work.memory_nbytes / 1e9:.1f} GB are needed. Start it with fewer "
+                "--processes"
+            )
+
+
+def _not_begun(client: distributed.Client, futures: dict[int, distributed.Future]) -> list[int]:
+    """Numbers whose task no worker has in work."""
+    try:
+        begun = {key for keys in client.processing().values() for key in keys}
+    except (OSError, TimeoutError):
+        return []
+    threads = sum(client.nthreads().values())
+    ordered = sorted(futures, key=lambda number: futures[number].key not in begun)
+    return ordered[threads:]

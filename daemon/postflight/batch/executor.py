@@ -1,0 +1,112 @@
+"""The interface of executors: where the exposures of a command are computed.
+
+A command describes its work once (`BatchWork`). An executor opens it where the work is done and
+returns an outcome for each task. Retries, quarantine and order are in
+`daemon.postflight.batch.batch_run`; no executor knows what is computed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol, TypeAlias
+
+
+@dataclass(frozen=True)
+class BatchTask:
+    """One exposure, and what its action has to know about it."""
+
+    number: int
+    payload: Any = None
+
+
+class BatchAction(Protocol):
+    """Computes one task at a time in the process that opened it."""
+
+    def __call__(self, task: BatchTask) -> Any:
+        """The result of a task; it can be pickled."""
+
+    def clone(self) -> BatchAction:
+        """Another action with separate buffers and shared calibrations."""
+
+
+class BatchWork(Protocol):
+    """Description of the work of a command; it can be pickled.
+
+    `memory_nbytes` is what one task occupies, `threads` the threads of one action.
+    """
+
+    @property
+    def memory_nbytes(self) -> int: ...
+
+    @property
+    def threads(self) -> int: ...
+
+    def open(self) -> BatchAction:
+        """Load calibrations and kernels; called once in each process.
+
+        Raises:
+            Exception: the work cannot be done at all; the run ends with its sentence.
+        """
+
+
+@dataclass(frozen=True)
+class TaskDone:
+    """A task and its result."""
+
+    number: int
+    result: Any
+
+
+@dataclass(frozen=True)
+class TaskFailed:
+    """A task whose action raised an error."""
+
+    number: int
+    error: Exception
+
+
+LossKind: TypeAlias = Literal["killed", "out-of-memory", "scheduler"]
+
+
+@dataclass(frozen=True)
+class TaskLost:
+    """A task whose process ended before it returned a result."""
+
+    number: int
+    kind: LossKind
+    cause: str
+
+
+TaskOutcome: TypeAlias = TaskDone | TaskFailed | TaskLost
+
+
+class BatchExecutor(Protocol):
+    """Computes tasks, at most `capacity` at a time: what waits occupies no memory of a worker."""
+
+    @property
+    def capacity(self) -> int:
+        """Tasks that may be in work now."""
+
+    @property
+    def description(self) -> str:
+        """Where the work is done, in words for a person."""
+
+    def start(self, work: BatchWork) -> None:
+        """Open the work; returns when one process is ready.
+
+        Raises:
+            Exception: what `BatchWork.open` raised.
+        """
+
+    def submit(self, task: BatchTask) -> None:
+        """Begin a task; never called for more than `capacity` at a time."""
+
+    def wait(self, timeout_s: float) -> list[TaskOutcome]:
+        """Outcomes since the last call; waits for the first one up to `timeout_s`."""
+
+    def close(self, timeout_s: float) -> list[TaskOutcome]:
+        """Let tasks in work finish for up to `timeout_s`, then end all processes.
+
+        Returns:
+            Outcomes of tasks that finished.
+        """

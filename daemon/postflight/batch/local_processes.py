@@ -1,0 +1,246 @@
+"""Executor of this machine: worker processes that are started again when they die.
+
+The first process loads the work alone, so that kernels are compiled once; the others follow. A
+worker ignores Ctrl-C and ends when the command's end of its pipe is closed.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import pickle
+import signal
+import time
+from collections import deque
+from contextlib import suppress
+from multiprocessing.connection import Connection, wait
+from pathlib import Path
+from typing import Any, Final
+
+from daemon import DaemonError
+from daemon.mission.exposure_batch import cause_of
+from daemon.postflight.batch.executor import (
+    BatchTask,
+    BatchWork,
+    LossKind,
+    TaskDone,
+    TaskFailed,
+    TaskLost,
+    TaskOutcome,
+)
+from daemon.products.processing_threads import configure_threads, thread_counts
+
+OPEN_TIMEOUT_S: Final = 600.0
+"""Kernels of a new version are compiled within this time."""
+RESTART_MAX: Final = 3
+"""Starts in a row that end before the work is loaded; then the machine cannot do it."""
+
+_SPAWN = multiprocessing.get_context("spawn")
+
+
+class WorkerStartError(DaemonError):
+    """Worker processes cannot be started; the message states what to do."""
+
+
+class WorkerError(DaemonError, ValueError):
+    """An error of a worker process, by its message."""
+
+
+class _Ready:
+    """The work is loaded."""
+
+
+class _Worker:
+    """One process, its pipe, and the task it has."""
+
+    def __init__(self, work: bytes, environment: dict[str, str]) -> None:
+        self.connection, child_end = _SPAWN.Pipe(duplex=True)
+        self.task: BatchTask | None = None
+        self.is_ready = False
+        self.oom_kills = _oom_kills()
+        self.process = _SPAWN.Process(target=worker_main, args=(child_end, work), daemon=True)
+        before = {name: os.environ.get(name) for name in environment}
+        os.environ.update(environment)
+        # The child inherits the mask: Ctrl-C cannot end it before it ignores the signal.
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            self.process.start()
+        finally:
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+            for name, value in before.items():
+                if value is None:
+                    del os.environ[name]
+                else:
+                    os.environ[name] = value
+        child_end.close()
+        self.begun_s = time.monotonic()
+
+    def end(self, timeout_s: float) -> None:
+        self.connection.close()
+        self.process.join(timeout_s)
+        if self.process.is_alive():
+            self.process.kill()
+            self.process.join()
+
+
+class LocalProcessExecutor:
+    """`count` worker processes, one task each at a time.
+
+    Args:
+        count: of processes.
+    """
+
+    def __init__(self, count: int) -> None:
+        self._count = count
+        self._workers: list[_Worker] = []
+        self._found: deque[TaskOutcome] = deque()
+        self._work = b""
+        self._environment: dict[str, str] = {}
+        self._failed_starts = 0
+        self._is_closing = False
+
+    @property
+    def capacity(self) -> int:
+        return sum(worker.is_ready for worker in self._workers)
+
+    @property
+    def description(self) -> str:
+        return f"{self._count} processes"
+
+    @property
+    def pids(self) -> tuple[int, ...]:
+        """Process ids of the workers."""
+        return tuple(w.process.pid for w in self._workers if w.process.pid is not None)
+
+    def start(self, work: BatchWork) -> None:
+        self._work, self._environment = pickle.dumps(work), thread_counts(work.threads)
+        self._start_worker()
+        while not self._workers[0].is_ready:
+            self._receive(1.0)
+        for _ in range(self._count - 1):
+            self._start_worker()
+
+    def submit(self, task: BatchTask) -> None:
+        worker = next((w for w in self._workers if w.is_ready and w.task is None), None)
+        if worker is None:
+            raise WorkerStartError("no process is free; no more tasks than capacity are in work")
+        worker.task = task
+        with suppress(BrokenPipeError, ConnectionError):  # `_receive` finds it dead
+            worker.connection.send(task)
+
+    def wait(self, timeout_s: float) -> list[TaskOutcome]:
+        if not self._found:
+            self._receive(timeout_s)
+        found = list(self._found)
+        self._found.clear()
+        return found
+
+    def close(self, timeout_s: float) -> list[TaskOutcome]:
+        limit_s = time.monotonic() + timeout_s
+        self._is_closing = True  # what dies now is not started again
+        while any(w.task for w in self._workers) and time.monotonic() < limit_s:
+            self._receive(0.2)
+        for worker in self._workers:
+            worker.connection.close()
+        for worker in self._workers:
+            worker.end(0.0 if worker.task else 5.0)
+        self._workers.clear()
+        return self.wait(0.0)
+
+    def _start_worker(self) -> None:
+        self._workers.append(_Worker(self._work, self._environment))
+
+    def _receive(self, timeout_s: float) -> None:
+        ends: dict[Any, _Worker] = {w.connection: w for w in self._workers}
+        for ready in wait(list(ends), timeout_s):
+            worker = ends[ready]
+            try:
+                message = worker.connection.recv()
+            except (EOFError, OSError, pickle.UnpicklingError):
+                self._replace(worker)
+                continue
+            if isinstance(message, _Ready):
+                worker.is_ready, self._failed_starts = True, 0
+            elif worker.is_ready:
+                worker.task = None
+                self._found.append(message)
+            else:
+                raise message.error
+        for worker in self._workers:
+            if not worker.is_ready and time.monotonic() - worker.begun_s > OPEN_TIMEOUT_S:
+                worker.process.kill()
+
+    def _replace(self, worker: _Worker) -> None:
+        worker.process.join(5.0)
+        kind, cause = _cause_of(worker)
+        worker.end(0.0)
+        self._workers.remove(worker)
+        if worker.task is not None:
+            self._found.append(TaskLost(worker.task.number, kind, cause))
+        if not worker.is_ready:
+            self._failed_starts += 1
+            if self._failed_starts >= RESTART_MAX and not any(w.is_ready for w in self._workers):
+                raise WorkerStartError(
+                    f"a worker process ended {RESTART_MAX} times before it was ready: {cause}. "
+                    "Give fewer --processes, or see its messages above"
+                )
+        if len(self._workers) < self._count and not self._is_closing:
+            self._start_worker()
+
+
+def worker_main(connection: Connection, pickled_work: bytes) -> None:
+    """Open the work and compute tasks until the other end is closed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    configure_threads()
+    try:
+        action = pickle.loads(pickled_work).open()
+    except Exception as error:  # noqa: BLE001 - the command states it
+        connection.send(TaskFailed(0, _picklable(error)))
+        return
+    try:
+        connection.send(_Ready())
+        while True:
+            task = connection.recv()
+            connection.send(outcome_of(action, task))
+    except (EOFError, ConnectionError):
+        return  # the command ended, or was killed
+
+
+def outcome_of(action: Any, task: BatchTask) -> TaskOutcome:
+    """The outcome of a task, with its error where it raised one."""
+    try:
+        return TaskDone(task.number, action(task))
+    except MemoryError:
+        return TaskLost(task.number, "out-of-memory", "the process could not allocate memory")
+    except Exception as error:  # noqa: BLE001 - it is the outcome of this task
+        return TaskFailed(task.number, _picklable(error))
+
+
+def _picklable(error: Exception) -> Exception:
+    """The error, or its message where pickling would lose or alter it."""
+    try:
+        again = pickle.loads(pickle.dumps(error))
+        is_same = type(again) is type(error) and str(again) == str(error)
+    except Exception:  # noqa: BLE001 - errors of libraries do what they like here
+        is_same = False
+    return error if is_same else WorkerError(cause_of(error))
+
+
+def _cause_of(worker: _Worker) -> tuple[LossKind, str]:
+    code = worker.process.exitcode
+    if code is None or code >= 0:
+        return "killed", f"its process ended with status {code}"
+    name = signal.Signals(-code).name
+    if -code == signal.SIGKILL and _oom_kills() > worker.oom_kills:
+        return "out-of-memory", "the kernel killed its process: out of memory"
+    return "killed", f"its process was killed by {name}"
+
+
+def _oom_kills() -> int:
+    """Processes that the kernel killed for memory since boot; 0 where it does not count them."""
+    try:
+        lines = Path("/proc/vmstat").read_text("ascii").splitlines()
+    except OSError:
+        return 0
+    return next((int(line.split()[1]) for line in lines if line.startswith("oom_kill ")), 0)

@@ -1,0 +1,113 @@
+"""A run finishes every exposure that can be done, whatever happens to processes and the store."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from daemon.postflight.batch import batch_run
+from daemon.postflight.batch.batch_run import BatchOutcome, run_batch
+from daemon.postflight.batch.capacity import plan_processes
+from daemon.postflight.batch.executor import BatchExecutor, BatchTask
+from daemon.postflight.batch.in_process import InProcessExecutor
+from daemon.postflight.batch.local_processes import LocalProcessExecutor
+from tests.daemon.postflight.batch.toy_work import ToyWork, attempts_of
+
+EXECUTORS: dict[str, Callable[[], BatchExecutor]] = {
+    "in process": lambda: InProcessExecutor(2),
+    "local processes": lambda: LocalProcessExecutor(2),
+}
+
+
+@pytest.fixture(autouse=True)
+def soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(batch_run, "STORE_RETRIES_S", (0.01, 0.01, 0.01))
+    monkeypatch.setattr(batch_run, "CLAIM_RETRY_S", 0.01)
+
+
+def ran(executor: BatchExecutor, folder: Path, payloads: dict[int, str], count: int = 6):
+    tasks = [BatchTask(number, payloads.get(number, "")) for number in range(1, count + 1)]
+    return run_batch(executor, ToyWork(folder), tasks)
+
+
+def causes(outcome: BatchOutcome) -> dict[int, str]:
+    return {failure.exposure: failure.cause for failure in outcome.failures}
+
+
+@pytest.mark.parametrize("kind", EXECUTORS)
+def test_what_passes_is_tried_again_and_what_does_not_is_listed(kind: str, tmp_path: Path) -> None:
+    payloads = {2: "bad 9", 3: "store 3", 4: "claimed 5", 5: "store 9"}
+    outcome = ran(EXECUTORS[kind](), tmp_path, payloads)
+    assert outcome.results == {1: 10, 3: 30, 4: 40, 6: 60}
+    assert causes(outcome) == {2: "ValueError: frame 3 is damaged", 5: "Connection timed out"}
+    assert [attempts_of(tmp_path, number) for number in range(1, 7)] == [1, 1, 4, 6, 4, 1]
+    assert (outcome.counts.store_retries, outcome.counts.claimed_elsewhere) == (6, 5)
+    assert not outcome.is_interrupted
+
+
+@pytest.mark.parametrize("kind", EXECUTORS)
+def test_a_full_disk_ends_the_run(kind: str, tmp_path: Path) -> None:
+    outcome = ran(EXECUTORS[kind](), tmp_path, {1: "full 9"}, count=40)
+    found = causes(outcome)
+    assert found[1] == "No space left on device"
+    assert found[40] == "not attempted, because of exposure 1: No space left on device"
+    assert len(found) + len(outcome.results) == 40
+
+
+@pytest.mark.parametrize("kind", EXECUTORS)
+def test_work_that_cannot_be_opened_is_refused(kind: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="no such calibration"):
+        run_batch(EXECUTORS[kind](), ToyWork(tmp_path, refuses=True), [BatchTask(1)])
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.trust
+def test_killed_processes_cost_their_own_exposure_one_more_attempt(tmp_path: Path) -> None:
+    payloads = {2: "killed 1", 3: "killed 2", 4: "killed 9", 5: "memory 1", 6: "memory 9"}
+    outcome = ran(LocalProcessExecutor(2), tmp_path, payloads | {7: "status 1"}, count=12)
+    assert sorted(outcome.results) == [1, 2, 3, 5, 7, 8, 9, 10, 11, 12]
+    found = causes(outcome)
+    assert "quarantined after 3 attempts: its process was killed by SIGKILL" in found[4]
+    assert "the last time with no other exposure in work" in found[4] and "--only 4" in found[4]
+    assert "quarantined after 2 attempts: the process could not allocate memory" in found[6]
+    attempts = [attempts_of(tmp_path, number) for number in range(1, 13)]
+    assert attempts == [1, 2, 3, 3, 2, 2, 2, 1, 1, 1, 1, 1]
+    assert outcome.counts.lost_processes == 1 + 2 + 3 + 1 + 2 + 1
+
+
+def test_ctrl_c_lets_what_is_in_work_finish_and_begins_nothing_more(tmp_path: Path) -> None:
+    def interrupt(_counts: object) -> None:
+        raise KeyboardInterrupt
+
+    tasks = [BatchTask(1), *(BatchTask(number, "slow") for number in range(2, 30))]
+    outcome = run_batch(LocalProcessExecutor(2), ToyWork(tmp_path), tasks, interrupt)
+    assert outcome.is_interrupted and 1 in outcome.results
+    begun = {int(path.name) for path in tmp_path.iterdir()}
+    assert begun == set(outcome.results) and len(begun) < 6
+
+
+@pytest.mark.parametrize(
+    ("cores", "available_gb", "tasks", "threads", "expected"),
+    [
+        (64, 128.0, 1000, None, (51, 1)),
+        (64, 512.0, 1000, None, (64, 1)),
+        (8, 5.0, 1000, None, (2, 4)),
+        (8, 0.5, 1000, None, (1, 8)),
+        (8, 64.0, 3, None, (3, 2)),
+        (8, 64.0, 1000, 4, (2, 4)),
+    ],
+)
+def test_processes_are_limited_by_cores_memory_and_exposures(
+    cores: int,
+    available_gb: float,
+    tasks: int,
+    threads: int | None,
+    expected: tuple[int, int],
+) -> None:
+    available_nbytes = int(available_gb * 1e9)
+    plan = plan_processes(
+        2_000_000_000, tasks, cores=cores, available_nbytes=available_nbytes, threads=threads
+    )
+    assert (plan.processes, plan.threads) == expected
