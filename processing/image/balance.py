@@ -347,6 +347,14 @@ def _node_means(frames, valid, lattices, cell, out):
 @njit(cache=True, nogil=True)
 def _block_mean(frame, valid, corner):
     """Mean of a block within the usable area; `UNUSABLE` where a pixel is saturated or a hole."""
+    column, row = corner[0], corner[1]
+    if (
+        column >= valid[0]
+        and row >= valid[2]
+        and column + _BLOCK_PX <= valid[1] + 1.0
+        and row + _BLOCK_PX <= valid[3] + 1.0
+    ):
+        return _whole_block_mean(frame, row, column)
     total = np.int64(0)
     pixels = 0
     unusable = False
@@ -361,3 +369,20 @@ def _block_mean(frame, valid, corner):
             total += value
             pixels += 1
     return UNUSABLE if unusable or pixels == 0 else total / pixels
+
+
+@njit(cache=True, nogil=True)
+def _whole_block_mean(frame, row, column):
+    """As `_block_mean` where all pixels of the block are usable: counts known to the compiler."""
+    total = np.int32(0)
+    odd_bits = np.int32(0)
+    least = np.int32(65535)
+    for y in range(row, row + _BLOCK_PX):
+        line = frame[y, column : column + _BLOCK_PX]
+        for x in range(_BLOCK_PX):
+            value = np.int32(line[x])
+            total += value
+            odd_bits |= value
+            least = min(least, value)
+    unusable = least == 0 or (odd_bits & 1) == 1
+    return UNUSABLE if unusable else np.float64(total) / (_BLOCK_PX * _BLOCK_PX)

@@ -292,15 +292,11 @@ def _feather(labels, kernel, out):
         for s in range(out.shape[0]):
             for j in range(columns):
                 out[s, i, j] = 0
+        mixed = _mixed_along(labels, i, reach)
         shares = np.zeros(out.shape[0], np.float32)
         for j in range(columns):
-            own = labels[i, j]
-            single = True
-            for y in range(max(i - reach, 0), min(i + reach + 1, rows)):
-                for x in range(max(j - reach, 0), min(j + reach + 1, columns)):
-                    single &= labels[y, x] == own
-            if single:
-                out[own, i, j] = WEIGHT_UNIT
+            if not mixed[j]:
+                out[labels[i, j], i, j] = WEIGHT_UNIT
                 continue
             shares[:] = 0.0
             for dy in range(-reach, reach + 1):
@@ -310,3 +306,28 @@ def _feather(labels, kernel, out):
                     shares[labels[y, x]] += kernel[dy + reach] * kernel[dx + reach]
             for s in range(out.shape[0]):
                 out[s, i, j] = np.uint8(np.float32(WEIGHT_UNIT) * shares[s] + np.float32(0.5))
+
+
+@njit(cache=True, nogil=True)
+def _mixed_along(labels, i, reach):
+    """Where in a row of nodes several frames own nodes within reach; (columns,) uint8."""
+    rows, columns = labels.shape
+    own = labels[i]
+    differs = np.zeros(columns, np.uint8)
+    for y in range(max(i - reach, 0), min(i + reach + 1, rows)):
+        other = labels[y]
+        for j in range(columns):
+            differs[j] |= np.uint8(other[j] != own[j])
+    mixed = differs.copy()
+    for k in range(1, reach + 1):
+        for j in range(columns - k):
+            mixed[j] |= differs[j + k]
+        for j in range(k, columns):
+            mixed[j] |= differs[j - k]
+    for k in range(reach):
+        # A change between two nodes is within reach of those on both sides.
+        for j in range(1, columns - k):
+            mixed[j + k] |= np.uint8(own[j] != own[j - 1])
+        for j in range(1 + k, columns):
+            mixed[j - 1 - k] |= np.uint8(own[j] != own[j - 1])
+    return mixed

@@ -28,11 +28,14 @@ from processing.matching.least_squares import (
 )
 from processing.matching.prefetch import fetch_ahead
 
-__all__ = ["INTERPOLATION", "MARGIN_PX", "match_patches", "select_features"]
+__all__ = ["INTERPOLATION", "MARGIN_PX", "match_patches", "refine_patches", "select_features"]
 
 Array = NDArray[Any]
 
 _BLOCK: Final = 32
+
+_AGREEMENT_PX: Final = 0.5
+"""How far from its prediction least squares may find a point that is not searched."""
 
 
 @njit(cache=True)
@@ -252,3 +255,126 @@ def match_patches(
             result[i, 6] = best[4] - best[5]
             result[i, 7] = 1.0
     return result
+
+
+@njit(cache=True, parallel=True, nogil=True)
+def refine_patches(
+    frame_a: Array,
+    frame_b: Array,
+    at_a: Array,
+    predicted_b: Array,
+    limits_b: Array,
+    ratio: int,
+    half_window: int,
+    is_uint16: bool,
+    table: Array,
+) -> Array:
+    """As `match_patches` where places in b are predicted to a part of a pixel: without a search.
+
+    Args:
+        frame_a: (h, w), uint16 Level-1 words or float32; the finer frame.
+        frame_b: (h, w), same type.
+        at_a: (n, 2) int64, first pixel (column, row) of the centre box of ratio x ratio pixels.
+        predicted_b: (n, 2), where the centre of that box is in frame b, px.
+        limits_b: (4,) int64, first and last usable column, first and last usable row of frame b.
+        ratio: pixels of a per pixel of b along each axis.
+        half_window: the window has 2 * half_window + 1 pixels of b.
+        is_uint16: the frames hold Level-1 words.
+        table: `INTERPOLATION`.
+
+    Returns:
+        (n, 8) as of `match_patches`, with 1 for the height of the peak. The last is 1 where least
+        squares converges within half a pixel of the prediction, -1 where a window holds bad pixels,
+        else 0.
+    """
+    count = len(at_a)
+    result = np.zeros((count, 8))
+    side = 2 * half_window + 1
+    margin_px = half_window + MARGIN_PX
+    size = side + 2 * MARGIN_PX
+    middle = (ratio - 1) / 2.0
+    blocks = (count + _BLOCK - 1) // _BLOCK
+    for block in prange(blocks):
+        flat_a = np.zeros(size * size + PATCH_SLACK, np.float32)
+        flat_b = np.zeros(size * size + PATCH_SLACK, np.float32)
+        a = flat_a[: size * size].reshape(size, size)
+        b = flat_b[: size * size].reshape(size, size)
+        scratch = refinement_scratch(side)
+        found = np.empty(4)
+        first = np.int64(block * _BLOCK)
+        last = min(first + _BLOCK, count)
+        here = _predicted_corners(at_a, predicted_b, first, ratio, margin_px)
+        for i in range(first, last):
+            col_a, row_a, col_b, row_b = here
+            if i + 1 < last:
+                here = _predicted_corners(at_a, predicted_b, i + 1, ratio, margin_px)
+                fetch_ahead(frame_a, here[0], here[1], ratio * size, ratio * size)
+                fetch_ahead(frame_b, here[2], here[3], size, size)
+            if (
+                col_a < 0
+                or row_a < 0
+                or col_a + ratio * size > frame_a.shape[1]
+                or row_a + ratio * size > frame_a.shape[0]
+                or col_b < limits_b[0]
+                or row_b < limits_b[2]
+                or col_b + size > limits_b[1] + 1
+                or row_b + size > limits_b[3] + 1
+            ):
+                continue
+            if (
+                not _load(frame_a, col_a, row_a, ratio, is_uint16, a)
+                or not _load(frame_b, col_b, row_b, 1, is_uint16, b)
+                or not (is_uint16 or (_all_finite(a) and _all_finite(b)))
+            ):
+                result[i, 7] = -1.0
+                continue
+            moved_col = col_a + ratio * margin_px - at_a[i, 0]
+            moved_row = row_a + ratio * margin_px - at_a[i, 1]
+            whole_col, whole_row = col_b + margin_px, row_b + margin_px
+            shift = (
+                predicted_b[i, 0] - whole_col + moved_col / ratio,
+                predicted_b[i, 1] - whole_row + moved_row / ratio,
+            )
+            if not refine(
+                (flat_a, flat_b),
+                (size, size),
+                (0, 0),
+                shift,
+                half_window,
+                MARGIN_PX,
+                ratio * ratio,
+                table,
+                scratch,
+                found,
+            ):
+                continue
+            if max(abs(found[0] - shift[0]), abs(found[1] - shift[1])) > _AGREEMENT_PX:
+                continue
+            result[i, 0] = at_a[i, 0] + moved_col + middle - 0.5 * found[0] * ratio
+            result[i, 1] = at_a[i, 1] + moved_row + middle - 0.5 * found[1] * ratio
+            result[i, 2] = whole_col + 0.5 * found[0]
+            result[i, 3] = whole_row + 0.5 * found[1]
+            result[i, 4] = found[2]
+            result[i, 5] = found[3]
+            result[i, 6] = 1.0
+            result[i, 7] = 1.0
+    return result
+
+
+@njit(cache=True)
+def _predicted_corners(
+    at_a: Array, predicted_b: Array, i: int, ratio: int, margin_px: int
+) -> tuple[int, int, int, int]:
+    """First column and row of both patches, a's in phase with b's pixels (see `match_patches`)."""
+    whole_col = int(np.round(predicted_b[i, 0]))
+    whole_row = int(np.round(predicted_b[i, 1]))
+    moved_col = moved_row = 0
+    if ratio > 1:
+        moved_col = -int(np.round((predicted_b[i, 0] - whole_col) * ratio))
+        moved_row = -int(np.round((predicted_b[i, 1] - whole_row) * ratio))
+    return (
+        at_a[i, 0] + moved_col - ratio * margin_px,
+        at_a[i, 1] + moved_row - ratio * margin_px,
+        whole_col - margin_px,
+        whole_row - margin_px,
+    )

@@ -63,13 +63,14 @@ class PairSearch:
 
     Where the frames differ by more than a shift, `region` (first and last column, first and last
     row of b) is what has to be seen of a as b would see it, each pixel divided by `step`; `at_a`
-    does not count then.
+    does not count then. `expected_b` (n, 2) is where b sees the centre of a's box, before rounding.
     """
 
     pair: tuple[str, str]
     kind: int
     at_a: NDArray[np.int64]
     at_b: NDArray[np.int64]
+    expected_b: Array
     step: int = 1
     region: tuple[int, int, int, int] | None = None
 
@@ -112,6 +113,7 @@ def pan_searches(
     for overlap in overlaps(rig):
         a, b = overlap.sensor_a, overlap.sensor_b
         at_a = at_b = np.empty((0, 2), dtype=np.int64)
+        expected = np.empty((0, 2))
         region = None
         if (
             a in frames
@@ -119,7 +121,7 @@ def pan_searches(
             and not _differ_by_shift_only(placements[a], placements[b], overlap.rectangle)
         ):
             at_b, region = _seen_searches(placements, frames, overlap, settings, margin_px)
-            at_a = at_b
+            at_a, expected = at_b, at_b.astype(np.float64)
         elif a in frames and b in frames:
             area = _shrunk(
                 _raw_areas(placements[a], [overlap.rectangle])[0],
@@ -131,8 +133,10 @@ def pan_searches(
             predicted = raw_from_vip_mm(
                 placements[b], vip_mm_from_raw(placements[a], at_a.astype(np.float64))
             )
-            at_a, at_b = _inside(at_a, predicted, usable_pixels(placements[b]), margin_px)
-        result.append(PairSearch((a, b), PAN_TO_PAN, at_a, at_b, region=region))
+            keep = _within(predicted, usable_pixels(placements[b]), margin_px)
+            at_a, expected = at_a[keep], predicted[keep]
+            at_b = np.rint(expected).astype(np.int64)
+        result.append(PairSearch((a, b), PAN_TO_PAN, at_a, at_b, expected, region=region))
     return result
 
 
@@ -219,7 +223,10 @@ def colour_searches(
     empty = np.empty((0, 2), dtype=np.int64)
     whole_ratio = colour_ratio(rig)
     step = whole_ratio or max(1, math.floor(ratio))
-    attempted = {name: PairSearch((name, colour), PAN_TO_COLOUR, empty, empty) for name in coverage}
+    attempted = {
+        name: PairSearch((name, colour), PAN_TO_COLOUR, empty, empty, np.empty((0, 2)))
+        for name in coverage
+    }
     if colour in frames and present:
         union = Rectangle(
             min(coverage[name].x_min_mm for name in coverage),
@@ -260,7 +267,9 @@ def colour_searches(
             ):
                 at = at_colour[mine]
                 region = _region_around(at, there, margin_px + 1)
-                attempted[name] = PairSearch(pair, PAN_TO_COLOUR, at, at, step, region)
+                attempted[name] = PairSearch(
+                    pair, PAN_TO_COLOUR, at, at, at.astype(np.float64), step, region
+                )
                 continue
             first = np.rint(predicted[name][mine] - (whole_ratio - 1) / 2.0).astype(np.int64)
             centre = first + (whole_ratio - 1) / 2.0
@@ -268,7 +277,7 @@ def colour_searches(
                 placements[colour], vip_mm_from_raw(placements[name], centre)
             )
             at_b = np.rint(expected).astype(np.int64)
-            attempted[name] = PairSearch(pair, PAN_TO_COLOUR, first, at_b, step)
+            attempted[name] = PairSearch(pair, PAN_TO_COLOUR, first, at_b, expected, step)
     return list(attempted.values())
 
 
@@ -393,13 +402,6 @@ def _within(raw: Array, usable: tuple[int, int, int, int], margin_px: int) -> ND
             & (raw[:, 1] >= usable[2] + margin_px)
             & (raw[:, 1] <= usable[3] - margin_px)
         )
-
-
-def _inside(
-    at_a: NDArray[np.int64], predicted: Array, usable: tuple[int, int, int, int], margin_px: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    keep = _within(predicted, usable, margin_px)
-    return at_a[keep], np.rint(predicted[keep]).astype(np.int64)
 
 
 def _differ_by_shift_only(

@@ -1,8 +1,8 @@
 """Tie points: the same ground in two sensors, PAN to PAN and PAN to the colour master.
 
 They are matched here, in Level-1 frames of raw geometry, where
-`processing.matching.tie_point_search` seeks them; the compiled kernels are in
-`processing.matching.patches`, what the points are good for in `processing.mosaic.free_mosaic`.
+`processing.matching.tie_point_search` seeks them and as `processing.matching.two_stage` does; what
+the points are good for is in `processing.mosaic.free_mosaic`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from processing.geometry.placement import SensorPlacement
 from processing.geometry.topology import exact_colour_ratio
 from processing.image.rectification import rectify_to_sensor
-from processing.matching.patches import INTERPOLATION, match_patches
 from processing.matching.tie_point_search import (
     PAN_TO_COLOUR,
     PAN_TO_PAN,
@@ -26,6 +25,7 @@ from processing.matching.tie_point_search import (
     pan_searches,
     usable_pixels,
 )
+from processing.matching.two_stage import MatchLimits, Positions, match_positions
 from processing.rig import Rig
 
 __all__ = ["PAN_TO_COLOUR", "PAN_TO_PAN", "TiePointSettings", "TiePoints", "match_tie_points"]
@@ -126,25 +126,20 @@ def match_tie_points(
                 placements[a], placements[b], frame_a, region=search.region, step=step
             )
             frame_a, at_a = seen.pixels, seen.at(search.at_b)
-        found = match_patches(
+        found = match_positions(
             frame_a,
             frames[b],
-            at_a,
-            search.at_b,
+            Positions(at_a, search.at_b, search.expected_b),
             np.array(usable_pixels(placements[b]), dtype=np.int64),
-            step,
-            window // 2,
-            settings.search_pp_px if to_pan else settings.search_pc_px,
-            frames[a].dtype == np.uint16,
-            INTERPOLATION,
+            ratio=step,
+            window_px=window,
+            search_px=settings.search_pp_px if to_pan else settings.search_pc_px,
+            limits=MatchLimits(
+                settings.max_sigma_pp_px if to_pan else settings.max_sigma_pc_px,
+                settings.min_correlation,
+                settings.min_peak_margin,
+            ),
         )
-        largest = settings.max_sigma_pp_px if to_pan else settings.max_sigma_pc_px
-        found = found[
-            (found[:, 7] > 0.0)
-            & (found[:, 4] <= largest)
-            & (found[:, 5] >= settings.min_correlation)
-            & (found[:, 6] >= settings.min_peak_margin)
-        ]
         columns = np.empty((len(found), 10))
         columns[:, 0], columns[:, 1] = index[a], index[b]
         columns[:, 2:6] = found[:, :4]

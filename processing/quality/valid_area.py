@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final, TypeAlias
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from processing.quality.figures.image import ValidAreaFigures
@@ -100,10 +101,13 @@ def gap_cells(raster: NDArray[Any], columns: int, rows: int, *, saturated_bit: i
     height, width = raster.shape
     down = ((np.arange(rows * SAMPLES) + 0.5) * height / (rows * SAMPLES)).astype(np.int64)
     across = ((np.arange(columns * SAMPLES) + 0.5) * width / (columns * SAMPLES)).astype(np.int64)
-    seen = raster[np.ix_(down, across)].reshape(rows, SAMPLES, columns, SAMPLES)
-    gaps: Mask = np.mean(seen != 0, axis=(1, 3)) < 0.5
+    there = np.zeros((rows, columns), np.int32)
+    saturated = np.zeros((rows, columns), np.int32)
+    _count_samples(raster, down, across, saturated_bit, there, saturated)
+    half = SAMPLES * SAMPLES / 2.0
+    gaps: Mask = there < half
     if saturated_bit:
-        gaps |= _smoothed(np.mean(seen & saturated_bit != 0, axis=(1, 3)) >= 0.5)
+        gaps |= _smoothed(saturated >= half)
     return gaps
 
 
@@ -239,6 +243,19 @@ def _is_box(box: object, columns: int, rows: int) -> bool:
         return False
     left, top, right, bottom = box
     return bool(0 <= left < right <= columns and 0 <= top < bottom <= rows)
+
+
+@njit(cache=True, nogil=True)
+def _count_samples(raster, down, across, saturated_bit, there, saturated):
+    """Count the samples of each cell that hold data, and those that are saturated."""
+    for i in range(len(down)):
+        line = raster[down[i]]
+        there_row = there[i // SAMPLES]
+        saturated_row = saturated[i // SAMPLES]
+        for j in range(len(across)):
+            value = np.int64(line[across[j]])
+            there_row[j // SAMPLES] += np.int32(value != 0)
+            saturated_row[j // SAMPLES] += np.int32((value & saturated_bit) != 0)
 
 
 def _smoothed(cells: Mask) -> Mask:
