@@ -23,6 +23,8 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks import gate
+from daemon.cli.benchmark import peers
 from daemon.cli.benchmark.measurement import interleaved, machine
 from daemon.configuration.model import PlanSection
 from daemon.mission.exposure import CaptureRecord, FrameRecord
@@ -37,10 +39,11 @@ from processing.rig import load_rig
 Frames = Mapping[str, NDArray[np.uint16]]
 
 
-def main() -> None:
+def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.mini", description=__doc__)
     parser.add_argument("--runs", type=int, default=7)
     parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("--accept", action="store_true", help="write the ratios to the record")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="syntopic-bench-") as folder:
         mission, radiometry = _fly(Path(folder))
@@ -50,10 +53,15 @@ def main() -> None:
             "pipeline": _time_pipeline(mission, radiometry, options.runs),
             "writer": _time_writer(Path(folder), mission, options.runs),
         }
+    ratios, processor = result["pipeline"]["cpu_ratios"], result["machine"]["processor"]
+    if options.accept:
+        gate.accept(ratios, processor, result["machine"]["cores"])
+    result["gate"] = gate.compared(ratios, processor)
     if options.json:
         print(json.dumps(result))
     else:
         _print(result)
+    return 1 if result["gate"]["slower"] else 0
 
 
 def _fly(folder: Path) -> tuple[Mission, Path]:
@@ -93,7 +101,16 @@ def _time_pipeline(mission: Mission, radiometry: Path, runs: int) -> dict[str, A
         for target, source in zip(copies, sources, strict=True):
             np.copyto(target, source)
 
-    timed = interleaved(runs, process=process, copy=copy)
+    remaps = [
+        peers.remap_of(rig, product.mosaic.placements[name], frames[name])
+        for name in product.sensors
+    ]
+
+    def remap() -> None:
+        for one in remaps:
+            one()
+
+    timed = interleaved(runs, process=process, copy=copy, remap=remap)
     pixels = sum(frame.size for frame in frames.values())
     seconds = timed["process"]["median_s"]
     return {
@@ -101,6 +118,11 @@ def _time_pipeline(mission: Mission, radiometry: Path, runs: int) -> dict[str, A
         "stages_median_s": {stage: float(np.median(s)) for stage, s in stages.items()},
         "megapixels_per_s": pixels / 1e6 / seconds,
         "ratio_to_copy": seconds / timed["copy"]["median_s"],
+        "ratio_to_remap": seconds / timed["remap"]["median_s"],
+        "cpu_ratios": {
+            name: timed["process"]["median_cpu_s"] / timed[name]["median_cpu_s"]
+            for name in ("copy", "remap")
+        },
         "realtime_factor": rig.frame_interval_s / seconds,
     }
 
@@ -155,12 +177,15 @@ def _print(result: Mapping[str, Any]) -> None:
     console.print(table)
     console.print(
         f"{pipeline['megapixels_per_s']:.1f} Mpx/s, {pipeline['ratio_to_copy']:.0f} times a plain "
-        f"copy, realtime_factor {pipeline['realtime_factor']:.2f}"
+        f"copy, {pipeline['ratio_to_remap']:.2f} times a bare remap, realtime_factor "
+        f"{pipeline['realtime_factor']:.2f}"
     )
     console.print(
         f"writer: {result['writer']['ratio_of_plain_speed']:.2f} of the speed of write + fsync"
     )
+    for sentence in result["gate"]["sentences"]:
+        console.print(sentence, soft_wrap=True)
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

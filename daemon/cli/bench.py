@@ -101,7 +101,8 @@ def _print(result: dict[str, Any]) -> None:
         return
     console.print(
         f"cv2.remap of the PAN frames {peers['remap_s'] * 1e3:.0f} ms; composition takes "
-        f"{peers['resampling_ratio']:.2f} times that"
+        f"{peers['resampling_ratio']:.2f} times that, an exposure of several in parallel "
+        f"{peers['ratio_to_remap']:.2f} times"
     )
     stitched = peers["nona_enblend"]
     if "skipped" in stitched:

@@ -13,14 +13,19 @@ from typing import Any
 
 
 def interleaved(runs: int, **tasks: Callable[[], object]) -> dict[str, dict[str, float]]:
-    """Time tasks in turn; for each task seconds: median, least, most."""
+    """Time tasks in turn; for each task seconds: median, least, most, and median CPU seconds."""
     seconds: dict[str, list[float]] = {name: [] for name in tasks}
+    cpu_s: dict[str, list[float]] = {name: [] for name in tasks}
     for _ in range(runs):
         for name, task in tasks.items():
-            started = time.perf_counter()
+            used, started = time.process_time(), time.perf_counter()
             task()
             seconds[name].append(time.perf_counter() - started)
-    return {name: spread(values) for name, values in seconds.items()}
+            cpu_s[name].append(time.process_time() - used)
+    return {
+        name: {**spread(values), "median_cpu_s": statistics.median(cpu_s[name])}
+        for name, values in seconds.items()
+    }
 
 
 def spread(seconds: list[float]) -> dict[str, float]:

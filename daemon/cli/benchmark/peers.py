@@ -7,10 +7,12 @@ from __future__ import annotations
 
 import math
 import shutil
+import statistics
 import subprocess
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +26,8 @@ from processing.matching.tie_points import PAN_TO_PAN, TiePoints
 from processing.rig import Rig
 
 CELL_PX = 32
+REMAP_THREADS = 2
+REMAP_RUNS = 5
 PEER_TIMEOUT_S = 1500.0
 PACKAGES = {
     "nona": "hugin-tools",
@@ -53,8 +57,31 @@ def remap_seconds(
 ) -> float:
     """Seconds of cv2.remap, cubic, of all PAN frames, each over the box of the image it fills.
 
-    The maps are float32, made before and not timed; nothing is blended, masked or balanced.
+    The reference of the pipeline's pace, whatever its own threads: two threads, float32 maps, made
+    before and not timed, one warm-up, median of five runs. Nothing is blended, masked or balanced.
     """
+    import cv2
+
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(REMAP_THREADS)
+    runs = [0.0] * REMAP_RUNS
+    try:
+        for name, frame in frames.items():
+            remap = remap_of(rig, placements[name], frame)
+            remap()
+            for k in range(REMAP_RUNS):
+                started = time.perf_counter()
+                remap()
+                runs[k] += time.perf_counter() - started
+    finally:
+        cv2.setNumThreads(threads)
+    return statistics.median(runs)
+
+
+def remap_of(
+    rig: Rig, placement: SensorPlacement, frame: NDArray[np.uint16]
+) -> Callable[[], object]:
+    """One bare cv2.remap of a PAN frame over the box of the image it fills, its maps made."""
     import cv2
 
     image = rig.virtual_image
@@ -62,27 +89,21 @@ def remap_seconds(
         raise PeerError(f"rig {rig.name} has no virtual image to remap to")
     raster = pan_raster(image)
     rows, columns = lattice_shape(raster, CELL_PX)
-    total = 0.0
-    for name, frame in frames.items():
-        lattice = np.empty((rows, columns, 2))
-        fill_lattice(image, raster, placements[name], CELL_PX, lattice)
-        height, width = frame.shape
-        c, r = lattice[..., 0], lattice[..., 1]
-        inside = (c >= 0) & (c <= width - 1) & (r >= 0) & (r <= height - 1)
-        i, j = np.flatnonzero(inside.any(axis=1)), np.flatnonzero(inside.any(axis=0))
-        box = lattice[i[0] : i[-1] + 1, j[0] : j[-1] + 1]
-        box = np.where(box == OUTSIDE, 0.0, box)
-        up, along = _between(box.shape[0]), _between(box.shape[1])
-        maps = [np.ascontiguousarray(up @ box[..., k] @ along.T, np.float32) for k in (0, 1)]
-        source = np.ascontiguousarray(frame)
-        target = np.zeros(maps[0].shape, np.uint16)
-        best = math.inf
-        for _ in range(2):
-            started = time.perf_counter()
-            cv2.remap(source, maps[0], maps[1], cv2.INTER_CUBIC, target, cv2.BORDER_CONSTANT)
-            best = min(best, time.perf_counter() - started)
-        total += best
-    return total
+    lattice = np.empty((rows, columns, 2))
+    fill_lattice(image, raster, placement, CELL_PX, lattice)
+    height, width = frame.shape
+    c, r = lattice[..., 0], lattice[..., 1]
+    inside = (c >= 0) & (c <= width - 1) & (r >= 0) & (r <= height - 1)
+    i, j = np.flatnonzero(inside.any(axis=1)), np.flatnonzero(inside.any(axis=0))
+    box = lattice[i[0] : i[-1] + 1, j[0] : j[-1] + 1]
+    box = np.where(box == OUTSIDE, 0.0, box)
+    up, along = _between(box.shape[0]), _between(box.shape[1])
+    maps = [np.ascontiguousarray(up @ box[..., k] @ along.T, np.float32) for k in (0, 1)]
+    source = np.ascontiguousarray(frame)
+    target = np.zeros(maps[0].shape, np.uint16)
+    return partial(
+        cv2.remap, source, maps[0], maps[1], cv2.INTER_CUBIC, target, cv2.BORDER_CONSTANT
+    )
 
 
 def _between(nodes: int) -> NDArray[np.float32]:

@@ -245,6 +245,7 @@ def _peers(
     found: dict[str, Any] = {
         "remap_s": remap_s,
         "resampling_ratio": result["stages"]["composition"]["median_s"] / remap_s,
+        "ratio_to_remap": result["side_by_side"]["seconds_per_exposure"] / remap_s,
     }
     missing = peers.missing_programs()
     if missing:
