@@ -35,6 +35,7 @@ _KERNEL_MODULES: Final = (
     "processing.quality.frame_blocks",
     "processing.quality.local_sharpness",
     "processing.quality.signal_steps",
+    "processing.quality.valid_area",
     "processing.matching.least_squares",
     "processing.radiometry.defects",
     "processing.radiometry.level1",
