@@ -247,6 +247,7 @@ def test_nothing_compiles_after_the_warm_up(
         "_flat_pass",
         "select_features",
         "match_patches",
+        "refine_patches",
         "_node_means",
         "_cheapest_path",
         "_feather",
