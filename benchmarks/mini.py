@@ -13,8 +13,10 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Mapping
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from datetime import UTC, datetime
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -31,11 +33,13 @@ from daemon.mission.exposure import CaptureRecord, FrameRecord
 from daemon.mission.layout import Mission
 from daemon.mission.store.store import Level0Writer, load_level0
 from daemon.products.exposure_conditions import conditions_of
+from daemon.products.processing_threads import configure_threads, thread_counts
 from processing.pipelines.stitched import Pipeline, PipelineSettings
 from processing.quality.report import Flag
 from processing.radiometry.calibration import load_radiometry
 from processing.rig import load_rig
 
+THREADS = 2
 Frames = Mapping[str, NDArray[np.uint16]]
 
 
@@ -50,7 +54,7 @@ def main() -> int:
         result = {
             "machine": machine(),
             "rig": "ultracam-x-mini",
-            "pipeline": _time_pipeline(mission, radiometry, options.runs),
+            "pipeline": _in_own_process(mission, radiometry, options.runs),
             "writer": _time_writer(Path(folder), mission, options.runs),
         }
     ratios, processor = result["pipeline"]["cpu_ratios"], result["machine"]["processor"]
@@ -78,10 +82,20 @@ def _fly(folder: Path) -> tuple[Mission, Path]:
     return Mission.open(mission), mission.parents[1] / "sim" / "calibration" / "radiometry"
 
 
-def _time_pipeline(mission: Mission, radiometry: Path, runs: int) -> dict[str, Any]:
+def _in_own_process(mission: Mission, radiometry: Path, runs: int) -> dict[str, Any]:
+    """Time the pipeline in a process that begins as the service's worker does: no thread spins."""
+    for name, count in thread_counts(THREADS).items():
+        os.environ.setdefault(name, count)
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as worker:
+        return worker.submit(_time_pipeline, mission.path, radiometry, runs).result()
+
+
+def _time_pipeline(mission_path: Path, radiometry: Path, runs: int) -> dict[str, Any]:
+    configure_threads()
+    mission = Mission.open(mission_path)
     rig = load_rig(mission.rig_path)
     calibrations = {s.name: load_radiometry(radiometry / f"{s.name}.npz") for s in rig.sensors}
-    pipeline = Pipeline(rig, calibrations, PipelineSettings(geometry=False))
+    pipeline = Pipeline(rig, calibrations, PipelineSettings(geometry=False, threads=THREADS))
     pipeline.warm_up()
     frames, exposure = load_level0(mission.level0(2), rig)
     plan = PlanSection(ground_height_m=395.0, height_above_ground_m=3000.0)
