@@ -51,7 +51,7 @@ def main() -> int:
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="syntopic-bench-") as folder:
         mission, radiometry = _fly(Path(folder))
-        result = {
+        result: dict[str, Any] = {
             "machine": machine(),
             "rig": "ultracam-x-mini",
             "pipeline": _in_own_process(mission, radiometry, options.runs),

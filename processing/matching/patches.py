@@ -301,8 +301,9 @@ def refine_patches(
         b = flat_b[: size * size].reshape(size, size)
         scratch = refinement_scratch(side)
         found = np.empty(4)
+        # `prange` counts in uint64: without this, each callee is compiled for uint64 as well.
         first = np.int64(block * _BLOCK)
-        last = min(first + _BLOCK, count)
+        last = min(first + _BLOCK, np.int64(count))
         here = _predicted_corners(at_a, predicted_b, first, ratio, margin_px)
         for i in range(first, last):
             col_a, row_a, col_b, row_b = here

@@ -246,7 +246,14 @@ def _is_box(box: object, columns: int, rows: int) -> bool:
 
 
 @njit(cache=True, nogil=True)
-def _count_samples(raster, down, across, saturated_bit, there, saturated):
+def _count_samples(
+    raster: NDArray[Any],
+    down: NDArray[np.int64],
+    across: NDArray[np.int64],
+    saturated_bit: int,
+    there: NDArray[np.int32],
+    saturated: NDArray[np.int32],
+) -> None:
     """Count the samples of each cell that hold data, and those that are saturated."""
     for i in range(len(down)):
         line = raster[down[i]]
