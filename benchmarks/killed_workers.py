@@ -19,6 +19,7 @@ import subprocess
 import sys
 import threading
 from collections import Counter
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -65,8 +66,9 @@ class Killer(threading.Thread):
                 self.scheduler = started_scheduler()
                 self.done[what] += 1
             elif victims := computing_children(self.worker_command):
-                os.kill(random.choice(victims), signal.SIGKILL)
-                self.done[what] += 1
+                with suppress(ProcessLookupError):
+                    os.kill(random.choice(victims), signal.SIGKILL)
+                    self.done[what] += 1
 
     def end(self) -> None:
         self.is_ended.set()

@@ -106,6 +106,7 @@ class DaskExecutor:
         self._work = b""
         self._futures: dict[int, distributed.Future] = {}
         self._ended: queue.SimpleQueue[tuple[int, distributed.Future]] = queue.SimpleQueue()
+        self._unsent: list[TaskOutcome] = []
         self._submitted = 0
         self._capacity, self._counted_s = 1, 0.0
         self.dashboard = ""
@@ -156,7 +157,8 @@ class DaskExecutor:
 
     def submit(self, task: BatchTask) -> None:
         if self._client is None or not self._is_connected():
-            return  # `wait` finds it
+            self._unsent.append(TaskLost(task.number, "scheduler", "the scheduler died"))
+            return
         self._submitted += 1
         future = self._client.submit(
             run_on_worker,
@@ -170,7 +172,10 @@ class DaskExecutor:
 
     def wait(self, timeout_s: float) -> list[TaskOutcome]:
         if not self._is_connected():
-            return self._reconnect()
+            self._unsent += self._reconnect()
+        if self._unsent:
+            unsent, self._unsent = self._unsent, []
+            return unsent
         limit_s = time.monotonic() + timeout_s
         found: list[TaskOutcome] = []
         while not found and self._is_connected():

@@ -121,6 +121,18 @@ def test_a_cluster_whose_workers_are_killed_makes_the_same_bytes(
     assert hashes(mission) == hashes(other)
 
 
+def test_a_task_submitted_while_the_scheduler_is_away_is_submitted_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    from daemon.postflight.batch.dask_executor import DaskExecutor
+    from daemon.postflight.batch.executor import BatchTask, TaskLost
+
+    executor = DaskExecutor(cluster_address("tcp://127.0.0.1:1", None, None, None))
+    monkeypatch.setattr(executor, "_reconnect", list)
+    executor.submit(BatchTask(7))
+    assert executor.wait(0.0) == [TaskLost(7, "scheduler", "the scheduler died")]
+
+
 def test_without_a_scheduler_the_sentence_names_how_to_start_one() -> None:
     url = f"tcp://127.0.0.1:{free_port()}"
     command = [sys.executable, "-m", "daemon", "worker", url, "--processes", "1", "--wait", "1"]
