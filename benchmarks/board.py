@@ -24,8 +24,9 @@ from scipy.stats import chi2
 from daemon.postflight.calibration.board.report import covariance_of, estimated_parameters
 from processing.bundle.network import INTERIOR
 from processing.calibration.board.adjustment import BoardCalibration, BoardSettings, calibrate_board
-from processing.calibration.board.views import BoardView, layer_mm
+from processing.calibration.board.views import BoardView
 from processing.geometry.lens import ideal_from_measured
+from processing.geometry.placement import layer_mm_from_raw
 from processing.geometry.rotation import rotation_matrix, vectors_from_rotations
 from processing.matching.board_corners import BoardCorners
 from processing.matching.calibration_board import CalibrationBoard, parse_board
@@ -178,7 +179,7 @@ def peer_difference_px(one: BoardSample, head: str) -> Array:
     column = np.linspace(margin, 1 - margin, 17) * (size[0] - 1)
     row = np.linspace(margin, 1 - margin, 13) * (size[1] - 1)
     px = np.stack(np.meshgrid(column, row), axis=-1).reshape(-1, 2)
-    ideal = ideal_from_measured(cone.lens, layer_mm(sensor, px))
+    ideal = ideal_from_measured(cone.lens, layer_mm_from_raw(sensor, px))
     ours = np.column_stack([ideal[:, 0], -ideal[:, 1], np.full(len(px), cone.lens.f_mm)])
     ours /= np.linalg.norm(ours, axis=1, keepdims=True)
     exactly = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)

@@ -221,6 +221,37 @@ def raw_from_sensor_mm(placement: SensorPlacement, u_mm: Array) -> Array:
     return colrow
 
 
+def layer_mm_from_raw(sensor: Sensor, colrow: Array) -> Array:
+    """Carry raw pixels into the physical layer, as the rig file places the sensor.
+
+    Args:
+        sensor: place, rotation, scale and perspective skew, at calibration temperature.
+        colrow: (column, row), shape (n, 2), zero-based, integer at the pixel centre, row down.
+
+    Returns:
+        Points of the layer before lens correction, shape (n, 2), mm, x right, y up.
+
+    Source: docs/explanation/mathematics/coordinates.md#pixels-and-millimetres.
+
+    Example:
+        The upper left pixel of 1248 x 832, 7.2 um.
+
+        >>> from dataclasses import replace
+        >>> from processing.rig import find_rig
+        >>> sensor = find_rig("ultracam-x-mini").sensor("SU10")
+        >>> sensor = replace(sensor, x_mm=0.0, y_mm=0.0, rotation_rad=0.0, scale=1.0)
+        >>> layer_mm_from_raw(sensor, np.array([[0.0, 0.0]])).round(4)
+        array([[-4.4892,  2.9916]])
+    """
+    u = np.empty((len(colrow), 2))
+    u[:, 0] = (colrow[:, 0] - (sensor.width_px - 1) / 2.0) * sensor.pitch_mm
+    u[:, 1] = ((sensor.height_px - 1) / 2.0 - colrow[:, 1]) * sensor.pitch_mm
+    about = apply_similarity(Similarity(0.0, 0.0, sensor.rotation_rad, sensor.scale), u)
+    if sensor.skew_per_mm != NO_SKEW:
+        about = about * (1.0 + about @ sensor.skew_per_mm)[:, None]
+    return np.asarray(about + np.array((sensor.x_mm, sensor.y_mm)))
+
+
 def corrected_mm_from_raw(placement: SensorPlacement, colrow: Array) -> Array:
     """u' of eq. 1: what S and P act on, independent of their adjustment.
 

@@ -17,8 +17,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.calibration.board.views import layer_mm
 from processing.geometry.lens import ideal_from_measured
+from processing.geometry.placement import layer_mm_from_raw
 from processing.geometry.rotation import rotation_matrix
 from processing.rig import Cone
 
@@ -51,7 +51,7 @@ def directions(cone: Cone, px: Array) -> Array:
     Returns:
         Shape (n, 3).
     """
-    ideal = ideal_from_measured(cone.lens, layer_mm(cone.sensors[0], px))
+    ideal = ideal_from_measured(cone.lens, layer_mm_from_raw(cone.sensors[0], px))
     ray = np.column_stack([ideal, np.full(len(ideal), -cone.lens.f_mm)])
     return np.asarray(ray / np.linalg.norm(ray, axis=1, keepdims=True))
 

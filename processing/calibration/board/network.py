@@ -23,7 +23,8 @@ from processing.bundle.network import (
     Points,
     Stations,
 )
-from processing.calibration.board.views import BoardView, ViewPose, layer_mm
+from processing.calibration.board.views import BoardView, ViewPose
+from processing.geometry.placement import layer_mm_from_raw
 from processing.geometry.rotation import rotation_matrix
 from processing.matching.calibration_board import CalibrationBoard
 from processing.rig import Cone
@@ -114,7 +115,9 @@ def board_network(
     sizes = [len(view.corners.index) for view in views]
     image = np.repeat(np.arange(len(views)), sizes)
     by_name = {cone.name: cone for cone in cones}
-    xy = np.concatenate([layer_mm(by_name[v.head].sensors[0], v.corners.px) for v in views])
+    xy = np.concatenate(
+        [layer_mm_from_raw(by_name[v.head].sensors[0], v.corners.px) for v in views]
+    )
     pitch = np.array([cone.sensors[0].pitch_mm for cone in cones])[cameras][image]
     return Network(
         cameras=tuple(_camera(cone, free) for cone in cones),

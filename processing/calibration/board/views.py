@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 
 from processing.bundle.initial_values import resect
 from processing.geometry.lens import ideal_from_measured
+from processing.geometry.placement import layer_mm_from_raw
 from processing.matching.board_corners import BoardCorners
 from processing.matching.calibration_board import CalibrationBoard
-from processing.rig import Cone, Sensor
+from processing.rig import Cone
 
 Array = NDArray[np.float64]
 
@@ -89,23 +90,6 @@ class ViewCoverage:
         return not self.missing
 
 
-def layer_mm(sensor: Sensor, px: Array) -> Array:
-    """Places in the layer, as the rig file has the sensor.
-
-    Args:
-        sensor: place, rotation and scale.
-        px: column and row, shape (n, 2).
-
-    Returns:
-        Shape (n, 2), mm, y up.
-    """
-    u = (px[:, 0] - (sensor.width_px - 1) / 2) * sensor.pitch_mm
-    v = ((sensor.height_px - 1) / 2 - px[:, 1]) * sensor.pitch_mm
-    c, s = math.cos(sensor.rotation_rad), math.sin(sensor.rotation_rad)
-    rotated = sensor.scale * np.stack([c * u - s * v, s * u + c * v], axis=1)
-    return np.asarray(rotated + np.array([sensor.x_mm, sensor.y_mm]))
-
-
 def pose_of(cone: Cone, board: CalibrationBoard, corners: BoardCorners) -> ViewPose:
     """Orient a view by a resection with the lens of the rig file.
 
@@ -120,7 +104,7 @@ def pose_of(cone: Cone, board: CalibrationBoard, corners: BoardCorners) -> ViewP
     Raises:
         ValueError: no resection.
     """
-    ideal = ideal_from_measured(cone.lens, layer_mm(cone.sensors[0], corners.px))
+    ideal = ideal_from_measured(cone.lens, layer_mm_from_raw(cone.sensors[0], corners.px))
     station, rotation = resect(ideal, board.corners_m[corners.index], cone.lens.f_mm)
     return ViewPose(rotation.T, -rotation.T @ station)
 

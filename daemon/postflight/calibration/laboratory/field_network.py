@@ -17,7 +17,7 @@ from daemon.postflight.calibration.laboratory.field_measurement import (
     master_of,
     offset_m,
 )
-from daemon.postflight.calibration.laboratory.head_geometry import LENS_KEYS, layer_mm
+from daemon.postflight.calibration.laboratory.head_geometry import LENS_KEYS
 from processing.bundle.network import (
     INTERIOR,
     Attitudes,
@@ -30,6 +30,7 @@ from processing.bundle.network import (
     Stations,
 )
 from processing.bundle.terms import Kind, Part, Term
+from processing.geometry.placement import layer_mm_from_raw
 from processing.geometry.rotation import rotation_matrix
 from processing.rig import Cone, Rig, Sensor
 
@@ -64,7 +65,7 @@ def lab_network(
     sigma = np.empty_like(observations.px)
     for j, sensor in enumerate(rig.sensors):
         own = observations.sensor == j
-        xy[own] = layer_mm(sensor, observations.px[own])
+        xy[own] = layer_mm_from_raw(sensor, observations.px[own])
         sigma[own] = sigma_px * sensor.pitch_mm
     heads = tuple(
         HeadMounting(

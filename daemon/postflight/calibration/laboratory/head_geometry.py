@@ -36,6 +36,7 @@ from processing.bundle.network import (
     Stations,
 )
 from processing.bundle.rank_diagnosis import RankDefectError
+from processing.geometry.placement import layer_mm_from_raw
 from processing.geometry.residual_grid import (
     ResidualGrid,
     cross_validation_residuals,
@@ -133,16 +134,6 @@ class HeadGeometry:
         return replace(self.cone.lens, **values, residual_grid=grid)
 
 
-def layer_mm(sensor: Sensor, px: Array) -> Array:
-    """Layer coordinates (n, 2), mm, of pixel positions (column, row), as the rig places them."""
-    u = (px[:, 0] - (sensor.width_px - 1) / 2) * sensor.pitch_mm
-    v = ((sensor.height_px - 1) / 2 - px[:, 1]) * sensor.pitch_mm
-    c, s = math.cos(sensor.rotation_rad), math.sin(sensor.rotation_rad)
-    rotated = sensor.scale * np.stack([c * u - s * v, s * u + c * v], axis=1)
-    rotated *= 1.0 + (rotated @ sensor.skew_per_mm)[:, None]
-    return np.asarray(rotated + np.array([sensor.x_mm, sensor.y_mm]))
-
-
 def collimator_axes(alpha_rad: float, beta_rad: float) -> Array:
     """Columns: direction to the target, and the axes of its plane along alpha and beta; (3, 3).
 
@@ -194,7 +185,11 @@ def calibrate_head(
     matched_mm = float(np.median(matching.sigma_px[matched])) * sensor.pitch_mm
     sigma_mm = math.hypot(matched_mm, angle_sigma_rad * cone.lens.f_mm)
     network = head_network(
-        cone, [targets[k] for k in matched], layer_mm(sensor, px), sigma_mm=sigma_mm, free=free
+        cone,
+        [targets[k] for k in matched],
+        layer_mm_from_raw(sensor, px),
+        sigma_mm=sigma_mm,
+        free=free,
     )
     return _adjusted(cone, sensor, targets, matching, network, sigma_mm)
 

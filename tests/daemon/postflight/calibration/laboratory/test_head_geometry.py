@@ -19,12 +19,12 @@ from daemon.postflight.calibration.laboratory.head_geometry import (
     CollimatorSeries,
     Target,
     head_network,
-    layer_mm,
 )
 from daemon.postflight.calibration.laboratory.laboratory_series import SeriesError, read_series
 from daemon.postflight.calibration.laboratory.radiometric import RadiometricSeries
 from processing.bundle.adjust import adjust
 from processing.bundle.network import INTERIOR
+from processing.geometry.placement import layer_mm_from_raw
 from processing.geometry.residual_grid import grid_from_bytes
 from processing.matching.target_matching import TargetImage, first_guess, positions_of
 from processing.rig import find_rig, load_rig, shipped_rigs
@@ -77,7 +77,7 @@ def test_a_head_comes_out_below_a_twentieth_of_a_pixel_and_the_grid_takes_the_re
         g.ravel() for g in np.meshgrid(np.linspace(40, 1750, 15), np.linspace(40, 980, 9))
     )
     with_extra = collimator.true_head(find_rig(RIG), "P1", 1)
-    measured = layer_mm(rig.sensor("P1"), np.stack([column, row], axis=1))
+    measured = layer_mm_from_raw(rig.sensor("P1"), np.stack([column, row], axis=1))
     error = head.ideal(column, row) + grid.correction_to_ideal(measured)
     error = error - with_extra.ideal(column, row)
     assert float(np.sqrt(np.mean(_less_rotation(measured, error) ** 2))) < 0.012 / 100
@@ -144,7 +144,10 @@ def test_the_uncertainty_of_the_parameters_is_honest_over_fifty_seeds() -> None:
                         Target(Path(), "P1", str(holder), alpha, beta, 20.0, 90.0 * holder)
                     )
         network = head_network(
-            cone, targets, layer_mm(sensor, np.array(px)), sigma_mm=sigma_px * sensor.pitch_mm
+            cone,
+            targets,
+            layer_mm_from_raw(sensor, np.array(px)),
+            sigma_mm=sigma_px * sensor.pitch_mm,
         )
         result = adjust(network)
         columns = result.layout.interior[0]
