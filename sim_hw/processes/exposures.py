@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,10 +17,16 @@ from typing import Any
 
 import tifffile
 
+from processing.rig import Rig
 from sim_hw.__main__ import displacement, rig_file
 from sim_hw.world import sensor_calibration
 from sim_hw.world.atomic_file import atomic_file
-from sim_hw.world.electronics import Electronics, true_sensor
+from sim_hw.world.electronics import (
+    COLUMN_BIAS_DN,
+    PIXEL_BIAS_DN,
+    Electronics,
+    true_sensor,
+)
 from sim_hw.world.ground_types import GROUNDS
 from sim_hw.world.post_processed_trajectory import marks_of_lines, write_trajectory
 from sim_hw.world.rendering import ExposureParameters, light_on_sensor
@@ -37,6 +44,9 @@ CONTROL, CHECKS = 12, 30
 """Surveyed points of a block."""
 LEAST_BLOCK = 5
 """Exposures that make one: fewer hardly overlap three times."""
+BLACK_SIGMAS = 4.0
+MIN_FULL_WELL_E = 2000.0
+"""Fewer electrons at the highest value leave nothing but photon noise: 2.2 % of white."""
 
 
 def write_exposures(world: World, out: Path, *, count: int, scenes: Path, lines: int = 1) -> Path:
@@ -145,6 +155,38 @@ def _write_plan(world: World, mission: Path, radiometry: Path) -> None:
         part.write_text(text, encoding="utf-8")
 
 
+def radiometry_problem(rig: Rig) -> str | None:
+    """Why frames of a rig would show nothing but its placeholders for radiometric values.
+
+    Args:
+        rig: the camera.
+
+    Returns:
+        One sentence about the first such sensor; None where all can be emulated.
+    """
+    for sensor in rig.sensors:
+        full_well_e = sensor.full_scale_dn * sensor.electrons_per_dn
+        read_noise_dn = sensor.read_noise_e / sensor.electrons_per_dn
+        least_dn = BLACK_SIGMAS * math.hypot(read_noise_dn, PIXEL_BIAS_DN, COLUMN_BIAS_DN)
+        found = []
+        if full_well_e < MIN_FULL_WELL_E:
+            found.append(
+                f"electrons_per_dn = {sensor.electrons_per_dn:g} fills {sensor.bits} bits with "
+                f"{full_well_e:.0f} electrons; a sensor holds {MIN_FULL_WELL_E:.0f} at least"
+            )
+        if sensor.black_dn < least_dn:
+            found.append(
+                f"black_dn = {sensor.black_dn:g} cuts the noise of dark pixels off at 0 DN; it is "
+                f"{least_dn:.1f} at least"
+            )
+        if found:
+            return (
+                f"sensor {sensor.name}: {'; '.join(found)}. Give black_dn, electrons_per_dn and "
+                "read_noise_e of the sensor, such as 64, 20 and 30 for 12 bits"
+            )
+    return None
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command line; one JSON line gives the path of every result."""
     line = argparse.ArgumentParser(prog="python -m sim_hw.processes.exposures", description=__doc__)
@@ -182,6 +224,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )
     except ValueError as error:
         print(error, file=sys.stderr)
+        return 2
+    problem = radiometry_problem(world.rig)
+    if problem is not None:
+        print(f"{given.rig}: {problem}", file=sys.stderr)
         return 2
     given.out.mkdir(parents=True, exist_ok=True)
     mission = write_exposures(
