@@ -44,16 +44,18 @@ class SlipSettings:
     independent points, and by more than `min_shift_px`. The second decides on ground where errors
     of neighbouring points are correlated: relief, trees, clouds, vehicles
     (docs/explanation/validity.md). All of a band moves: `min_share` of its points have its shift,
-    of vehicles on a road fewer.
+    of vehicles on a road fewer. A head drops whole lines: a band moves by `min_own_px` of its
+    frame's own pixels at least, of which the adjustment leaves `remaining_share`.
     """
 
     bin_points: int = 7
     limit: float = 15.0
     min_share: float = 0.6
+    min_own_px: float = 0.5
     max_rounds: int = 4
 
     def min_shift_px(self, points: int) -> float:
-        """The smallest shift of a band that is a slip.
+        """The smallest shift of a band that residuals show.
 
         Args:
             points: tie points in the band.
@@ -64,6 +66,39 @@ class SlipSettings:
         Source: docs/explanation/mathematics/validity.md#read-out-slips.
         """
         return 0.15 + 1.7 / math.sqrt(points)
+
+    def min_whole_px(self, share: float, own_px: float) -> float:
+        """The smallest shift of a band that a head can cause: it shifts by whole pixels.
+
+        Args:
+            share: part of the frame in the band.
+            own_px: size of the frame's own pixel, PAN pixels.
+
+        Returns:
+            PAN pixels.
+
+        Source: docs/explanation/mathematics/validity.md#read-out-slips.
+        """
+        return self.min_own_px * own_px * remaining_share(share)
+
+
+def remaining_share(share: float) -> float:
+    """What a frame's own shift, rotation and scale leave of a band's shift against the rest.
+
+    A straight line fitted to a step of one at the end of a frame takes this much of it; a band in
+    the middle keeps more.
+
+    Args:
+        share: part of the frame in the band, 0 to 1.
+
+    Returns:
+        Shift that is left over the shift; 0.25 for half a frame.
+
+    Example:
+        >>> remaining_share(0.5), remaining_share(0.1)
+        (0.25, 0.73)
+    """
+    return 1.0 - 3.0 * share * (1.0 - share)
 
 
 @dataclass(frozen=True)
@@ -282,6 +317,7 @@ def _bands(
     own = np.where(in_a[:, None], residuals[rows], -residuals[rows])
     raw = np.where(in_a[:, None], tie_points.raw_a[rows], tie_points.raw_b[rows])
     sensor = rig.sensor(tie_points.names[number])
+    own_px = _own_px(rig, sensor.name)
     axes: tuple[tuple[Axis, int, int], ...] = (
         ("rows", 1, sensor.height_px),
         ("columns", 0, sensor.width_px),
@@ -289,8 +325,20 @@ def _bands(
     return [
         band
         for axis, index, size in axes
-        if (band := _best_band(sensor.name, axis, size, raw[:, index], own, sigma[rows], settings))
+        if (
+            band := _best_band(
+                sensor.name, axis, size, raw[:, index], own, sigma[rows], settings, own_px=own_px
+            )
+        )
     ]
+
+
+def _own_px(rig: Rig, sensor: str) -> float:
+    """Size of a frame's pixel in the virtual image, PAN pixels."""
+    cone, image = rig.cone_of(sensor), rig.virtual_image
+    if image is None:
+        return 1.0
+    return rig.sensor(sensor).pitch_mm / image.pitch_mm * image.f_mm / cone.lens.f_mm
 
 
 def _best_band(
@@ -301,6 +349,8 @@ def _best_band(
     residuals: Array,
     sigma: Array,
     settings: SlipSettings,
+    *,
+    own_px: float,
 ) -> tuple[Slip, float] | None:
     """Of all bands of one frame along one axis that are shifted, the one that explains most.
 
@@ -337,9 +387,12 @@ def _best_band(
             # A wrong scale or rotation is a ramp, which a band only seems to be.
             ramp = _explained(residuals - level, sigma, _ramp(at, residuals - level))
             explained = explained if explained > ramp else 0.0
-            large = max(abs(dx), abs(dy)) > settings.min_shift_px(band.stop - band.start)
             off = np.abs(residuals[band] - outside - (dx, dy)).max(axis=1)
             near = off < MIN_COMMON_FRACTION * math.hypot(dx, dy) + 3.0 * sigma[band]
+            large = max(abs(dx), abs(dy)) > max(
+                settings.min_shift_px(band.stop - band.start),
+                settings.min_whole_px(float(np.sum(near)) / len(residuals), own_px),
+            )
             if (
                 large
                 and explained > 0.0

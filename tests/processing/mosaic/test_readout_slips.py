@@ -282,7 +282,7 @@ def worst(count: int, level: float, step: float) -> Slip | None:
     noise = 0.01 * np.random.default_rng(1).standard_normal((count, 2))
     sigma = np.full(count, 0.05)
     found = readout_slips._best_band(
-        "SU00", "rows", count, at, residuals + noise, sigma, SlipSettings()
+        "SU00", "rows", count, at, residuals + noise, sigma, SlipSettings(), own_px=1.0
     )
     return None if found is None else found[0]
 
@@ -301,3 +301,38 @@ def test_half_of_four_bins_is_the_smallest_band() -> None:
     assert slip is not None and slip.points == 14
     assert worst(21, 0.0, 20.0) is not None
     assert worst(14, 0.0, 20.0) is None
+
+
+@pytest.mark.parametrize(
+    ("share", "kept"), [(0.04, 0.8848), (0.25, 0.4375), (0.5, 0.25), (0.75, 0.4375)]
+)
+def test_a_straight_line_leaves_this_much_of_a_step(share: float, kept: float) -> None:
+    at = np.linspace(0.0, 1.0, 20001)
+    step = (at < share).astype(np.float64)
+    left = step - np.polyval(np.polyfit(at, step, 1), at)
+    assert np.mean(left[at < share]) - np.mean(left[at >= share]) == pytest.approx(kept, abs=1e-3)
+    assert readout_slips.remaining_share(share) == pytest.approx(kept)
+
+
+def test_pixels_are_as_large_as_they_lie_in_the_virtual_image() -> None:
+    rig = find_rig("dmc-mini")
+    assert readout_slips._own_px(rig, "G") == pytest.approx(4.8, abs=1e-3)
+    assert readout_slips._own_px(rig, rig.pan_cones[0].sensors[0].name) == pytest.approx(
+        1.0, abs=1e-3
+    )
+    assert readout_slips._own_px(find_rig("midas-mini"), "nadir") == 1.0
+
+
+@pytest.mark.parametrize(("own_px", "expected"), [(1.0, True), (2.2, True), (2.9, False)])
+def test_a_band_moves_by_half_a_pixel_of_its_own_frame_or_is_no_slip(
+    own_px: float, expected: bool
+) -> None:
+    """Of a sixth 58 % is left: 0.75 px are the least that pixels of 2.57 px can shift by."""
+    at = np.arange(840.0)
+    residuals = 0.01 * np.random.default_rng(2).standard_normal((840, 2))
+    residuals[:140, 1] += 0.75
+    sigma = np.full(840, 0.05)
+    found = readout_slips._best_band(
+        "SU00", "rows", 840, at, residuals, sigma, SlipSettings(), own_px=own_px
+    )
+    assert (found is not None) is expected
