@@ -43,7 +43,7 @@ def clean_rows(count: int, seed: int, file: Path | None) -> Iterator[Row]:
         if number in known:
             yield known[number]
             continue
-        row = _clean(number, seed)
+        row = clean_row(number, seed)
         if file is not None:
             with file.open("a") as out:
                 out.write(json.dumps(row) + "\n")
@@ -51,7 +51,8 @@ def clean_rows(count: int, seed: int, file: Path | None) -> Iterator[Row]:
         yield row
 
 
-def _clean(number: int, seed: int) -> Row:
+def clean_row(number: int, seed: int) -> Row:
+    """One healthy exposure by number and seed: its flags, false alarms and normalised errors."""
     light = number // DRAWS
     rig = RIGS[light % len(RIGS)]
     scene = list(SCENES)[light // len(RIGS) % len(SCENES)]

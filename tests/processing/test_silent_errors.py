@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from benchmarks.silent_errors.cases import Case, draw, run
-from benchmarks.silent_errors.clean import clean_rows
+from benchmarks.silent_errors.clean import clean_row, clean_rows
 from benchmarks.silent_errors.faults import FAULTS
-from benchmarks.silent_errors.limits import LIMITS, L, X, table
+from benchmarks.silent_errors.limits import DMC, LIMITS, L, X, table
 
 DOCUMENT = Path(__file__).parents[2] / "docs/explanation/validity.md"
 SAMPLE = {
@@ -35,6 +35,14 @@ def test_a_sample_of_wrong_inputs_does_not_pass_as_good(rig: str) -> None:
     outcomes = [run(case) for case in _sample(rig)]
     wrong = [o for o in outcomes if o.result in ("silent", "misled")]
     assert not wrong, wrong
+
+
+@pytest.mark.trust
+def test_a_tenth_of_a_colour_pixel_under_a_cloud_is_no_slip() -> None:
+    for number in (792, 798):
+        row = clean_row(number, seed=4)
+        assert (row["rig"], row["scene"]) == (DMC, "cloud")
+        assert not row["alarm"], row
 
 
 def test_the_published_detection_limits_are_those_of_the_search() -> None:
