@@ -70,6 +70,51 @@ def rededge(
 
 
 @app.command()
+def photographs(
+    folder: Annotated[Path, typer.Argument(help="Folder with JPEG or TIFF files of one camera.")],
+    out: Annotated[Path, typer.Option(help="New mission folder.")],
+    focal_mm: Annotated[
+        float | None, typer.Option(help="Focal length in mm (default: EXIF).", min=0.1)
+    ] = None,
+    pixel_um: Annotated[
+        float | None, typer.Option(help="Pixel pitch in um (default: EXIF).", min=0.1)
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Import photographs with positions in EXIF as a mission of one head.
+
+    The interior orientation is provisional; `syntopic triangulate` estimates it. Photographs of
+    several cameras, sizes or focal lengths are refused.
+
+    Example: `syntopic import photographs DCIM --out missions/field-8`
+    """
+    from daemon.postflight.importers.photographs import import_photographs
+
+    imported = import_photographs(folder, out, focal_mm=focal_mm, pixel_um=pixel_um)
+    first = imported.photographs[0]
+    if as_json:
+        content = {
+            "mission": str(imported.mission.path),
+            "photographs": len(imported.photographs),
+            "camera": first.camera,
+            "f_px": first.focal_px,
+            "pixel_um": first.pitch_mm * 1e3,
+            "notes": list(imported.notes),
+        }
+        typer.echo(json.dumps(content))
+        return
+    console = Console()
+    console.print(
+        f"{len(imported.photographs)} photographs of {first.camera}, {first.width_px} x "
+        f"{first.height_px} px, in {out}",
+        soft_wrap=True,
+    )
+    for note in imported.notes:
+        console.print(note, style="yellow", markup=False)
+    console.print(f"Next: syntopic triangulate {out}")
+
+
+@app.command()
 def dbat(
     script: Annotated[Path, typer.Argument(help="Script (XML) of a camera calibration.")],
     out: Annotated[Path, typer.Option(help="Folder for the adjustment project; must be new.")],

@@ -17,7 +17,6 @@ from daemon.cli.options import (
     AttitudeSigma,
     Crs,
     MountFile,
-    PositionSigma,
     Trajectory,
     lock_for,
 )
@@ -42,12 +41,17 @@ block (--head). Views of similar direction are matched, oblique ones by the plan
 With --live, the mission is triangulated as in flight: exposure by exposure, by the navigation of
 each record. Results are in export/triangulation/live: live.json, orientations.csv and report.html.
 
+A mission of photographs (`syntopic import photographs`) is oriented from features of its images
+without attitudes, and the interior orientation is estimated; control from an ODM `gcp_list.txt`
+(--points alone) or the two tables, with images named by file.
+
 Examples: `syntopic triangulate MISSION --trajectory sbet.out`,
 `syntopic triangulate MISSION --live`,
 `syntopic triangulate MISSION --head 5 --head 8`,
 `syntopic triangulate MISSION --set sensors-full --points points.csv --measured measured.csv`
 """
 
+FLOWN_SIGMA_M = (0.05, 0.05, 0.08)
 SETS = ("none", "radial", "sensors", "sensors-full")
 
 
@@ -81,7 +85,13 @@ def triangulate(
     gnss: Annotated[
         str, typer.Option(help="Model of GNSS errors per line: none, shift or linear.")
     ] = "none",
-    position_sigma: PositionSigma = (0.05, 0.05, 0.08),
+    position_sigma: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(
+            help="Standard deviation of positions in m: east north up (default: 0.05 0.05 0.08, of "
+            "photographs 3 3 5)."
+        ),
+    ] = None,
     attitude_sigma: AttitudeSigma = (5.0, 5.0, 8.0),
     search: Annotated[
         int, typer.Option(help="Search radius around the prediction in pixels.", min=4, max=200)
@@ -100,12 +110,16 @@ def triangulate(
     if live:
         from daemon.cli.triangulate_live import triangulate_live
 
-        triangulate_live(mission, position_sigma, attitude_sigma, trajectory, as_json=as_json)
+        triangulate_live(
+            mission, position_sigma or FLOWN_SIGMA_M, attitude_sigma, trajectory, as_json=as_json
+        )
         return
     from daemon.cli.adjust import _peak_mib
+    from daemon.cli.triangulate_photographs import POSITION_SIGMA_M, triangulate_photographs
     from daemon.mission.layout import Mission
     from daemon.postflight.adjustment.csv_tables import ProjectError
     from daemon.postflight.adjustment.summary import print_report, report_of
+    from daemon.postflight.importers.photographs import is_photographs
     from daemon.postflight.triangulation.report import (
         print_triangulation,
         triangulation_of,
@@ -132,11 +146,26 @@ def triangulate(
         )
     begun = time.perf_counter()
     folder = Mission.open(mission)
-    results = out or folder.export_dir / "triangulation" / set_name
+    of_photographs = is_photographs(folder)
+    name = "photographs" if of_photographs else set_name
+    results = out or folder.export_dir / "triangulation" / name
     if (results / "project.toml").exists():
         raise ProjectError(
             [f"{results} holds a triangulation already; give another folder with --out"]
         )
+    position_sigma = position_sigma or (POSITION_SIGMA_M if of_photographs else FLOWN_SIGMA_M)
+    if of_photographs:
+        triangulate_photographs(
+            folder,
+            results,
+            points=points,
+            measured=measured,
+            crs=crs,
+            position_sigma_m=position_sigma,
+            reject_beyond=reject,
+            as_json=as_json,
+        )
+        return
     requirements = TriangulationSettings(
         parameters=cast("SetName", set_name),
         interior=interior,

@@ -1,0 +1,118 @@
+"""`syntopic triangulate` of a mission of photographs: no attitudes, self-calibration."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+
+import typer
+from rich.progress import Progress
+
+from daemon.cli.exit_status import ExitStatus
+from daemon.cli.options import lock_for
+from daemon.mission.layout import Mission
+from daemon.terminal.console import Console
+
+POSITION_SIGMA_M = (3.0, 3.0, 5.0)
+"""Of a camera's own receiver; the adjustment estimates them."""
+
+
+def triangulate_photographs(
+    folder: Mission,
+    results: Path,
+    *,
+    points: Path | None,
+    measured: Path | None,
+    crs: str | None,
+    position_sigma_m: tuple[float, float, float],
+    reject_beyond: float,
+    as_json: bool,
+) -> None:
+    """Orient, adjust, write the results, print them; end with a status if photographs are missing.
+
+    Raises:
+        TriangulationError: the photographs make no block, or it cannot be adjusted.
+    """
+    from daemon.cli.adjust import _peak_mib
+    from daemon.mission.store.durable import create_file
+    from daemon.postflight.adjustment.summary import print_report, report_of
+    from daemon.postflight.calibration.rig_writer import rig_toml
+    from daemon.postflight.triangulation.ground_control import control_of
+    from daemon.postflight.triangulation.photograph_block import photograph_block_of
+    from daemon.postflight.triangulation.photograph_project import (
+        adjusted_rig,
+        photograph_cautions,
+        photograph_project,
+        photographs_section,
+    )
+    from daemon.postflight.triangulation.report import (
+        print_triangulation,
+        triangulation_of,
+        write_triangulation,
+    )
+    from daemon.postflight.triangulation.triangulation import TriangulationError
+    from processing.bundle.adjust import adjust
+    from processing.bundle.initial_values import completed
+    from processing.bundle.network import NetworkError
+    from processing.bundle.rank_diagnosis import RankDefectError
+
+    begun = time.perf_counter()
+    with (
+        lock_for(folder, results),
+        Progress(console=Console(stderr=True), transient=True) as progress,
+    ):
+        task = progress.add_task("features", total=None)
+
+        def step(what: str, done: int, total: int) -> None:
+            progress.update(task, description=what, completed=done, total=total)
+
+        found = photograph_block_of(folder, crs=crs, progress=step)
+        control = control_of(found, points, measured)
+        project = photograph_project(
+            found, control, position_sigma_m=position_sigma_m, reject_beyond=reject_beyond
+        )
+
+        def show(what: str, number: int, squares: float) -> None:
+            progress.update(task, description=f"{what} {number}: {squares:.6g}", total=None)
+
+        try:
+            result = adjust(completed(project.network), project.settings, progress=show)
+        except (NetworkError, RankDefectError) as error:
+            raise TriangulationError(f"{folder.path}: {error}") from error
+        report = report_of(
+            result,
+            project.checks,
+            name=project.name,
+            seconds=time.perf_counter() - begun,
+            peak_mib=_peak_mib(),
+        )
+        report["triangulation"] = triangulation_of(found.block, found.tied, project, result)
+        section = photographs_section(found, control, result)
+        report["photographs"] = section
+        report["cautions"] += photograph_cautions(section)
+        write_triangulation(results, found.block, project, result, report)
+        content = rig_toml(
+            adjusted_rig(found.block.rig, result),
+            remark="Adjusted interior orientation of photographs.",
+            names_schema=False,
+        )
+        create_file(results / "adjusted-rig.toml", [content], mode=0o644)
+    incomplete = bool(section["left_out"] or result.problems)
+    if as_json:
+        typer.echo(json.dumps(report | {"folder": str(results)}))
+    else:
+        console = Console()
+        print_report(console, report | {"rejected": [], "left_out": [], "control": {"count": 0}})
+        print_triangulation(console, report["triangulation"])
+        console.print(
+            f"{section['oriented']} photographs oriented, {len(section['left_out'])} not; "
+            f"f {section['f_px']:.1f} +- {section['f_sigma_px']:.1f} px (EXIF "
+            f"{section['f_exif_px']:.1f}); positions of EXIF differ by "
+            f"{', '.join(f'{v:.1f}' for v in section['position_rms_m'])} m RMS",
+            highlight=False,
+            soft_wrap=True,
+        )
+        console.print(f"Results: {results}, report {results / 'report.html'}", soft_wrap=True)
+    if incomplete:
+        raise typer.Exit(ExitStatus.PROBLEM)

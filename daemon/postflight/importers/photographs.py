@@ -1,0 +1,292 @@
+"""A folder of photographs of one camera becomes a mission folder that `syntopic triangulate` takes.
+
+Files are copied as they are. The interior orientation is provisional: focal length of EXIF, no
+distortion, principal point in the middle. Positions are the camera's, without standard deviation.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from daemon.mission.canonical_json import sha256_hex
+from daemon.mission.exposure import Exposure, FrameRecord, exposure_bytes
+from daemon.mission.layout import Mission, exposure_name
+from daemon.mission.store import durable
+from daemon.postflight.calibration.rig_writer import rig_toml
+from daemon.postflight.importers import exif_tags
+from daemon.postflight.importers.exif_tags import ImageTags, TagsError, read_tags
+from daemon.postflight.importers.rededge import ImagesError
+from processing.rig import Cone, Lens, Rig, Sensor, load_rig
+
+CONE: Final = "C"
+"""Name of the only cone and sensor."""
+RIG_NAME: Final = "photographs"
+SUFFIXES: Final = (".jpg", ".jpeg", ".tif", ".tiff")
+POSITIONS_MIN: Final = 3
+_NOMINAL_PITCH_MM: Final = 1e-3
+_FILES_MAX: Final = 100_000
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """One file: camera, size, provisional focal length in pixels, place or None."""
+
+    path: Path
+    camera: str
+    serial: str
+    width_px: int
+    height_px: int
+    focal_px: float
+    focal_source: str
+    pitch_mm: float
+    f_number: float
+    taken: str
+    exposure_time_us: float | None
+    position: tuple[float, float, float] | None
+
+
+@dataclass(frozen=True)
+class ImportedPhotographs:
+    """The written mission; `notes` state what is provisional or missing."""
+
+    mission: Mission
+    photographs: tuple[Photograph, ...]
+    notes: tuple[str, ...]
+
+
+def import_photographs(
+    folder: Path,
+    out: Path,
+    *,
+    focal_mm: float | None = None,
+    pixel_um: float | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> ImportedPhotographs:
+    """Write the mission folder `out` from the photographs of a folder, in the order of their names.
+
+    Args:
+        folder: with JPEG or TIFF files; other files are not looked at.
+        out: it must be new.
+        focal_mm: focal length in place of EXIF; together with `pixel_um`.
+        pixel_um: pixel pitch of the files.
+        progress: gets files done and in all.
+
+    Raises:
+        ImagesError: no usable photographs, several cameras, or fewer than three positions.
+        OSError: the disk refused.
+    """
+    if out.exists():
+        raise ImagesError([f"{out}: is there already; give the path of a new mission folder"])
+    photographs = read_photographs(folder, focal_mm=focal_mm, pixel_um=pixel_um)
+    rig = rig_of(photographs[0])
+    content = rig_toml(
+        rig,
+        remark="Photographs of one camera. The interior orientation is provisional: "
+        f"{photographs[0].focal_source}.",
+        names_schema=False,
+    )
+    with durable.new_files(out, last="rig.toml") as part:
+        for name in ("L0", "L2"):
+            durable.make_directories(part / name)
+        durable.create_file(part / "rig.toml", [content], mode=0o644)
+        written = load_rig(part / "rig.toml")
+        for number, one in enumerate(photographs, start=1):
+            _write_exposure(part, number, one, written, sha256_hex(content))
+            if progress is not None:
+                progress(number, len(photographs))
+    return ImportedPhotographs(Mission.open(out), tuple(photographs), _notes(photographs))
+
+
+def read_photographs(
+    folder: Path, *, focal_mm: float | None = None, pixel_um: float | None = None
+) -> list[Photograph]:
+    """The photographs of a folder, all of one camera.
+
+    Raises:
+        ImagesError: every reason why they make no block.
+    """
+    if (focal_mm is None) != (pixel_um is None):
+        raise ImagesError(["--focal-mm and --pixel-um go together; give both or neither"])
+    if not folder.is_dir():
+        raise ImagesError([f"{folder}: no such folder; give the one with the photographs"])
+    paths = sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES)
+    if len(paths) < 2 or len(paths) > _FILES_MAX:
+        raise ImagesError([f"{folder}: holds {len(paths)} JPEG or TIFF files; a block takes two"])
+    given = None if focal_mm is None or pixel_um is None else (focal_mm, pixel_um)
+    problems: list[str] = []
+    found: list[Photograph] = []
+    for path in paths:
+        try:
+            found.append(_photograph(path, read_tags(path), given))
+        except TagsError as error:
+            problems.append(str(error))
+    problems += _of_several_cameras(found)
+    placed = sum(one.position is not None for one in found)
+    if not problems and placed < POSITIONS_MIN:
+        problems.append(
+            f"{folder}: {placed} of {len(found)} photographs have a position in EXIF (GPSLatitude, "
+            f"GPSLongitude, GPSAltitude); {POSITIONS_MIN} are needed to place a block"
+        )
+    if problems:
+        raise ImagesError(problems)
+    return found
+
+
+def is_photographs(mission: Mission) -> bool:
+    """Whether a mission was made of photographs: its only frames are JPEG or TIFF as they came."""
+    try:
+        rig = load_rig(mission.rig_path)
+    except (OSError, ValueError):
+        return False
+    return rig.name == RIG_NAME and [cone.name for cone in rig.cones] == [CONE]
+
+
+def _photograph(path: Path, tags: ImageTags, given: tuple[float, float] | None) -> Photograph:
+    focal = exif_tags.focal_length_px_of(tags)
+    pitch = exif_tags.pitch_mm_of(tags)
+    length = tags.number(exif_tags.FOCAL_LENGTH)
+    if given is not None:
+        focal = (given[0] * 1e3 / given[1], f"--focal-mm {given[0]:g} --pixel-um {given[1]:g}")
+        pitch = given[1] * 1e-3
+    elif focal is not None and (pitch is None or "35mm" in focal[1]):
+        pitch = length / focal[0] if length else None
+    if focal is None or not 0.2 < focal[0] / max(tags.width_px, tags.height_px) < 50.0:
+        raise TagsError(
+            f"{path.name}: no focal length that can be used (FocalLength with "
+            "FocalPlaneXResolution, or FocalLengthIn35mmFilm); give --focal-mm and --pixel-um"
+        )
+    camera = f"{tags.text(exif_tags.MAKE)} {tags.text(exif_tags.MODEL)}".strip() or "unknown camera"
+    seconds = tags.number(exif_tags.EXPOSURE_TIME)
+    return Photograph(
+        path=path,
+        camera=camera[:80],
+        serial=tags.text(exif_tags.BODY_SERIAL)[:40],
+        width_px=tags.width_px,
+        height_px=tags.height_px,
+        focal_px=focal[0],
+        focal_source=focal[1],
+        pitch_mm=pitch or _NOMINAL_PITCH_MM,
+        f_number=tags.number(exif_tags.F_NUMBER) or 5.6,
+        taken=tags.text(exif_tags.DATE_TIME_ORIGINAL)[:40],
+        exposure_time_us=None if seconds is None or seconds <= 0.0 else seconds * 1e6,
+        position=exif_tags.position_of(tags),
+    )
+
+
+def _of_several_cameras(photographs: Sequence[Photograph]) -> list[str]:
+    """One sentence where sizes, cameras, serial numbers or focal lengths differ."""
+    kinds = Counter(
+        f"{one.camera}{f' {one.serial}' if one.serial else ''}, {one.width_px} x {one.height_px} "
+        f"px, f {one.focal_px:.0f} px"
+        for one in photographs
+    )
+    if len(kinds) < 2:
+        return []
+    counted = "; ".join(f"{count} of {kind}" for kind, count in kinds.most_common(6))
+    return [
+        f"the folder holds photographs of {len(kinds)} cameras or settings ({counted}); put those "
+        "of one camera, size and focal length into a folder of their own"
+    ]
+
+
+def rig_of(photograph: Photograph) -> Rig:
+    """A rig of one head with a provisional interior orientation."""
+    sensor = Sensor(
+        name=CONE,
+        serial=photograph.serial,
+        width_px=photograph.width_px,
+        height_px=photograph.height_px,
+        pitch_um=round(photograph.pitch_mm * 1e3, 6),
+        x_mm=0.0,
+        y_mm=0.0,
+        calibration_c=20.0,
+        probe="",
+        bits=8,
+    )
+    cone = Cone(
+        name=CONE,
+        role="colour",
+        bands=("red", "green", "blue"),
+        position_mm=(0.0, 0.0, 0.0),
+        rotation_rad=(0.0, 0.0, 0.0),
+        probe="",
+        calibration_c=20.0,
+        lens=Lens(
+            f_mm=round(photograph.focal_px * photograph.pitch_mm, 6),
+            f_number=photograph.f_number,
+            f_sigma_ppm=20_000.0,
+        ),
+        sensors=(sensor,),
+    )
+    return Rig(
+        name=RIG_NAME,
+        title=photograph.camera,
+        timing="synchronous",
+        frame_interval_s=1.0,
+        master_cone=CONE,
+        colour_master_cone=CONE,
+        reference_cone=CONE,
+        calibration_id="uncalibrated",
+        calibration_date="",
+        virtual_image=None,
+        cones=(cone,),
+    )
+
+
+def _write_exposure(mission: Path, number: int, one: Photograph, rig: Rig, rig_sha256: str) -> None:
+    folder = mission / "L0" / exposure_name(number)
+    folder.mkdir()
+    name = f"{CONE}{one.path.suffix.lower()}"
+    data = one.path.read_bytes()
+    durable.create_file(folder / name, [data])
+    settings: dict[str, float | int | str] = {"Source": one.path.name}
+    if one.taken:
+        settings["DateTimeOriginal"] = one.taken
+    if one.position is not None:
+        place = ("GpsLatitudeDeg", "GpsLongitudeDeg", "GpsAltitudeM")
+        settings |= dict(zip(place, one.position, strict=True))
+    frame = FrameRecord(
+        sensor=CONE,
+        head_serial=one.serial,
+        file=name,
+        sha256=sha256_hex(data),
+        width_px=one.width_px,
+        height_px=one.height_px,
+        pixel_format="JPEG" if name.endswith(("jpg", "jpeg")) else "TIFF",
+        exposure_time_us=one.exposure_time_us,
+        settings=settings,
+    )
+    exposure = Exposure(
+        number=number,
+        frames=(frame,),
+        missing=(),
+        state="complete",
+        calibration_id=rig.calibration_id,
+        calibration_sha256=rig_sha256,
+        mark_gps_ns=None,
+        mark_source="none",
+        software="syntopic import photographs",
+    )
+    durable.create_file(folder / "exposure.json", [exposure_bytes(exposure)])
+    durable.sync_directory(folder)
+
+
+def _notes(photographs: Sequence[Photograph]) -> tuple[str, ...]:
+    notes = [
+        f"The interior orientation is provisional: f {photographs[0].focal_px:.1f} px from "
+        f"{photographs[0].focal_source}, no distortion."
+    ]
+    without = [one.path.name for one in photographs if one.position is None]
+    if without:
+        notes.append(
+            f"{len(without)} photographs have no position: {', '.join(without[:5])}"
+            f"{', ...' if len(without) > 5 else ''}."
+        )
+    notes.append(
+        "EXIF does not state which heights GPSAltitude has; they are taken as ellipsoidal."
+    )
+    return tuple(notes)

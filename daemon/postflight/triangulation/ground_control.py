@@ -1,0 +1,222 @@
+"""Control points of photographs: ODM's `gcp_list.txt`, or the two tables of `syntopic triangulate`.
+
+Images are named by their files. Pixels are zero in the middle of the upper left pixel.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon.mission.foreign_files import ForeignFileError, read_regular_file
+from daemon.orientation.local_frame import LocalFrame
+from daemon.postflight.adjustment.csv_tables import read_table
+from daemon.postflight.triangulation.photograph_block import PhotographBlock
+from daemon.postflight.triangulation.triangulation import TriangulationError
+
+Array = NDArray[np.float64]
+
+MEASURED_SIGMA_PX: Final = 0.5
+SURVEYED_SIGMA_M: Final = (0.02, 0.02, 0.03)
+_FILE_MAX_BYTES: Final = 20_000_000
+
+
+@dataclass(frozen=True)
+class GroundControl:
+    """Points with role, place (n, 3) m in the local frame, sigma; and where images show them.
+
+    `image` and `point` are indices (m,), `px` (m, 2). `unused` names measurements in images that
+    are not in the block.
+    """
+
+    names: tuple[str, ...]
+    roles: tuple[str, ...]
+    xyz_m: Array
+    sigma_m: Array
+    image: NDArray[np.int64]
+    point: NDArray[np.int64]
+    px: Array
+    sigma_px: Array
+    unused: tuple[str, ...] = ()
+
+
+def no_control() -> GroundControl:
+    """No points."""
+    none, empty = np.zeros(0, np.int64), np.zeros((0, 3))
+    return GroundControl((), (), empty, empty, none, none, np.zeros((0, 2)), np.zeros(0))
+
+
+def read_gcp_list(path: Path, images: Mapping[str, int], frame: LocalFrame) -> GroundControl:
+    """Control points of OpenDroneMap's file.
+
+    First line: coordinate system (EPSG code, PROJ text, or "WGS84 UTM 16N"). Then a measurement a
+    line: east north height column row image [name]. Points without a name are joined by their
+    coordinates. Heights are those of the coordinate system; without one, ellipsoidal.
+
+    Args:
+        path: the file.
+        images: index of an image by the name of its file.
+        frame: of the block.
+
+    Raises:
+        TriangulationError: with every line that cannot be read.
+
+    Source: OpenDroneMap, "Ground Control Points", format of gcp_list.txt.
+    """
+    try:
+        lines = read_regular_file(path, _FILE_MAX_BYTES).decode("utf-8-sig").splitlines()
+    except (ForeignFileError, OSError, UnicodeDecodeError) as error:
+        raise TriangulationError(f"{path}: {error}") from error
+    numbered = [(n, line.strip()) for n, line in enumerate(lines, start=1)]
+    numbered = [(n, line) for n, line in numbered if line and not line.startswith("#")]
+    if len(numbered) < 2:
+        raise TriangulationError(f"{path.name}: a line with the coordinate system, then points")
+    problems: list[str] = []
+    rows: list[tuple[str, tuple[float, float, float], int, tuple[float, float]]] = []
+    unused: list[str] = []
+    for n, line in numbered[1:]:
+        parts = line.split()
+        try:
+            numbers = [float(part) for part in parts[:5]]
+            image = parts[5]
+            if len(numbers) < 5 or not all(map(math.isfinite, numbers)):
+                raise ValueError
+        except (ValueError, IndexError):
+            problems.append(f"{path.name} line {n}: east north height column row image [name]")
+            continue
+        at = images.get(image.lower())
+        name = parts[6] if len(parts) > 6 else f"{parts[0]}_{parts[1]}_{parts[2]}"
+        if at is None:
+            unused.append(f"{image}: {name}")
+            continue
+        east, north, height, column, row = numbers
+        rows.append((name, (east, north, height), at, (column, row)))
+    places: dict[str, tuple[float, float, float]] = {}
+    for name, place, _, _ in rows:
+        if places.setdefault(name, place) != place:
+            problems.append(f"{path.name}: point {name} has two different places")
+    if problems:
+        raise TriangulationError("; ".join(problems[:20]))
+    names = tuple(places)
+    number = {name: k for k, name in enumerate(names)}
+    geodetic = _geodetic(path, numbered[0][1], np.array([places[n] for n in names]).reshape(-1, 3))
+    return GroundControl(
+        names,
+        ("control",) * len(names),
+        frame.from_geodetic(*geodetic.T) if len(names) else np.zeros((0, 3)),
+        np.tile(SURVEYED_SIGMA_M, (len(names), 1)),
+        np.array([at for _, _, at, _ in rows], np.int64),
+        np.array([number[name] for name, *_ in rows], np.int64),
+        np.array([px for *_, px in rows]).reshape(-1, 2),
+        np.full(len(rows), MEASURED_SIGMA_PX),
+        tuple(unused),
+    )
+
+
+def read_control_tables(
+    points_file: Path, measured_file: Path, images: Mapping[str, int], frame: LocalFrame
+) -> GroundControl:
+    """The tables of `syntopic triangulate --points --measured`; images by file or image name.
+
+    Raises:
+        TriangulationError: with every mistake.
+    """
+    table = read_table(
+        points_file, ("point", "role", "latitude_deg", "longitude_deg", "height_m"),
+        ("sx_m", "sy_m", "sz_m"),
+    )  # fmt: skip
+    names, roles = table.names("point"), table.text("role")
+    for role, line in zip(roles, table.lines, strict=True):
+        if role not in ("control", "check"):
+            table.add_problem(line, f"role is {role!r}; control or check is right")
+    place = np.array([table.numbers(c) for c in ("latitude_deg", "longitude_deg", "height_m")])
+    sigma = [
+        table.numbers(c, s) for c, s in zip(("sx_m", "sy_m", "sz_m"), SURVEYED_SIGMA_M, strict=True)
+    ]
+    seen = read_table(measured_file, ("image", "point", "column_px", "row_px"), ("sigma_px",))
+    number = {name: k for k, name in enumerate(names)}
+    own = seen.text("image")
+    of = [images.get(name.lower()) for name in own]
+    for name, line in zip(seen.text("point"), seen.lines, strict=True):
+        if name not in number:
+            seen.add_problem(line, f"point {name!r} is not there")
+    px = np.array([seen.numbers("column_px"), seen.numbers("row_px")]).T.reshape(-1, 2)
+    problems = [*table.problems, *seen.problems]
+    if problems or not np.isfinite(place).all() or not np.isfinite(px).all():
+        raise TriangulationError("; ".join(problems) or "an empty cell where a number is needed")
+    keep = np.array([k is not None for k in of], bool)
+    points = np.array([number[name] for name in seen.text("point")], np.int64)
+    return GroundControl(
+        tuple(names),
+        tuple(roles),
+        frame.from_geodetic(*place),
+        np.array(sigma).T.reshape(-1, 3),
+        np.array([k for k in of if k is not None], np.int64),
+        points[keep],
+        px[keep],
+        np.array(seen.numbers("sigma_px", MEASURED_SIGMA_PX))[keep],
+        tuple(f"{n}: not in the block" for n, k in zip(own, of, strict=True) if k is None),
+    )
+
+
+def _geodetic(path: Path, system: str, xyz: Array) -> Array:
+    """Latitude, longitude, ellipsoidal height (n, 3) of coordinates in a system."""
+    from pyproj import CRS, Transformer
+    from pyproj.exceptions import CRSError, ProjError
+
+    try:
+        source = CRS.from_user_input(_named_utm(system) or system)
+        to = Transformer.from_crs(source.to_3d(), CRS.from_epsg(4979), always_xy=True)
+        if to.source_crs is None or source.is_geocentric:
+            raise TriangulationError(f"{path.name}: {system}: a projected or geographic system")
+        longitude, latitude, height = to.transform(xyz[:, 0], xyz[:, 1], xyz[:, 2], errcheck=True)
+    except (CRSError, ProjError) as error:
+        raise TriangulationError(
+            f"{path.name} line 1: {system[:80]!r} is no coordinate system; write EPSG:32616, a "
+            f"PROJ text or WGS84 UTM 16N"
+        ) from error
+    return np.stack([latitude, longitude, height], axis=-1)
+
+
+def _named_utm(system: str) -> str | None:
+    """EPSG code of "WGS84 UTM 16N"."""
+    parts = system.upper().split()
+    if len(parts) != 3 or parts[:2] != ["WGS84", "UTM"] or parts[2][-1:] not in ("N", "S"):
+        return None
+    zone = parts[2][:-1]
+    if not zone.isdigit() or not 1 <= int(zone) <= 60:
+        return None
+    return f"EPSG:{326 if parts[2][-1] == 'N' else 327}{int(zone):02d}"
+
+
+def image_index(names: Sequence[str], files: Mapping[str, str]) -> dict[str, int]:
+    """Index of every image by its name and by that of its file, in small letters."""
+    by_name = {name.lower(): k for k, name in enumerate(names)}
+    return by_name | {files[name].lower(): k for k, name in enumerate(names)}
+
+
+def control_of(
+    found: PhotographBlock, points_file: Path | None, measured_file: Path | None
+) -> GroundControl:
+    """Control of a block of photographs: a `gcp_list.txt` alone, or two tables.
+
+    Raises:
+        TriangulationError: files with mistakes, or one table without the other.
+    """
+    images = image_index(found.block.names, found.files)
+    frame = found.block.frame
+    if points_file is None and measured_file is None:
+        return no_control()
+    if points_file is not None and measured_file is not None:
+        return read_control_tables(points_file, measured_file, images, frame)
+    if points_file is None or points_file.suffix.lower() != ".txt":
+        raise TriangulationError(
+            "--points takes a gcp_list.txt alone, or a table together with --measured"
+        )
+    return read_gcp_list(points_file, images, frame)

@@ -1,0 +1,325 @@
+"""The block of a mission of photographs: tie points and orientations without any attitude known.
+
+Features, tracks and the incremental orientation give the start (`processing.bundle.
+incremental_orientation`), positions of EXIF its place, scale and attitude. What is not oriented is
+named with the reason.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon.mission.exposure import Exposure
+from daemon.mission.layout import Mission
+from daemon.mission.store.level0 import RasterError
+from daemon.orientation.exterior_orientation import ExteriorOrientation, sealed_exposures
+from daemon.orientation.geodesy import utm_of
+from daemon.orientation.georeference import Georeference
+from daemon.orientation.local_frame import LocalFrame
+from daemon.postflight.importers.photographs import CONE
+from daemon.postflight.triangulation.triangulation import ImageBlock, TriangulationError
+from processing.bundle.incremental_orientation import (
+    OrientedBlock,
+    PhotographTracks,
+    orient_photographs,
+)
+from processing.bundle.network import CameraModel
+from processing.geometry.orientation import grid_from_enu
+from processing.geometry.positions_fit import NotPlacedError, fit_positions
+from processing.matching.block_matching import BlockTiePoints, image_mm
+from processing.matching.photograph_tracks import (
+    MATCHES_MIN,
+    Features,
+    Tracks,
+    features_of,
+    join_tracks,
+    match_photographs,
+    spread_tracks,
+)
+from processing.pipelines.perspective import perspective_of
+from processing.rig import Rig, VirtualImage, load_rig
+
+Array = NDArray[np.float64]
+Progress = Callable[[str, int, int], None]
+
+FREE: Final = ("dx0", "dy0", "df", "k1", "k2", "k3", "p1", "p2")
+"""Estimated parameters of the interior orientation."""
+NEIGHBOURS: Final = 10
+"""Images whose positions are nearest are compared; without positions all are."""
+_ORIENTED_MIN: Final = 3
+_MAX_PIXELS: Final = 500_000_000
+_FOCAL_SIGMA: Final = 0.02
+_POINT_SIGMA: Final = 0.02
+_CORNER_SIGMA: Final = 0.05
+_DECENTRING_SIGMA: Final = 0.005
+
+
+@dataclass(frozen=True)
+class PhotographBlock:
+    """Oriented photographs with tie points.
+
+    `block`, `tied`: as of any mission, of the oriented images alone. `files` by image name;
+    `start` in the local frame, its image points those of `tied`. `left_out` has a sentence for
+    each photograph without orientation. `position_m` (n, 3) is NaN where EXIF has none.
+    """
+
+    block: ImageBlock
+    tied: BlockTiePoints
+    files: Mapping[str, str]
+    camera: CameraModel
+    xyz_m: Array
+    position_m: Array
+    left_out: tuple[str, ...]
+
+
+def photograph_block_of(
+    mission: Mission, *, crs: str | None = None, progress: Progress = lambda _w, _d, _n: None
+) -> PhotographBlock:
+    """Match and orient the photographs of a mission.
+
+    Raises:
+        TriangulationError: fewer than three photographs that hang together, or positions that do
+            not place them.
+    """
+    rig = load_rig(mission.rig_path)
+    image = perspective_of(rig.cone(CONE))
+    read = sealed_exposures(mission)
+    exposures = list(read.results.values())
+    if len(exposures) < _ORIENTED_MIN:
+        raise TriangulationError(
+            f"{mission.path}: {len(exposures)} photographs can be read; a block takes three"
+        )
+    geodetic = np.array([_position(exposure) for exposure in exposures])
+    known = np.isfinite(geodetic[:, 0])
+    if known.sum() < _ORIENTED_MIN:
+        raise TriangulationError(f"{mission.path}: {known.sum()} photographs have a position")
+    frame = LocalFrame(*(float(v) for v in geodetic[known, :2].mean(axis=0)))
+    position = np.full((len(exposures), 3), np.nan)
+    position[known] = frame.from_geodetic(*geodetic[known].T)
+    features = _features(mission, exposures, image, progress)
+    candidates = candidate_pairs(position)
+    pairs = match_photographs(
+        features, candidates, progress=lambda done: progress("matching", done, len(candidates))
+    )
+    tracks = join_tracks(features, pairs)
+    camera = provisional_camera(rig)
+    measured = PhotographTracks(
+        tracks.image, tracks.point, image_mm(image, tracks.px), len(exposures), tracks.points
+    )
+    found = orient_photographs(
+        camera, measured, progress=lambda done: progress("orienting", done, len(exposures))
+    )
+    names = [_source(exposure) for exposure in exposures]
+    if found is None or found.oriented.sum() < _ORIENTED_MIN:
+        raise TriangulationError(_unconnected(mission, names, features, len(pairs)))
+    placed = _placed(found, position)
+    return _assembled(
+        mission, rig, exposures, frame, position, tracks, features, placed, crs, camera
+    )
+
+
+def provisional_camera(rig: Rig) -> CameraModel:
+    """The head's camera model with the parameters that are estimated, and how well they are known.
+
+    EXIF gives f to 2 %; distortion is within 5 % at the corner.
+    """
+    cone = rig.cone(CONE)
+    image = perspective_of(cone)
+    corner = 0.5 * float(np.hypot(image.width_px, image.height_px)) * image.pitch_mm
+    sigma = {
+        "df": _FOCAL_SIGMA * image.f_mm,
+        "dx0": _POINT_SIGMA * corner,
+        "dy0": _POINT_SIGMA * corner,
+        **{f"k{n}": _CORNER_SIGMA / corner ** (2 * n) for n in (1, 2, 3)},
+        "p1": _DECENTRING_SIGMA / corner,
+        "p2": _DECENTRING_SIGMA / corner,
+    }
+    return CameraModel(CONE, image.f_mm, free=frozenset(FREE), sigma=sigma, pixel_mm=image.pitch_mm)
+
+
+def candidate_pairs(position_m: Array) -> list[tuple[int, int]]:
+    """Pairs (a, b), a < b, of images near each other; one without a position goes with all."""
+    n = len(position_m)
+    distance = np.linalg.norm(position_m[:, None] - position_m[None], axis=2)
+    near = np.argsort(np.where(np.isfinite(distance), distance, np.inf), axis=1)
+    found = set()
+    for a in range(n):
+        everyone = not np.isfinite(position_m[a, 0]) or n <= NEIGHBOURS + 1
+        others = range(n) if everyone else near[a, : NEIGHBOURS + 1].tolist()
+        found |= {(min(a, b), max(a, b)) for b in others if b != a}
+    return sorted(found)
+
+
+def original_pixels(
+    mission: Mission, exposure: Exposure, image: VirtualImage, *, grey: bool
+) -> NDArray[np.uint8]:
+    """Pixels of a photograph as its sensor wrote them, (h, w) grey or (h, w, 3) red, green, blue.
+
+    Raises:
+        RasterError: no image, damaged, or of another size.
+    """
+    path = mission.level0(exposure.number) / exposure.frames[0].file
+    how = cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_COLOR_RGB
+    pixels = cv2.imread(str(path), how | cv2.IMREAD_IGNORE_ORIENTATION)
+    if pixels is None:
+        raise RasterError(f"{path}: no image that can be decoded; copy the original again")
+    if pixels.shape[:2] != (image.height_px, image.width_px):
+        raise RasterError(
+            f"{path}: {pixels.shape[1]} x {pixels.shape[0]} px; the camera has {image.width_px} x "
+            f"{image.height_px} px"
+        )
+    return np.ascontiguousarray(pixels, np.uint8)
+
+
+def _features(
+    mission: Mission, exposures: list[Exposure], image: VirtualImage, progress: Progress
+) -> list[Features]:
+    found = []
+    for done, exposure in enumerate(exposures, start=1):
+        try:
+            found.append(features_of(original_pixels(mission, exposure, image, grey=True)))
+        except RasterError as error:
+            raise TriangulationError(str(error)) from error
+        progress("features", done, len(exposures))
+    return found
+
+
+def _position(exposure: Exposure) -> tuple[float, float, float]:
+    settings = exposure.frames[0].settings if exposure.frames else {}
+    keys = ("GpsLatitudeDeg", "GpsLongitudeDeg", "GpsAltitudeM")
+    values = [settings.get(key) for key in keys]
+    if not all(isinstance(value, int | float) for value in values):
+        return (np.nan, np.nan, np.nan)
+    a, b, c = (float(value) for value in values if isinstance(value, int | float))
+    return (a, b, c)
+
+
+def _source(exposure: Exposure) -> str:
+    return str(exposure.frames[0].settings.get("Source", exposure.frames[0].file))
+
+
+def _unconnected(mission: Mission, names: list[str], features: list[Features], pairs: int) -> str:
+    counts = [len(one.px) for one in features]
+    weak = [f"{n} {c}" for n, c in zip(names, counts, strict=True) if c < 10 * MATCHES_MIN]
+    texture = f"; little texture (features): {', '.join(weak[:5])}" if weak else ""
+    return (
+        f"{mission.path}: no three photographs hang together. {pairs} pairs of images share "
+        f"{MATCHES_MIN} or more consistent features of {int(np.median(counts))} in an image "
+        f"(median){texture}. Photographs of a block overlap by 60 % and more, show one place, and "
+        "are sharp"
+    )
+
+
+def _placed(found: OrientedBlock, position: Array) -> OrientedBlock:
+    """The block brought to the known positions by a similarity."""
+    own = found.oriented & np.isfinite(position[:, 0])
+    try:
+        fit = fit_positions(found.station[own], position[own])
+    except NotPlacedError as error:
+        raise TriangulationError(
+            f"the positions of EXIF do not place the block: {error}"
+        ) from error
+    return replace(
+        found,
+        station=fit.applied(found.station),
+        rotation=fit.rotation @ found.rotation,
+        xyz=fit.applied(found.xyz),
+    )
+
+
+def _assembled(
+    mission: Mission,
+    rig: Rig,
+    exposures: list[Exposure],
+    frame: LocalFrame,
+    position: Array,
+    tracks: Tracks,
+    features: list[Features],
+    placed: OrientedBlock,
+    crs: str | None,
+    camera: CameraModel,
+) -> PhotographBlock:
+    names = [_source(exposure) for exposure in exposures]
+    kept = np.flatnonzero(placed.oriented)
+    number = np.full(len(exposures), -1)
+    number[kept] = np.arange(len(kept))
+    rows = np.flatnonzero(placed.used)
+    size = (rig.cone(CONE).sensors[0].width_px, rig.cone(CONE).sensors[0].height_px)
+    rows = rows[spread_tracks(tracks.image[rows], tracks.point[rows], tracks.px[rows], size)]
+    points, point = np.unique(tracks.point[rows], return_inverse=True)
+    image = number[tracks.image[rows]]
+    crs = crs or utm_of(frame.latitude_deg, frame.longitude_deg) or "EPSG:4978"
+    oriented = _exteriors(exposures, kept, placed, frame, crs)
+    ground = float(np.median(placed.xyz[points, 2]))
+    block = ImageBlock(
+        mission, rig, perspective_of(rig.cone(CONE)), oriented, crs, frame,
+        placed.station[kept], placed.rotation[kept], ground,
+    )  # fmt: skip
+    matched = _matched(image, point)
+    tied = BlockTiePoints(image, point, tracks.px[rows], len(points), matched, matched)
+    left_out = [
+        f"{names[k]} has no orientation: it shares {placed.seen[k]} object points with the block "
+        f"({len(features[k].px)} features)"
+        for k in np.flatnonzero(~placed.oriented)
+    ]
+    interior = replace(camera, interior=placed.interior)
+    return PhotographBlock(
+        block, tied, {eo.name: names[k] for eo, k in zip(oriented, kept, strict=True)},
+        interior, placed.xyz[points], position[kept], tuple(left_out),
+    )  # fmt: skip
+
+
+def _exteriors(
+    exposures: list[Exposure],
+    kept: NDArray[np.int64],
+    placed: OrientedBlock,
+    frame: LocalFrame,
+    crs: str,
+) -> tuple[ExteriorOrientation, ...]:
+    georeference = Georeference(crs)
+    found = []
+    for k, place in zip(kept, frame.to_geodetic(placed.station[kept]), strict=True):
+        latitude, longitude, height = (float(v) for v in place)
+        at = georeference.place(latitude, longitude, height)
+        enu = frame.local_from_enu(latitude, longitude).T @ placed.rotation[k]
+        found.append(
+            ExteriorOrientation(
+                exposure=exposures[k].number,
+                cone=CONE,
+                is_virtual=False,
+                gps_ns=0,
+                line_id=exposures[k].line_id,
+                strip_id=exposures[k].strip_id,
+                latitude_deg=latitude,
+                longitude_deg=longitude,
+                height_m=height,
+                centre_m=np.array([at.east_m, at.north_m, at.height_m]),
+                rotation=grid_from_enu(at.azimuth_of_north_rad) @ enu,
+                azimuth_of_north_rad=at.azimuth_of_north_rad,
+                scale=at.scale,
+                method="photographs",
+                horizontal_sigma_m=None,
+                vertical_sigma_m=None,
+            )
+        )
+    return tuple(found)
+
+
+def _matched(image: NDArray[np.int64], point: NDArray[np.int64]) -> dict[tuple[int, int], int]:
+    """Common object points by pair of images."""
+    found: dict[tuple[int, int], int] = {}
+    order = np.lexsort((image, point))
+    bounds = np.flatnonzero(np.diff(point[order], prepend=-1, append=-2))
+    for start, end in pairwise(bounds):
+        own = image[order[start:end]].tolist()
+        for i, a in enumerate(own):
+            for b in own[i + 1 :]:
+                found[a, b] = found.get((a, b), 0) + 1
+    return found

@@ -1,0 +1,351 @@
+"""Orientation of images of which nothing is known, one after the other, from a first pair.
+
+Relative orientation of a pair, intersection of its points, resection of the next image, adjustment
+with self-calibration, until no image is left that sees enough points. The frame is that of the
+first image and has no scale; a similarity brings it to known positions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.bundle.camera_model import ideal_mm
+from processing.bundle.damped_adjustment import FreeBlock, damped_adjustment
+from processing.bundle.initial_values import intersect
+from processing.bundle.network import CameraModel
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+Flags = NDArray[np.bool_]
+
+POINTS_MIN: Final = 20
+"""Object points that an image must see to be oriented."""
+_VISION = np.diag([1.0, -1.0, -1.0])
+_PARALLAX_MIN_RAD: Final = np.radians(2.0)
+_PAIRS_TRIED: Final = 6
+_TRIAL_IMAGES: Final = 5
+"""Images that each relative orientation of a first pair is tried with."""
+_ADJUSTED_EACH: Final = 6
+_SHIFT_MIN: Final = 0.05
+"""Shortest base of a first pair over the distance of its plane."""
+_RESIDUAL_MAX_PX: Final = 4.0
+_FIRST_RESIDUAL_MAX_PX: Final = 12.0
+_INTERIOR_FROM: Final = 4
+"""Images from which on the interior orientation is estimated."""
+_GROWTH: Final = 1.25
+"""The block is adjusted again when it has grown by this factor."""
+
+
+@dataclass(frozen=True)
+class PhotographTracks:
+    """Image points of tracks: image (n,), point (n,), measured xy (n, 2) mm, y up; counts."""
+
+    image: Indices
+    point: Indices
+    xy_mm: Array
+    images: int
+    points: int
+
+
+@dataclass(frozen=True)
+class OrientedBlock:
+    """Images in a frame without scale.
+
+    `station` (images, 3), `rotation` (images, 3, 3) object from camera, `xyz` (points, 3): NaN
+    where not known. `interior` (10,). `used` (n,) marks the image points that fit. `seen` (images,)
+    counts object points that an image without orientation sees.
+    """
+
+    station: Array
+    rotation: Array
+    xyz: Array
+    interior: Array
+    used: Flags
+    seen: Indices
+
+    @property
+    def oriented(self) -> Flags:
+        """Images with an orientation, (images,)."""
+        return np.asarray(np.isfinite(self.station[:, 0]))
+
+
+def orient_photographs(
+    camera: CameraModel,
+    tracks: PhotographTracks,
+    *,
+    progress: Callable[[int], None] = lambda _done: None,
+) -> OrientedBlock | None:
+    """Orient as many images of one camera as hang together.
+
+    Args:
+        camera: provisional interior orientation with pixel size; `free` names what is estimated
+            on the way, `sigma` how well it is known.
+        tracks: image points of all images.
+        progress: called with the number of oriented images.
+
+    Returns:
+        Orientations; None where no pair of images can be oriented.
+
+    Source: docs/explanation/mathematics/bundle.md#orientation-without-attitudes.
+    """
+    cv2.setRNGSeed(1)
+    block = _best_start(camera, tracks)
+    if block is None:
+        return None
+    block.grow(tracks.images, progress)
+    seen = np.array([len(block.known_rows(k)) for k in range(tracks.images)], np.int64)
+    return OrientedBlock(
+        block.station, block.rotation, block.xyz, block.interior, block.used(), seen
+    )
+
+
+def _best_start(camera: CameraModel, tracks: PhotographTracks) -> _Growing | None:
+    """The few images of the first pair that grows, with the relative orientation that fits most."""
+    best, most = None, 0
+    for starts in _starts(_Growing(camera, tracks)):
+        for start in starts:
+            trial = _Growing(camera, tracks)
+            if not trial.begin(start):
+                continue
+            trial.grow(_TRIAL_IMAGES, lambda _done: None)
+            fitting = int(trial.used().sum())
+            if fitting > most:
+                best, most = trial, fitting
+        if best is not None and best.oriented.sum() >= _TRIAL_IMAGES:
+            break
+    return best
+
+
+class _Growing:
+    """A block while images are added to it. Rotations are object from our camera axes."""
+
+    def __init__(self, camera: CameraModel, tracks: PhotographTracks) -> None:
+        self.camera, self.tracks = camera, tracks
+        self.interior = camera.interior.copy()
+        self.station = np.full((tracks.images, 3), np.nan)
+        self.rotation = np.full((tracks.images, 3, 3), np.nan)
+        self.xyz = np.full((tracks.points, 3), np.nan)
+        self.limit_px = _FIRST_RESIDUAL_MAX_PX
+        self.refused: dict[int, int] = {}
+        order = np.argsort(tracks.image, kind="stable")
+        bounds = np.searchsorted(tracks.image[order], np.arange(tracks.images + 1))
+        self._rows = [order[a:b] for a, b in pairwise(bounds)]
+        self._place()
+
+    @property
+    def oriented(self) -> Flags:
+        return np.asarray(np.isfinite(self.station[:, 0]))
+
+    def _place(self) -> None:
+        """Ideal directions (n, 2) in vision axes, x / z and y / z, by the present interior."""
+        ideal = ideal_mm(
+            self.camera, self.interior, np.zeros(len(self.camera.terms)), self.tracks.xy_mm
+        )
+        self.ideal = ideal * np.array([1.0, -1.0]) / self.camera.f_mm
+
+    @property
+    def pixel(self) -> float:
+        """Size of a pixel in the plane at distance one."""
+        return (self.camera.pixel_mm or 1e-3) / self.camera.f_mm
+
+    def begin(self, start: _Start) -> bool:
+        """Orient a first pair; False where too few points intersect under a good angle."""
+        self.station[start.first], self.rotation[start.first] = 0.0, _VISION
+        self.station[start.second] = -start.rotation.T @ start.shift
+        self.rotation[start.second] = start.rotation.T @ _VISION
+        self._intersect()
+        return int(np.isfinite(self.xyz[:, 0]).sum()) >= POINTS_MIN
+
+    def grow(self, images: int, progress: Callable[[int], None]) -> None:
+        """Orient further images, adjusting as the block grows, up to so many."""
+        adjusted_at = 0
+        while True:
+            count = int(self.oriented.sum())
+            progress(count)
+            if count < _ADJUSTED_EACH or count >= _GROWTH * adjusted_at:
+                self.adjust()
+                adjusted_at = count
+            if count >= images:
+                return
+            if self.add_next():
+                continue
+            # With better values and points more images may fit.
+            self.adjust()
+            if not self.add_next():
+                return
+
+    def pairs(self) -> list[tuple[int, int, Indices, Indices]]:
+        """Pairs of images with the most common points, with their rows."""
+        points = [self.tracks.point[rows] for rows in self._rows]
+        found = []
+        for a in range(self.tracks.images):
+            for b in range(a + 1, self.tracks.images):
+                _, at, bt = np.intersect1d(
+                    points[a], points[b], assume_unique=True, return_indices=True
+                )
+                if len(at) >= 2 * POINTS_MIN:
+                    found.append((a, b, self._rows[a][at], self._rows[b][bt]))
+        found.sort(key=lambda one: -len(one[2]))
+        return found[:_PAIRS_TRIED]
+
+    def known_rows(self, image: int) -> Indices:
+        """Rows of an image whose object points are known."""
+        rows = self._rows[image]
+        return np.asarray(rows[np.isfinite(self.xyz[self.tracks.point[rows], 0])])
+
+    def add_next(self) -> bool:
+        """Orient the image that sees the most known points; False if none can be oriented."""
+        waiting = [(len(self.known_rows(k)), k) for k in np.flatnonzero(~self.oriented).tolist()]
+        for count, k in sorted(waiting, reverse=True):
+            if count < POINTS_MIN or self.refused.get(k, 0) >= count:
+                continue
+            if self._resect(k):
+                self._intersect()
+                return True
+            self.refused[k] = count
+        return False
+
+    def _resect(self, image: int) -> bool:
+        rows = self.known_rows(image)
+        known = self.xyz[self.tracks.point[rows]]
+        found, rotation, shift, inside = cv2.solvePnPRansac(
+            known, self.ideal[rows], np.eye(3), None, iterationsCount=2000, confidence=0.9999,
+            reprojectionError=self.limit_px * self.pixel, flags=cv2.SOLVEPNP_SQPNP,
+        )  # fmt: skip
+        if not found or inside is None or len(inside) < max(POINTS_MIN, 0.3 * len(rows)):
+            return False
+        own = inside.ravel()
+        rotation, shift = cv2.solvePnPRefineLM(
+            known[own], self.ideal[rows[own]], np.eye(3), None, rotation, shift
+        )
+        turn = cv2.Rodrigues(rotation)[0]
+        self.station[image] = (-turn.T @ shift).ravel()
+        self.rotation[image] = turn.T @ _VISION
+        return True
+
+    def _intersect(self) -> None:
+        """All points that two oriented images see under a good angle and with small residuals."""
+        tracks = self.tracks
+        rows = np.flatnonzero(self.oriented[tracks.image])
+        for _ in range(2):
+            image, point = tracks.image[rows], tracks.point[rows]
+            rays = self._rays(rows)
+            xyz, _ = intersect(tracks.points, point, self.station[image], rays)
+            residual = self._residual_px(xyz, rows)
+            rows = rows[residual < self.limit_px]
+        good = np.bincount(tracks.point[rows], minlength=tracks.points) >= 2
+        good &= self._parallax(rows) > _PARALLAX_MIN_RAD
+        xyz[~good] = np.nan
+        self.xyz = xyz
+
+    def _rays(self, rows: Indices) -> Array:
+        vision = np.column_stack([self.ideal[rows], np.ones(len(rows))])
+        rays = np.einsum("nij,nj->ni", self.rotation[self.tracks.image[rows]] @ _VISION, vision)
+        return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+
+    def _residual_px(self, xyz: Array, rows: Indices) -> Array:
+        image, point = self.tracks.image[rows], self.tracks.point[rows]
+        seen = np.einsum("nji,nj->ni", self.rotation[image], xyz[point] - self.station[image])
+        with np.errstate(all="ignore"):
+            place = seen[:, :2] * np.array([-1.0, 1.0]) / seen[:, 2:]
+        residual = np.linalg.norm(place - self.ideal[rows], axis=1) / self.pixel
+        return np.where((seen[:, 2] < 0.0) & np.isfinite(residual), residual, np.inf)
+
+    def _parallax(self, rows: Indices) -> Array:
+        """The largest angle of the rays of each point against their mean, doubled, rad."""
+        point, rays = self.tracks.point[rows], self._rays(rows)
+        mean = np.zeros((self.tracks.points, 3))
+        np.add.at(mean, point, rays)
+        mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
+        angle = np.arccos(np.clip(np.einsum("ni,ni->n", rays, mean[point]), -1.0, 1.0))
+        largest = np.zeros(self.tracks.points)
+        np.maximum.at(largest, point, angle)
+        return 2.0 * largest
+
+    def used(self) -> Flags:
+        """Image points of oriented images that fit."""
+        own = self.oriented[self.tracks.image] & np.isfinite(self.xyz[self.tracks.point, 0])
+        rows = np.flatnonzero(own)
+        own[rows] = self._residual_px(self.xyz, rows) < self.limit_px
+        count = np.bincount(self.tracks.point[own], minlength=self.tracks.points)
+        return np.asarray(own & (count[self.tracks.point] >= 2))
+
+    def adjust(self) -> None:
+        """Adjust what there is as a free network, with the interior orientation as an unknown."""
+        for _ in range(2):
+            rows = np.flatnonzero(self.used())
+            images = np.flatnonzero(self.oriented)
+            points, point = np.unique(self.tracks.point[rows], return_inverse=True)
+            image = np.searchsorted(images, self.tracks.image[rows])
+            given = FreeBlock(
+                self.station[images], self.rotation[images], self.xyz[points], self.interior
+            )
+            camera = self.camera
+            if len(images) < _INTERIOR_FROM:
+                camera = replace(camera, free=frozenset())
+            found = damped_adjustment(camera, given, image, point, self.tracks.xy_mm[rows])
+            self.station[images], self.rotation[images] = found.station, found.rotation
+            self.xyz[points], self.interior = found.points, found.interior
+            self._place()
+            fits = self._residual_px(self.xyz, rows)
+            self.limit_px = float(
+                np.clip(5.0 * np.median(fits), _RESIDUAL_MAX_PX, _FIRST_RESIDUAL_MAX_PX)
+            )
+            self._intersect()
+
+
+@dataclass(frozen=True)
+class _Start:
+    """A pair of images and one of its relative orientations, second from first, vision axes."""
+
+    first: int
+    second: int
+    rotation: Array
+    shift: Array
+
+
+def _starts(block: _Growing) -> Iterator[list[_Start]]:
+    """Relative orientations of each of the pairs with the most points.
+
+    A plane is seen alike from two places by two pairs of attitudes. Which is right shows when
+    further images are oriented; all are returned.
+    """
+    for a, b, rows_a, rows_b in block.pairs():
+        first, second = block.ideal[rows_a], block.ideal[rows_b]
+        limit = _RESIDUAL_MAX_PX * block.pixel
+        found = [*_by_essential(first, second, limit), *_by_plane(first, second, 2.0 * limit)]
+        yield [_Start(a, b, turn, shift / np.linalg.norm(shift)) for turn, shift in found]
+
+
+def _by_essential(a: Array, b: Array, limit: float) -> list[tuple[Array, Array]]:
+    essential, inside = cv2.findEssentialMat(
+        a, b, np.eye(3), method=cv2.USAC_MAGSAC, prob=0.9999, threshold=limit
+    )
+    if essential is None or essential.shape != (3, 3) or inside is None:
+        return []
+    own = inside.ravel() > 0
+    if own.sum() < POINTS_MIN:
+        return []
+    _, rotation, shift, _ = cv2.recoverPose(essential, a[own], b[own])
+    return [(rotation, shift.ravel())]
+
+
+def _by_plane(a: Array, b: Array, limit: float) -> list[tuple[Array, Array]]:
+    """Orientations whose plane lies in front of both images."""
+    homography, inside = cv2.findHomography(a, b, cv2.USAC_MAGSAC, limit)
+    if homography is None or inside is None or inside.sum() < POINTS_MIN:
+        return []
+    rays = np.column_stack([a, np.ones(len(a))])[inside.ravel() > 0]
+    _, turns, shifts, normals = cv2.decomposeHomographyMat(homography, np.eye(3))
+    return [
+        (turn, shift.ravel())
+        for turn, shift, normal in zip(turns, shifts, normals, strict=True)
+        if np.median(rays @ normal) > 0.0 and np.linalg.norm(shift) > _SHIFT_MIN
+    ]

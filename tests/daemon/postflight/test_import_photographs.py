@@ -1,0 +1,193 @@
+"""Photographs with positions in EXIF become a mission that is triangulated without attitudes.
+
+The photographs are real (seneca), reduced; EXIF is copied, so that its pixel size is that of the
+larger original.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from daemon.cli import app
+from daemon.orientation.local_frame import LocalFrame
+from daemon.postflight.importers.exif_tags import (
+    TagsError,
+    focal_length_px_of,
+    pitch_mm_of,
+    position_of,
+    read_tags,
+)
+from daemon.postflight.triangulation.ground_control import read_gcp_list
+from daemon.postflight.triangulation.triangulation import TriangulationError
+
+RUN = CliRunner()
+SENECA = Path(__file__).parents[4] / "shared" / "data" / "aerial" / "seneca"
+USED = (491, 492, 493, 495, 504, 505, 507)
+WIDTH = 900
+
+pytestmark = pytest.mark.skipif(not SENECA.is_dir(), reason="needs ../shared/data")
+
+
+def exif_segment(path: Path) -> bytes:
+    data = path.read_bytes()
+    at = data.index(b"Exif\0\0") - 4
+    (length,) = struct.unpack_from(">H", data, at + 2)
+    return data[at : at + 2 + length]
+
+
+def reduced(number: int, folder: Path, *, name: str = "", pixels: np.ndarray | None = None) -> Path:
+    original = SENECA / f"IMG_{number:04d}.jpg"
+    if pixels is None:
+        whole = cv2.imread(str(original))
+        pixels = cv2.resize(whole, (WIDTH, WIDTH * 3 // 4), interpolation=cv2.INTER_AREA)
+    jpeg = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
+    path = folder / (name or original.name)
+    path.write_bytes(jpeg[:2] + exif_segment(original) + jpeg[2:])
+    return path
+
+
+@pytest.fixture(scope="module")
+def photographs(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("photographs")
+    for number in USED:
+        reduced(number, folder)
+    return folder
+
+
+def test_tags_of_a_real_photograph() -> None:
+    tags = read_tags(SENECA / "IMG_0484.jpg")
+    assert (tags.width_px, tags.height_px) == (3600, 2700)
+    # 4000 px were taken; the file has 3600 of the same field.
+    assert pitch_mm_of(tags) == pytest.approx(25.4 / 16393.4426 * 4000 / 3600, rel=1e-6)
+    assert focal_length_px_of(tags)[0] == pytest.approx(2497.74, abs=0.01)
+    latitude, longitude, height = position_of(tags)
+    assert latitude == pytest.approx(41 + 2 / 60 + 12.28308 / 3600, abs=1e-9)
+    assert longitude == pytest.approx(-(83 + 18 / 60 + 22.57884 / 3600), abs=1e-9)
+    assert height == pytest.approx(282.196, abs=1e-3)
+
+
+def test_a_cropped_photograph_has_no_pixel_size(tmp_path) -> None:
+    path = reduced(484, tmp_path, pixels=np.full((900, 1000, 3), 90, np.uint8))
+    assert pitch_mm_of(read_tags(path)) is None
+    assert focal_length_px_of(read_tags(path)) is None
+
+
+@pytest.mark.parametrize("cut", [3, 40, 700, 5000])
+def test_a_photograph_that_ends_early_is_refused_by_name(tmp_path, cut) -> None:
+    path = tmp_path / "short.jpg"
+    path.write_bytes((SENECA / "IMG_0484.jpg").read_bytes()[:cut])
+    with pytest.raises(TagsError, match=r"short\.jpg"):
+        read_tags(path)
+
+
+def refused(folder: Path, out: Path, *options: str) -> str:
+    done = RUN.invoke(app, ["import", "photographs", str(folder), "--out", str(out), *options])
+    assert done.exit_code != 0 and not out.exists()
+    return " ".join(str(done.exception or done.output).split())
+
+
+def test_two_cameras_in_one_folder_are_refused(tmp_path, photographs) -> None:
+    folder = tmp_path / "mixed"
+    folder.mkdir()
+    for number in USED[:3]:
+        reduced(number, folder)
+    other = SENECA.parent / "caliterra" / "IMG_9419.jpg"
+    (folder / other.name).write_bytes(other.read_bytes())
+    sentence = refused(folder, tmp_path / "out")
+    assert "2 cameras" in sentence and "SX260" in sentence and "ELPH 300" in sentence
+
+
+def test_photographs_without_positions_or_focal_length_are_refused(tmp_path) -> None:
+    bare = tmp_path / "bare"
+    bare.mkdir()
+    for k in range(3):
+        cv2.imwrite(str(bare / f"{k}.jpg"), np.full((600, 800, 3), 90, np.uint8))
+    assert "--focal-mm" in refused(bare, tmp_path / "out")
+    sentence = refused(bare, tmp_path / "out", "--focal-mm", "5", "--pixel-um", "5")
+    assert "0 of 3 photographs have a position" in sentence
+
+
+@pytest.fixture(scope="module")
+def triangulated(photographs, tmp_path_factory) -> tuple[Path, dict]:
+    mission = tmp_path_factory.mktemp("mission") / "field"
+    made = RUN.invoke(
+        app, ["import", "photographs", str(photographs), "--out", str(mission), "--json"]
+    )
+    assert made.exit_code == 0, made.output
+    about = json.loads(made.stdout)
+    assert about["photographs"] == len(USED)
+    assert about["f_px"] == pytest.approx(2497.74 * WIDTH / 3600, rel=1e-4)
+    done = RUN.invoke(app, ["triangulate", str(mission), "--json"])
+    assert done.exit_code == 0, f"{done.output} {done.exception}"
+    return mission, json.loads(done.stdout)
+
+
+def test_photographs_are_triangulated_without_attitudes(triangulated) -> None:
+    mission, report = triangulated
+    found = report["photographs"]
+    assert found["oriented"] == len(USED) and not found["left_out"]
+    # Positions of a consumer's receiver, 24 m apart.
+    assert max(found["position_rms_m"]) < 5.0
+    assert max(report["triangulation"]["image_rms_px"]) < 1.0
+    assert not found["f_and_height_separated"]
+    assert any("not separated without control" in one for one in report["cautions"])
+    folder = mission / "export" / "triangulation" / "photographs"
+    assert (folder / "exterior.csv").exists() and (folder / "adjusted-rig.toml").exists()
+    rows = (folder / "exterior.csv").read_text().splitlines()
+    assert len([row for row in rows if row.startswith("0000")]) == len(USED)
+    again = RUN.invoke(app, ["adjust", str(folder), "--json"])
+    assert json.loads(again.stdout)["sigma0"] == pytest.approx(report["sigma0"], rel=0.1)
+
+
+def test_unrelated_photographs_are_reported(photographs, tmp_path) -> None:
+    folder = tmp_path / "unrelated"
+    folder.mkdir()
+    random = np.random.default_rng(1)
+    for k, number in enumerate(USED[:4]):
+        noise = random.integers(0, 255, (60, 80, 3), dtype=np.uint8)
+        pixels = cv2.resize(noise, (800, 600), interpolation=cv2.INTER_CUBIC)
+        reduced(number, folder, pixels=pixels if k < 3 else np.full_like(pixels, 128))
+    mission = tmp_path / "mission"
+    assert (
+        RUN.invoke(app, ["import", "photographs", str(folder), "--out", str(mission)]).exit_code
+        == 0
+    )
+    done = RUN.invoke(app, ["triangulate", str(mission)])
+    assert done.exit_code != 0
+    sentence = str(done.exception)
+    assert "no three photographs hang together" in sentence
+    assert "little texture" in sentence and "IMG_0495.jpg 0" in sentence
+    assert not (mission / "export" / "triangulation" / "photographs").exists()
+
+
+def test_an_odm_list_of_control_points_is_read(tmp_path) -> None:
+    frame = LocalFrame(41.0371, -83.3061)
+    path = tmp_path / "gcp_list.txt"
+    path.write_text(
+        "WGS84 UTM 17N\n"
+        "306200.5 4545500.25 210.0 100.5 200.25 IMG_1.jpg a\n"
+        "306200.5 4545500.25 210.0 300 400 img_2.JPG a\n"
+        "306250.0 4545500.25 211.0 10 20 IMG_1.jpg b\n"
+        "306250.0 4545500.25 211.0 10 20 IMG_9.jpg b\n"
+    )
+    found = read_gcp_list(path, {"img_1.jpg": 0, "img_2.jpg": 1}, frame)
+    assert found.names == ("a", "b") and found.image.tolist() == [0, 1, 0]
+    assert found.px[0].tolist() == [100.5, 200.25]
+    away = found.xyz_m[1] - found.xyz_m[0]
+    assert np.hypot(*away[:2]) == pytest.approx(49.5, abs=0.03) and away[2] == pytest.approx(
+        1, abs=0.01
+    )
+    assert found.unused == ("IMG_9.jpg: b",)
+    path.write_text("WGS84 UTM 99N\n1 2 3 4 5 IMG_1.jpg\n")
+    with pytest.raises(TriangulationError, match="no coordinate system"):
+        read_gcp_list(path, {"img_1.jpg": 0}, frame)
+    path.write_text("EPSG:32617\n1 2 3 4 IMG_1.jpg\n")
+    with pytest.raises(TriangulationError, match="line 2"):
+        read_gcp_list(path, {"img_1.jpg": 0}, frame)
