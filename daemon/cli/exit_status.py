@@ -49,7 +49,7 @@ PROBLEMS: Final = {
     "pansharpen": "an exposure could not be processed; the others are done",
     "replay": "a result differs from the recorded one",
     "orient": "the orientation of an exposure cannot be computed",
-    "triangulate": "the block cannot be adjusted, a photograph has no orientation, or data snooping ended early",
+    "triangulate": "the block cannot be adjusted, or a photograph has no orientation",
     "intersect": "no point can be intersected",
     "export": "the mission cannot be read, or a file could not be written",
     "import": "the input cannot be read or is inconsistent",

@@ -7,7 +7,7 @@ statistics; `processing.bundle.adjust` is the adjustment that results are taken 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,7 +44,8 @@ def damped_adjustment(
 
     Args:
         camera: its `free` parameters are estimated, each with its `sigma` about the camera's own
-            values; the model is eq. 5.1.
+            values; the model is eq. 5.1 of
+            Heier et al. (2002).
         block: values to begin with.
         image: image of each image point, shape (m,).
         point: object point of each, shape (m,).
@@ -85,7 +86,7 @@ class _Reduced:
 
     normal: Array
     right: Array
-    coupling: object
+    coupling: Any
     points: Array
     points_right: Array
     columns: int
@@ -95,12 +96,12 @@ class _Reduced:
         own = self.points * (1.0 + damping * np.eye(3))
         inverse = np.asarray(np.linalg.inv(own), np.float64)
         block = _block_diagonal(inverse)
-        coupled = self.coupling @ block  # type: ignore[operator]
+        coupled = self.coupling @ block
         normal = self.normal * (1.0 + damping * np.eye(self.columns))
-        reduced = normal - (coupled @ self.coupling.T).toarray()  # type: ignore[attr-defined]
+        reduced = normal - (coupled @ self.coupling.T).toarray()
         right = self.right - coupled @ self.points_right.ravel()
         solution = np.linalg.lstsq(reduced, right, rcond=1e-15)[0]
-        back = self.points_right.ravel() - self.coupling.T @ solution  # type: ignore[attr-defined]
+        back = self.points_right.ravel() - self.coupling.T @ solution
         return solution, np.einsum("pij,pj->pi", inverse, back.reshape(-1, 3))
 
 
@@ -215,7 +216,7 @@ class _Problem:
         )
 
 
-def _block_diagonal(blocks: Array) -> object:
+def _block_diagonal(blocks: Array) -> Any:
     from scipy.sparse import bsr_array
 
     n = len(blocks)

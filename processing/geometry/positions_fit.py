@@ -33,7 +33,14 @@ class PositionsFit:
     used: NDArray[np.bool_]
 
     def applied(self, xyz: Array) -> Array:
-        """Points (n, 3) brought to the known positions' frame."""
+        """Bring points into the frame of the known positions.
+
+        Args:
+            xyz: shape (n, 3), without scale.
+
+        Returns:
+            Shape (n, 3), m.
+        """
         return np.asarray(self.scale * xyz @ self.rotation.T + self.shift)
 
 

@@ -32,7 +32,7 @@ _TRACKS_IN_CELL: Final = 2
 
 
 @dataclass(frozen=True)
-class Features:
+class ImageFeatures:
     """Places (n, 2) px, zero in the middle of the upper left pixel, and descriptors (n, 128)."""
 
     px: Array
@@ -51,7 +51,7 @@ class Tracks:
 
 def features_of(
     grey: NDArray[np.uint8], *, side_max_px: int = 2400, features_max: int = 7000
-) -> Features:
+) -> ImageFeatures:
     """Features of one image by SIFT, the largest ones.
 
     Args:
@@ -74,18 +74,18 @@ def features_of(
     found = sorted(detector.detect(small), key=lambda k: (-k.size, -k.response))
     kept, descriptors = detector.compute(small, found[:features_max])
     if descriptors is None or not kept:
-        return Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32))
+        return ImageFeatures(np.zeros((0, 2)), np.zeros((0, 128), np.float32))
     ratio = np.array([width / size[0], height / size[1]])
     px = (np.array([k.pt for k in kept], dtype=np.float64) + 0.5) * ratio - 0.5
     # One feature a place: a second orientation of it would join tracks with themselves.
     _, first = np.unique(np.round(px, 3), axis=0, return_index=True)
     total = np.abs(descriptors).sum(axis=1, keepdims=True)
     rooted = np.sqrt(descriptors / np.maximum(total, 1e-12))
-    return Features(px[first], np.ascontiguousarray(rooted[first], np.float32))
+    return ImageFeatures(px[first], np.ascontiguousarray(rooted[first], np.float32))
 
 
 def match_photographs(
-    features: Sequence[Features],
+    features: Sequence[ImageFeatures],
     candidates: Sequence[tuple[int, int]],
     *,
     progress: Callable[[int], None] = lambda _done: None,
@@ -110,7 +110,7 @@ def match_photographs(
     return found
 
 
-def _alike(a: Features, b: Features) -> Indices:
+def _alike(a: ImageFeatures, b: ImageFeatures) -> Indices:
     """Mutually nearest descriptors that are clearly nearer than the second nearest, (m, 2)."""
     if min(len(a.px), len(b.px)) < _FEATURES_MIN:
         return np.zeros((0, 2), np.int64)
@@ -137,7 +137,7 @@ def _consistent(a_px: Array, b_px: Array, pairs: Indices) -> Indices:
     return pairs[:0] if inside is None else pairs[inside.ravel() > 0]
 
 
-def join_tracks(features: Sequence[Features], pairs: Pairs) -> Tracks:
+def join_tracks(features: Sequence[ImageFeatures], pairs: Pairs) -> Tracks:
     """Join matches to tracks; those that meet an image twice are left out as ambiguous.
 
     Args:

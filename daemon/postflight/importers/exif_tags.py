@@ -147,10 +147,14 @@ def _tiff(data: bytes, kind: str, size: tuple[int, int] | None = None) -> ImageT
             _directory(data, order, int(place[0])) if isinstance(place, tuple) and place else {}
         )
     if size is None:
-        sides = [image.get(code) for code in (IMAGE_WIDTH, IMAGE_LENGTH)]
-        if not all(isinstance(side, tuple) and side and side[0] >= 1 for side in sides):
+        sides = [
+            int(side[0])
+            for side in (image.get(IMAGE_WIDTH), image.get(IMAGE_LENGTH))
+            if isinstance(side, tuple) and side and side[0] >= 1
+        ]
+        if len(sides) != 2:
             raise ValueError("no image size")
-        size = (int(sides[0][0]), int(sides[1][0]))  # type: ignore[index]
+        size = (sides[0], sides[1])
     xmp = image.get(XMP)
     exif, gps = parts
     return ImageTags(kind, *size, image, exif, gps, xmp if isinstance(xmp, bytes) else None)

@@ -1,6 +1,6 @@
 """The block of a mission of photographs: tie points and orientations without any attitude known.
 
-Features, tracks and the incremental orientation give the start (`processing.bundle.
+ImageFeatures, tracks and the incremental orientation give the start (`processing.bundle.
 incremental_orientation`), positions of EXIF its place, scale and attitude. What is not oriented is
 named with the reason.
 """
@@ -36,7 +36,7 @@ from processing.geometry.positions_fit import NotPlacedError, fit_positions
 from processing.matching.block_matching import BlockTiePoints, image_mm
 from processing.matching.photograph_tracks import (
     MATCHES_MIN,
-    Features,
+    ImageFeatures,
     Tracks,
     features_of,
     join_tracks,
@@ -49,14 +49,13 @@ from processing.rig import Rig, VirtualImage, load_rig
 Array = NDArray[np.float64]
 Progress = Callable[[str, int, int], None]
 
-FREE: Final = ("dx0", "dy0", "df", "k1", "k2", "k3", "p1", "p2")
-"""Estimated parameters of the interior orientation."""
+FREE: Final = ("df", "k1", "k2", "p1", "p2")
+"""Estimated parameters; the principal point is held: tilts and a rolling shutter take its place."""
 NEIGHBOURS: Final = 10
 """Images whose positions are nearest are compared; without positions all are."""
 _ORIENTED_MIN: Final = 3
 _MAX_PIXELS: Final = 500_000_000
 _FOCAL_SIGMA: Final = 0.02
-_POINT_SIGMA: Final = 0.02
 _CORNER_SIGMA: Final = 0.05
 _DECENTRING_SIGMA: Final = 0.005
 
@@ -135,9 +134,7 @@ def provisional_camera(rig: Rig) -> CameraModel:
     corner = 0.5 * float(np.hypot(image.width_px, image.height_px)) * image.pitch_mm
     sigma = {
         "df": _FOCAL_SIGMA * image.f_mm,
-        "dx0": _POINT_SIGMA * corner,
-        "dy0": _POINT_SIGMA * corner,
-        **{f"k{n}": _CORNER_SIGMA / corner ** (2 * n) for n in (1, 2, 3)},
+        **{f"k{n}": _CORNER_SIGMA / corner ** (2 * n) for n in (1, 2)},
         "p1": _DECENTRING_SIGMA / corner,
         "p2": _DECENTRING_SIGMA / corner,
     }
@@ -180,7 +177,7 @@ def original_pixels(
 
 def _features(
     mission: Mission, exposures: list[Exposure], image: VirtualImage, progress: Progress
-) -> list[Features]:
+) -> list[ImageFeatures]:
     found = []
     for done, exposure in enumerate(exposures, start=1):
         try:
@@ -205,7 +202,9 @@ def _source(exposure: Exposure) -> str:
     return str(exposure.frames[0].settings.get("Source", exposure.frames[0].file))
 
 
-def _unconnected(mission: Mission, names: list[str], features: list[Features], pairs: int) -> str:
+def _unconnected(
+    mission: Mission, names: list[str], features: list[ImageFeatures], pairs: int
+) -> str:
     counts = [len(one.px) for one in features]
     weak = [f"{n} {c}" for n, c in zip(names, counts, strict=True) if c < 10 * MATCHES_MIN]
     texture = f"; little texture (features): {', '.join(weak[:5])}" if weak else ""
@@ -241,7 +240,7 @@ def _assembled(
     frame: LocalFrame,
     position: Array,
     tracks: Tracks,
-    features: list[Features],
+    features: list[ImageFeatures],
     placed: OrientedBlock,
     crs: str | None,
     camera: CameraModel,

@@ -150,8 +150,6 @@ def photographs_section(
         "f_exif_px": block.image.f_mm / pitch,
         "f_px": f_mm / pitch,
         "f_sigma_px": sigma["df"] / pitch,
-        "principal_point_px": [-interior["dx0"] / pitch, interior["dy0"] / pitch],
-        "principal_point_sigma_px": [sigma["dx0"] / pitch, sigma["dy0"] / pitch],
         "height_above_ground_m": height_m,
         "height_per_percent_m": 0.01 * height_m,
         "position_rms_m": [float(v) for v in np.sqrt(np.mean(away**2, axis=0))],

@@ -32,7 +32,9 @@ SENECA = Path(__file__).parents[4] / "shared" / "data" / "aerial" / "seneca"
 USED = (491, 492, 493, 495, 504, 505, 507)
 WIDTH = 900
 
-pytestmark = pytest.mark.skipif(not SENECA.is_dir(), reason="needs ../shared/data")
+pytestmark = pytest.mark.skipif(
+    not SENECA.is_dir(), reason="needs the photographs in ../shared/data/aerial"
+)
 
 
 def exif_segment(path: Path) -> bytes:
