@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.progress import (
@@ -16,29 +16,83 @@ from rich.progress import (
 )
 
 from daemon.cli.options import AsJson
+from daemon.configuration.model import ConfigurationError
 from daemon.terminal.console import Console
+from drivers.base.extras import require
 
-HELP = """Copy a mission to another disk and verify every file.
+if TYPE_CHECKING:
+    from daemon.mission.transfer.store_transfer import StoreTransferReport
+    from daemon.mission.transfer.transfer import Progress as ShowProgress
+    from daemon.mission.transfer.transfer import TransferReport
 
-Each file is read back from the other disk and compared by hash, in every run. An interrupted
+HELP = """Copy a mission to another disk or an object store and verify every file.
+
+Each file is read back from the copy and compared by hash, in every run. An interrupted
 transfer continues when the same command is run again. The source remains unless --remove-source is
 given: then the copy is sealed, the source is removed, and no later run changes the copy.
 
-Example: `syntopic transfer MISSION /media/shuttle`
+An object store is named as s3://bucket/folder, gs://bucket/folder or az://container/folder and
+requires `pip install 'syntopic[stores]'`. Credentials come from the environment.
+
+Examples: `syntopic transfer MISSION /media/shuttle`,
+`syntopic transfer MISSION s3://survey/2026 --remove-source`
 """
+
+
+def _to_disk(
+    mission: Path, disk: Path, show: ShowProgress, *, remove_source: bool
+) -> TransferReport:
+    from daemon.mission.layout import Mission
+    from daemon.mission.transfer.transfer import finish_transfer, transfer
+
+    finished = None if mission.exists() else finish_transfer(mission, disk, progress=show)
+    return finished or transfer(
+        Mission.open(mission), disk, remove_source=remove_source, progress=show
+    )
+
+
+def _to_store(
+    mission: Path, url: str, show: ShowProgress, *, remove_source: bool
+) -> StoreTransferReport:
+    from daemon.mission.layout import Mission
+    from daemon.mission.transfer.object_store import ObjectStore
+    from daemon.mission.transfer.store_transfer import finish_store_transfer, transfer_to_store
+
+    require("stores")
+    folder = ObjectStore(url)
+    finished = None if mission.exists() else finish_store_transfer(mission, folder, progress=show)
+    return finished or transfer_to_store(
+        Mission.open(mission), folder, remove_source=remove_source, progress=show
+    )
+
+
+def folder_of(target: str) -> Path:
+    """The folder of a path or of a file:// address.
+
+    Raises:
+        ConfigurationError: an address of another kind.
+    """
+    from urllib.parse import unquote, urlsplit
+
+    if "://" not in target:
+        return Path(target)
+    parts = urlsplit(target)
+    if parts.scheme != "file" or parts.netloc not in ("", "localhost") or parts.query:
+        raise ConfigurationError(
+            [f"{target}: no folder; a path, file:///folder, s3://, gs:// and az:// are right"]
+        )
+    return Path(unquote(parts.path))
 
 
 def transfer(
     mission: Annotated[Path, typer.Argument(help="Mission folder.")],
-    disk: Annotated[Path, typer.Argument(help="Folder of the other disk.")],
+    target: Annotated[str, typer.Argument(help="Folder of the other disk, or of an object store.")],
     remove_source: Annotated[
         bool, typer.Option("--remove-source", help="Remove the source after the copy is sealed.")
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    from daemon.mission.layout import Mission
-    from daemon.mission.transfer.transfer import finish_transfer
-    from daemon.mission.transfer.transfer import transfer as run
+    from daemon.mission.transfer.object_store import is_store_url
 
     columns = (BarColumn(), DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
@@ -47,12 +101,11 @@ def transfer(
         def show(done: int, total: int) -> None:
             progress.update(task, completed=done, total=total)
 
-        finished = None
-        if not mission.exists():
-            finished = finish_transfer(mission, disk, progress=show)
-        report = finished or run(
-            Mission.open(mission), disk, remove_source=remove_source, progress=show
-        )
+        report: TransferReport | StoreTransferReport
+        if is_store_url(target):
+            report = _to_store(mission, target, show, remove_source=remove_source)
+        else:
+            report = _to_disk(mission, folder_of(target), show, remove_source=remove_source)
     if as_json:
         typer.echo(
             json.dumps(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -14,7 +13,9 @@ from rich.text import Text
 
 from daemon.cli.exit_status import status_of
 from daemon.cli.options import AsJson
+from daemon.cli.transfer import folder_of
 from daemon.terminal.console import Console
+from drivers.base.extras import require
 
 if TYPE_CHECKING:
     from daemon.mission.verification.verification import VerifyReport
@@ -23,18 +24,23 @@ HELP = """Check a mission folder against its hashes and list files without a has
 
 Files without a hash do not change the exit status. A mission may be verified while it is flown.
 
-Example: `syntopic verify flights/demo/missions/20261121T101500Z-ultracam-x-mini`
+A mission that `syntopic transfer` copied to an object store is read there, each object once.
+
+Examples: `syntopic verify flights/demo/missions/20261121T101500Z-ultracam-x-mini`,
+`syntopic verify s3://survey/2026/20261121T101500Z-ultracam-x-mini`
 """
 SHOWN = 5
 """So many names of files that are not covered are printed for each reason; --json has all."""
 
 
 def verify(
-    mission: Annotated[Path, typer.Argument(help="Mission folder.")],
+    mission: Annotated[str, typer.Argument(help="Mission folder, or its address in a store.")],
     as_json: AsJson = False,
 ) -> None:
     from daemon.mission.layout import Mission
     from daemon.mission.store import store
+    from daemon.mission.transfer.object_store import ObjectStore, is_store_url
+    from daemon.mission.transfer.store_verification import verify_in_store
 
     with Progress(console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("verifying", total=None)
@@ -42,7 +48,12 @@ def verify(
         def show(done: int, total: int) -> None:
             progress.update(task, completed=done, total=total)
 
-        report = store.verify(Mission.open(mission, checks_subfolders=False), show)
+        if is_store_url(mission):
+            require("stores")
+            report = verify_in_store(ObjectStore(mission), show)
+        else:
+            folder = Mission.open(folder_of(mission), checks_subfolders=False)
+            report = store.verify(folder, show)
     if as_json:
         typer.echo(json.dumps(asdict(report)))
     else:

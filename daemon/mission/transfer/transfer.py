@@ -98,7 +98,7 @@ def transfer(
         durable.make_directories(target_path.parent)
         target = stack.enter_context(_locked_target(target_path, source))
         manifest = read_manifest(target, mission)
-        _checkpoint_index(mission)
+        checkpoint_index(mission)
         if manifest is not None and manifest.state == "sealed":
             copying = _Copying(source, target, manifest.files, progress)
             return copying.confirm_sealed(manifest, remove=remove_source)
@@ -144,7 +144,7 @@ def finish_transfer(
             return None
         if is_left:
             stack.enter_context(Mission(removing, manifest.mission).held())
-        step = _counter(manifest.nbytes, progress)
+        step = counter(manifest.nbytes, progress)
         check_sealed(target, manifest, step)
         if is_left:
             finish_removal(removing, manifest)
@@ -167,7 +167,7 @@ class _Copying:
         self._folders, files = source.list_entries()
         self._entries = [entry for entry in files if entry.name not in EXCLUDED_FILES]
         self._nbytes = sum(entry.nbytes for entry in self._entries)
-        self._step = _counter(2 * self._nbytes, progress)
+        self._step = counter(2 * self._nbytes, progress)
 
     def run(self, mission: Mission, *, remove: bool) -> TransferReport:
         """Copy, verify, and seal and remove the source where that is wanted."""
@@ -251,7 +251,7 @@ class _Copying:
                 here = self._hash_source(entry.name)
                 if here == there:
                     return here, True
-            if _is_captured(entry.name) and there == self._verified(entry.name):
+            if is_captured(entry.name) and there == self._verified(entry.name):
                 raise TransferError(
                     f"{self._source.path / entry.name} differs from the copy that was verified "
                     f"earlier in {self._target.path}; both are kept. Run `syntopic verify "
@@ -282,7 +282,7 @@ class _Copying:
                     f"{self._target.path / file.name} is not part of this mission; move it away or "
                     "choose another disk"
                 )
-            elif _is_captured(file.name):
+            elif is_captured(file.name):
                 raise TransferError(
                     f"{self._source.path} has lost {file.name}, which the copy in "
                     f"{self._target.path} has; the copy is left as it is. Transfer the mission "
@@ -349,7 +349,7 @@ def _locked_target(path: Path, source: FileTree | None) -> Iterator[FileTree]:
             yield target
 
 
-def _checkpoint_index(mission: Mission) -> None:
+def checkpoint_index(mission: Mission) -> None:
     """Fold the write-ahead log into the index, so that one file holds it."""
     if not mission.catalog_path.exists():
         return
@@ -369,7 +369,7 @@ def _sync_above(path: Path) -> None:
             durable.sync_directory(folder)
 
 
-def _is_captured(name: str) -> bool:
+def is_captured(name: str) -> bool:
     """Whether a file holds what cannot be made again: frames, records, logs, the configuration."""
     first, _, below = name.partition("/")
     if first == "log":
@@ -386,7 +386,7 @@ def _name_of_part(name: str) -> str | None:
     return f"{folder}/{final_name}" if folder else final_name
 
 
-def _counter(total: int, progress: Progress) -> ByteProgress:
+def counter(total: int, progress: Progress) -> ByteProgress:
     done = 0
 
     def step(count: int) -> None:

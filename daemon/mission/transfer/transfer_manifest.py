@@ -112,22 +112,35 @@ def read_manifest(target: FileTree, mission: Mission | None = None) -> TransferM
         TransferError: damaged, or of another mission.
     """
     try:
-        content = json.loads(target.read_small(MANIFEST_FILE))
-        manifest = _note(content)
+        data = target.read_small(MANIFEST_FILE)
     except FileNotFoundError:
         return None
+    return parse_manifest(data, str(target.path), mission)
+
+
+def parse_manifest(data: bytes, place: str, mission: Mission | None = None) -> TransferManifest:
+    """The note of a copy from its bytes.
+
+    Args:
+        data: content of `transfer.json`.
+        place: folder or address of the copy, for messages.
+        mission: refuse a copy of any other mission.
+
+    Raises:
+        TransferError: damaged, or of another mission.
+    """
+    try:
+        manifest = _note(json.loads(data))
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise TransferError(
-            f"{target.path / MANIFEST_FILE} is damaged ({type(error).__name__}), so what is in "
-            f"{target.path} is not known to be a copy; move it away or choose another disk"
+            f"{place}/{MANIFEST_FILE} is damaged ({type(error).__name__}), so what is in "
+            f"{place} is not known to be a copy; move it away or choose another disk"
         ) from error
     if mission is not None and (manifest.mission, manifest.genesis_sha256) != (
         mission.id,
         mission.genesis_sha256(),
     ):
-        raise TransferError(
-            f"{target.path} holds another mission of the same name; choose another disk"
-        )
+        raise TransferError(f"{place} holds another mission of the same name; choose another disk")
     return manifest
 
 

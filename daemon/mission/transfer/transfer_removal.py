@@ -53,13 +53,13 @@ def check_sealed(target: FileTree, manifest: TransferManifest, step: ByteProgres
             )
 
 
-def remove_sealed_source(source: FileTree, manifest: TransferManifest, target: Path) -> None:
+def remove_sealed_source(source: FileTree, manifest: TransferManifest, target: Path | str) -> None:
     """Remove a source that is as it was copied.
 
     Args:
         source: the mission's folder; the caller has compared it with the manifest.
         manifest: of the copy, sealed.
-        target: the copy, for the mark.
+        target: folder or address of the copy, for the mark.
 
     Raises:
         TransferError: the folder cannot be renamed, or holds what the copy does not.
