@@ -191,8 +191,13 @@ def view_of(eo: ExteriorOrientation) -> dict[str, float]:
 
 def sun_position_deg(eo: ExteriorOrientation) -> tuple[float, float]:
     """Elevation of the sun, and its azimuth clockwise from true north, at an image, degrees."""
-    unix_s = eo.gps_ns / SECOND_NS - leap_seconds_at(eo.gps_ns) + GPS_EPOCH_UNIX_S
-    place = math.radians(eo.latitude_deg), math.radians(eo.longitude_deg)
+    return sun_angles_deg(eo.gps_ns, eo.latitude_deg, eo.longitude_deg)
+
+
+def sun_angles_deg(gps_ns: int, latitude_deg: float, longitude_deg: float) -> tuple[float, float]:
+    """Elevation of the sun, and its azimuth clockwise from true north, degrees."""
+    unix_s = gps_ns / SECOND_NS - leap_seconds_at(gps_ns) + GPS_EPOCH_UNIX_S
+    place = math.radians(latitude_deg), math.radians(longitude_deg)
     return (
         math.degrees(sun_elevation_rad(unix_s, *place)),
         math.degrees(sun_azimuth_rad(unix_s, *place)),

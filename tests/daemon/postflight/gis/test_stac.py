@@ -50,11 +50,11 @@ def problems(content: dict) -> list[str]:
     registry = Registry().with_resources(
         [(uri, Resource.from_contents(schema, DRAFT7)) for uri, schema in known.items()]
     )
-    kind = "item" if content["type"] == "Feature" else "collection"
+    kind = {"Feature": "item"}.get(content["type"], content["type"].lower())
     core = f"https://schemas.stacspec.org/v1.1.0/{kind}-spec/json-schema/{kind}.json"
     return [
         f"{'/'.join(map(str, error.absolute_path))}: {error.message}"
-        for uri in (core, *content["stac_extensions"])
+        for uri in (core, *content.get("stac_extensions", ()))
         for error in Draft7Validator(known[uri], registry=registry).iter_errors(content)
     ]
 

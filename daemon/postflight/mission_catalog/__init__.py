@@ -1,0 +1,1 @@
+"""Catalog of many missions: a table of exposures, STAC collections, and queries."""

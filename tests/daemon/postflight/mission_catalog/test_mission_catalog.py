@@ -1,0 +1,205 @@
+"""A catalog over folders and a bucket, read by geopandas, GDAL and pystac, and queried."""
+
+from __future__ import annotations
+
+import json
+import math
+import shlex
+from pathlib import Path
+
+import pyarrow.parquet
+import pytest
+from typer.testing import CliRunner
+
+from daemon.cli import app
+from daemon.mission.layout import Mission
+from daemon.mission.transfer.object_store import ObjectStore
+from daemon.mission.transfer.store_transfer import transfer_to_store
+from tests.daemon.mission.stores.conftest import mission as mission
+from tests.daemon.mission.stores.conftest import store as store
+from tests.daemon.postflight.gis.test_stac import problems
+from tests.daemon.small_camera import RIG_TOML
+
+geopandas = pytest.importorskip("geopandas", reason="pip install 'syntopic[catalog]'")
+pyogrio = pytest.importorskip("pyogrio")
+pystac = pytest.importorskip("pystac")
+pytestmark = pytest.mark.peer
+
+EPOCH_NS = 1_479_300_000_000_000_000
+STEP_DEG = 0.01
+GROUND_M, HEIGHT_M = 400.0, 1400.0
+
+
+def lay_out(root: Path, name: str, count: int, longitude_deg: float) -> Path:
+    """Records of level images eastward of a place, one a hundredth of a degree; no frames."""
+    path = root / name
+    path.mkdir(parents=True)
+    (path / "rig.toml").write_text(RIG_TOML)
+    (path / "service.toml").write_text(f"[plan]\nground_height_m = {GROUND_M}\n")
+    for number in range(1, count + 1):
+        folder = path / f"L0/{number:06d}"
+        folder.mkdir(parents=True)
+        instant = EPOCH_NS + number * 60_000_000_000
+        navigation = {
+            "gps_ns": str(instant), "latitude_deg": 47.0,
+            "longitude_deg": longitude_deg + (number - 1) * STEP_DEG, "height_m": HEIGHT_M,
+            "roll_rad": 0.0, "pitch_rad": 0.0, "heading_rad": 0.0,
+        }  # fmt: skip
+        if number == count:
+            del navigation["roll_rad"]
+        record = {
+            "number": number, "mark_gps_ns": str(instant), "mark_sigma_ns": 25,
+            "mark_source": "event-mark", "line_id": "line 1", "navigation": navigation,
+            "frames": [{"sensor": "SU00", "file": "SU00.tif", "sha256": f"{number:064x}"}],
+        }  # fmt: skip
+        (folder / "exposure.json").write_text(json.dumps(record))
+        products = path / f"L2/{number:06d}"
+        products.mkdir(parents=True)
+        verdict = "refly" if number == 2 else "good"
+        (products / "quality.json").write_text(json.dumps({"verdict": verdict}))
+    return path
+
+
+def run(*arguments: str, status: int = 0) -> dict:
+    done = CliRunner().invoke(app, ["catalog", *arguments, "--json"])
+    assert done.exit_code == status, done.output + repr(done.exception)
+    return json.loads(done.stdout)
+
+
+@pytest.fixture
+def season(tmp_path: Path) -> Path:
+    for name, count, longitude in (("a", 4, 16.0), ("b", 3, 17.0)):
+        lay_out(tmp_path / "missions", name, count, longitude)
+    done = run("build", str(tmp_path / "season"), str(tmp_path / "missions"))
+    assert (done["missions"], done["exposures"], done["failures"]) == (2, 7, [])
+    return tmp_path / "season"
+
+
+def numbers(season: Path, *conditions: str) -> list[tuple[str, int]]:
+    found = run("query", str(season), *conditions)["exposures"]
+    return [(one["mission"], one["exposure"]) for one in found]
+
+
+ALL = [("a", 1), ("a", 2), ("a", 3), ("a", 4), ("b", 1), ("b", 2), ("b", 3)]
+
+
+def test_both_tables_hold_what_the_records_state(season: Path) -> None:
+    table = geopandas.read_parquet(season / "exposures.parquet")
+    package = pyogrio.read_dataframe(season / "exposures.gpkg")
+    for one in (table, package):
+        assert one.crs.to_epsg() == 4326 and len(one) == 7
+        assert list(zip(one["mission"], one["exposure"], strict=True)) == ALL
+        assert list(one["verdict"]) == ["good", "refly", "good", "good", "good", "refly", "good"]
+    first = table.iloc[0]
+    assert first["gps_ns"] == EPOCH_NS + 60_000_000_000
+    assert package["gps_ns"][0] == str(EPOCH_NS + 60_000_000_000)
+    assert first["utc"].timestamp() == pytest.approx((EPOCH_NS + 6e10) * 1e-9 + 315_964_800 - 18)
+    assert first["gsd_m"] == pytest.approx(1000.0 * 7.2e-3 / 100.0)
+    assert first["frame_sha256"] == f"SU00:{1:064x}" and first["sensors"] == "SU00"
+    # 64 x 48 px of 7.2 um at 100 mm, 1000 m above the ground, about the point below.
+    metric = table.geometry.to_crs(32633)
+    assert metric[0].area == pytest.approx((64 * 0.072) * (48 * 0.072), rel=0.01)
+    assert table.geometry[1].centroid.x == pytest.approx(16.01, abs=1e-6)
+    assert table.geometry[3] is None, "without an attitude there is no footprint"
+    metadata = pyarrow.parquet.read_schema(season / "exposures.parquet").metadata
+    assert json.loads(metadata[b"geo"])["primary_column"] == "geometry"
+
+
+def test_stac_clients_read_the_catalog(season: Path) -> None:
+    catalog = pystac.Catalog.from_file(str(season / "catalog.json"))
+    children = list(catalog.get_children())
+    assert [one.id for one in children] == ["a", "b"]
+    items = [item for one in children for item in one.get_items()]
+    assert [item.id for item in items] == [
+        "a-000001",
+        "a-000002",
+        "a-000003",
+        "b-000001",
+        "b-000002",
+    ]
+    for file in season.glob("*/*.json"):
+        content = json.loads(file.read_text())
+        assert problems(content) == [], file
+    assert Path(items[0].assets["record"].href).is_file()
+
+
+def test_queries_by_place_time_and_quality(season: Path, tmp_path: Path) -> None:
+    assert numbers(season) == ALL
+    assert numbers(season, "--bbox", "16.005", "46.9", "16.025", "47.1") == [("a", 2), ("a", 3)]
+    ring = [[16.995, 46.9], [17.005, 46.9], [17.005, 47.1], [16.995, 47.1], [16.995, 46.9]]
+    polygon = tmp_path / "block.geojson"
+    polygon.write_text(json.dumps({"type": "Polygon", "coordinates": [ring]}))
+    assert numbers(season, "--polygon", str(polygon)) == [("b", 1)]
+    utc = [one["utc"] for one in run("query", str(season), "--mission", "a")["exposures"]]
+    assert numbers(season, "--mission", "a", "--since", utc[1], "--until", utc[2]) == [
+        ("a", 2), ("a", 3),
+    ]  # fmt: skip
+    assert numbers(season, "--verdict", "refly") == [("a", 2), ("b", 2)]
+    assert numbers(season, "--gsd-max", "0.0719") == []
+    assert numbers(season, "--gsd-max", "0.0721") == ALL
+    sun = geopandas.read_parquet(season / "exposures.parquet")["sun_elevation_deg"]
+    limit = str(sun.sort_values().iloc[3])
+    assert len(numbers(season, "--sun-min", limit)) == 4
+    assert not math.isnan(sun.max())
+
+
+def test_a_selection_is_what_process_takes(season: Path, tmp_path: Path) -> None:
+    done = CliRunner().invoke(
+        app, ["catalog", "query", str(season), "--verdict", "refly", "--commands"]
+    )
+    lines = [shlex.split(line) for line in done.stdout.splitlines()]
+    places = [str(tmp_path / "missions" / name) for name in ("a", "b")]
+    assert lines == [["syntopic", "process", place, "--only", "2"] for place in places]
+
+
+def test_a_bucket_and_a_folder_give_the_same_rows(
+    season: Path, tmp_path: Path, mission: Mission, store
+) -> None:
+    url = store()
+    transfer_to_store(mission, ObjectStore(url))
+    local = run("build", str(tmp_path / "local"), str(mission.path))
+    remote = run("build", str(tmp_path / "remote"), url)
+    assert local["exposures"] == remote["exposures"] == 8
+    tables = [
+        geopandas.read_parquet(tmp_path / name / "exposures.parquet").drop(columns="place")
+        for name in ("local", "remote")
+    ]
+    assert tables[0].equals(tables[1])
+    one = run("build", str(tmp_path / "one"), f"{url}/{mission.id}", str(tmp_path / "missions"))
+    assert (one["missions"], one["exposures"]) == (3, 15)
+
+
+def test_a_damaged_mission_is_stated_and_the_others_are_there(season: Path, tmp_path: Path) -> None:
+    (tmp_path / "missions/a/rig.toml").write_text("broken")
+    record = tmp_path / "missions/b/L0/000001/exposure.json"
+    record.write_text(record.read_text()[:40])
+    done = run("build", str(season), status=1)
+    assert (done["missions"], done["exposures"]) == (1, 2)
+    assert len(done["failures"]) == 2
+    assert str(tmp_path / "missions/a") in done["failures"][0]
+    assert "000001" in done["failures"][1]
+
+
+def test_the_same_mission_at_two_places_counts_once(season: Path, tmp_path: Path) -> None:
+    lay_out(tmp_path / "copy", "a", 4, 16.0)
+    done = run("build", str(season), str(tmp_path / "missions"), str(tmp_path / "copy"), status=1)
+    assert done["exposures"] == 7 and "the same mission" in done["failures"][0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (("build", "{tmp}/missions", "{tmp}/missions"), "no catalog"),
+        (("build", "{tmp}/new"), "no place is given"),
+        (("build", "{tmp}/new", "{tmp}/nothing"), "no mission"),
+        (("query", "{tmp}/missions"), "catalog build"),
+        (("query", "{tmp}/season", "--since", "yesterday"), "write it as"),
+        (("query", "{tmp}/season", "--polygon", "{tmp}/missions/a/rig.toml"), "no polygon"),
+    ],
+)
+def test_what_cannot_be_done_is_refused_in_a_sentence(
+    season: Path, tmp_path: Path, arguments: tuple[str, ...], sentence: str
+) -> None:
+    done = CliRunner().invoke(app, ["catalog", *(a.format(tmp=tmp_path) for a in arguments)])
+    assert done.exit_code != 0 and sentence in str(done.exception), done.exception
+    assert (tmp_path / "missions/a/L0").is_dir()
