@@ -58,7 +58,7 @@ SENTENCES = {
         "the token file is complete; run `syntopic token list` to see whether it was changed"
     ),
     **dict.fromkeys(("report", "adjust", "triangulate", "orient", "intersect"), _COMPLETE_FILES),
-    **dict.fromkeys(("calibrate", "import", "export", "rigs show"), _COMPLETE_FILES),
+    **dict.fromkeys(("calibrate", "catalog", "import", "export", "rigs show"), _COMPLETE_FILES),
 }
 """By the name of a command, or of a group whose commands have none of their own."""
 
