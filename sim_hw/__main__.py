@@ -53,7 +53,7 @@ def parser() -> argparse.ArgumentParser:
     add("--probe", choices=PROBES, default="modbus", help="kind of the thermometer")
     add("--first-address", default="127.0.0.2", help="loopback address of the first head")
     add("--scene", help="a GeoTIFF to fly over instead of the shipped photographs")
-    add("--ground", choices=list(GROUNDS), default="landscape", help="what is flown over")
+    add("--ground", choices=list(GROUNDS), default="land", help="what is flown over")
     add("--still", action="store_true", help="render one exposure, and send it for every pulse")
     add("--digests", action="store_true", help="write the SHA-256 of every frame to OUT/sent")
     add("--scene-cache", type=Path, help="folder where built scenes are kept (default: OUT/scenes)")

@@ -69,6 +69,7 @@ TABLE: Final = {
         _command("process", _GROUND, "Process exposures again, Level-0 to Level-2."),
         _command("worker", _GROUND, "Join a cluster with the cores of this machine."),
         _command("pansharpen", _GROUND, "Compute Level-3: pansharpened RGB and CIR images."),
+        _command("orthomosaic", _GROUND, "Compute the orthomosaic from the stitched images."),
         _command(
             "replay", _GROUND, "Replay a recorded flight through the code and compare hashes."
         ),

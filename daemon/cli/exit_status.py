@@ -51,6 +51,7 @@ PROBLEMS: Final = {
     "replay": "a result differs from the recorded one",
     "orient": "the orientation of an exposure cannot be computed",
     "triangulate": "the block cannot be adjusted, or a photograph has no orientation",
+    "orthomosaic": "an image could not be read, or the block has no orthomosaic",
     "intersect": "no point can be intersected",
     "export": "the mission cannot be read, or a file could not be written",
     "import": "the input cannot be read or is inconsistent",

@@ -34,6 +34,10 @@ SENTENCES = {
         f"the images computed so far are complete and all others are as before; {RETRY_HINT} to "
         "compute the others"
     ),
+    "orthomosaic": (
+        f"the tiles computed so far are kept and an earlier orthomosaic is as before; {RETRY_HINT} "
+        "to continue"
+    ),
     "repair": f"every step done so far is complete; {RETRY_HINT} to finish",
     "transfer": (
         "every file copied so far is complete, and nothing is removed before the copy is sealed; "

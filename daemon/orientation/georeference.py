@@ -11,7 +11,9 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import pyproj
+from numpy.typing import NDArray
 from pyproj.transformer import TransformerGroup
 
 from daemon import DaemonError
@@ -107,6 +109,13 @@ class Georeference:
             east_m, north_m, height_m, direction="INVERSE"
         )
         return float(longitude), float(latitude)
+
+    def geodetic(self, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Latitude, longitude, deg, and ellipsoidal height, m, (n, 3), of points in the system."""
+        longitude, latitude, height = self._transformer.transform(
+            points_m[:, 0], points_m[:, 1], points_m[:, 2], direction="INVERSE"
+        )
+        return np.stack([latitude, longitude, height], axis=-1)
 
     def _transform(
         self, longitude_deg: float, latitude_deg: float, height_m: float

@@ -33,7 +33,8 @@ class GroundType:
     """A kind of ground.
 
     `light` is the illumination against what the exposure was planned for; `moves` that there is
-    traffic; `over_land` that the painter changes a landscape and does not make all of the picture.
+    traffic; `over_land` that the painter changes a landscape and does not make all of the picture;
+    `arranged` that the patches of the photographs are arranged to look like land.
     """
 
     description: str
@@ -41,6 +42,7 @@ class GroundType:
     light: float = 1.0
     moves: bool = False
     over_land: bool = False
+    arranged: bool = False
 
 
 def _landscape(picture: Picture, sample_m: float, random: np.random.Generator) -> Picture:
@@ -176,6 +178,9 @@ def motorways_px(width_px: int) -> tuple[float, float]:
 
 
 GROUNDS: Mapping[str, GroundType] = {
+    "land": GroundType(
+        "open ground and woods from photographs", _landscape, over_land=True, arranged=True
+    ),
     "landscape": GroundType(
         "fields, villages and woods from photographs", _landscape, over_land=True
     ),

@@ -1,8 +1,9 @@
 """Image quilting: one large picture out of patches of a few photographs, at full sharpness.
 
-Patches are drawn without replacement from (source cell, one of eight orientations) and joined by
+Patches, each a cell of a photograph in one of eight orientations and used once, are joined by
 minimum-error boundary cuts, after Efros and Freeman, Image Quilting for Texture Synthesis and
-Transfer, 2001; nothing is blended, so nothing is blurred. Radiometry of a scene is in `scene`.
+Transfer, 2001; nothing is blended, so nothing is blurred. They are drawn one after another, or
+arranged by `quilt_layout` and levelled by `quilt_levelling`. Radiometry of a scene is in `scene`.
 """
 
 from __future__ import annotations
@@ -15,6 +16,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_hw.world import quilt_layout, quilt_levelling
+
 Picture = NDArray[np.uint16]
 """Shape (height, width, bands)."""
 
@@ -25,7 +28,15 @@ THUMB = 16
 CANDIDATES = 160
 MIN_REPEAT_DISTANCE = 2
 """A cell is not used again, in whatever orientation, within this many patches."""
+PAINT_STEP = 4
+PAINT_RATIO = 1.25
+PAINT_LEVEL = 6000
+PAINT_SAMPLES = 25
+PAINT_COST = 4.0
+"""Of a patch with painted lines, in medians of the cost of two neighbours: used last."""
 ORIENTATIONS = 8
+_TURNS = (cv2.ROTATE_90_COUNTERCLOCKWISE, cv2.ROTATE_180, cv2.ROTATE_90_CLOCKWISE)
+_SIDES = ("left", "right", "top", "bottom")
 
 
 @dataclass(frozen=True)
@@ -44,16 +55,28 @@ class ImagePatch:
 
 @dataclass(frozen=True)
 class Quilt:
-    """A plan of patches, row by row. `reused` counts patches that had to be taken a second time."""
+    """A plan of patches, row by row.
+
+    `reused` counts patches that had to be taken a second time; `gains` are those of the corners of
+    every patch, (rows, columns, 2, 2, bands).
+    """
 
     rows: tuple[tuple[ImagePatch, ...], ...]
     reused: int
+    gains: NDArray[np.float32] | None = None
 
 
 def oriented(picture: NDArray[np.generic], orientation: int) -> NDArray[np.generic]:
     """One of the eight orientations of a square: quarter turns, then mirrored."""
     rotated = np.rot90(picture, orientation % 4)
     return rotated[:, ::-1] if orientation >= 4 else rotated
+
+
+def _turned(cell: Picture, orientation: int) -> Picture:
+    """As `oriented`, a copy."""
+    turned = cell if orientation % 4 == 0 else cv2.rotate(cell, _TURNS[orientation % 4 - 1])
+    flipped = cv2.flip(turned, 1) if orientation >= 4 else turned
+    return np.asarray(np.ascontiguousarray(flipped), dtype=np.uint16)
 
 
 def patches_of(sources: Sequence[Picture]) -> list[ImagePatch]:
@@ -74,7 +97,10 @@ def patches_of(sources: Sequence[Picture]) -> list[ImagePatch]:
 def plan_quilt(
     sources: Sequence[Picture], *, height_px: int, width_px: int, random: np.random.Generator
 ) -> Quilt:
-    """Choose patches: each the best match to its neighbours of candidates drawn at random."""
+    """Choose patches row by row: each fits best of candidates drawn at random.
+
+    The ground of most measurements; `plan_land` arranges the patches over the whole picture.
+    """
     step = PATCH_PX - OVERLAP_PX
     rows = -(-(height_px - OVERLAP_PX) // step)
     columns = -(-(width_px - OVERLAP_PX) // step)
@@ -112,6 +138,33 @@ def plan_quilt(
     )
 
 
+def plan_land(
+    sources: Sequence[Picture], *, height_px: int, width_px: int, random: np.random.Generator
+) -> Quilt:
+    """Choose and arrange patches so that neighbours fit, and level them."""
+    step = PATCH_PX - OVERLAP_PX
+    rows = -(-(height_px - OVERLAP_PX) // step)
+    columns = -(-(width_px - OVERLAP_PX) // step)
+    patches = patches_of(sources)
+    edges = _edges(sources, patches)
+    numbers = {cell: k for k, cell in enumerate(dict.fromkeys(p.cell for p in patches))}
+    chosen = quilt_layout.arrange(
+        (rows, columns),
+        _mismatches(edges["right"], edges["left"]),
+        _mismatches(edges["bottom"], edges["top"]),
+        _paint(sources, patches),
+        np.array([numbers[p.cell] for p in patches]),
+        random,
+    )
+    return Quilt(
+        rows=tuple(tuple(patches[i] for i in row) for row in chosen),
+        reused=max(rows * columns - len(patches), 0),
+        gains=quilt_levelling.corner_gains(
+            *(_ends(edges[side], side, sources[0].shape[2])[chosen] for side in _SIDES)
+        ),
+    )
+
+
 def assemble(sources: Sequence[Picture], quilt: Quilt, *, height_px: int, width_px: int) -> Picture:
     """Lay the patches of a plan out and cut them together, shape (height, width, bands)."""
     step = PATCH_PX - OVERLAP_PX
@@ -124,17 +177,16 @@ def assemble(sources: Sequence[Picture], quilt: Quilt, *, height_px: int, width_
             cell = sources[patch.source][
                 patch.row : patch.row + PATCH_PX, patch.column : patch.column + PATCH_PX
             ]
-            new = np.ascontiguousarray(oriented(cell, patch.orientation))
+            new = _turned(cell, patch.orientation)
+            if quilt.gains is not None:
+                new = quilt_levelling.scaled(new, quilt.gains[r, c])
             place = canvas[y : y + PATCH_PX, x : x + PATCH_PX]
-            keep = np.zeros((PATCH_PX, PATCH_PX), dtype=bool)
+            left, top = np.zeros(PATCH_PX, np.int64), np.zeros(PATCH_PX, np.int64)
             if c > 0:
-                seam = least_error_cut(_difference(place[:, :OVERLAP_PX], new[:, :OVERLAP_PX]))
-                keep |= np.arange(PATCH_PX)[None, :] < seam[:, None]
+                left = least_error_cut(_difference(place[:, :OVERLAP_PX], new[:, :OVERLAP_PX]))
             if r > 0:
-                seam = least_error_cut(_difference(place[:OVERLAP_PX], new[:OVERLAP_PX]).T)
-                keep |= np.arange(PATCH_PX)[:, None] < seam[None, :]
-            np.copyto(new, place, where=keep[:, :, None])
-            place[...] = new
+                top = least_error_cut(_difference(place[:OVERLAP_PX], new[:OVERLAP_PX]).T)
+            _lay(place, new, left, top)
     return canvas[:height_px, :width_px]
 
 
@@ -166,11 +218,28 @@ def _cut(error: NDArray[np.float32]) -> NDArray[np.int64]:
     return path
 
 
+@numba.njit(cache=True, nogil=True, fastmath=True)
+def _lay(place: Picture, new: Picture, left: NDArray[np.int64], top: NDArray[np.int64]) -> None:
+    """Write a patch right of its left cut and below its upper one."""
+    rows, columns, bands = new.shape
+    for i in range(rows):
+        for j in range(left[i], columns):
+            if i >= top[j]:
+                for k in range(bands):
+                    place[i, j, k] = new[i, j, k]
+
+
+@numba.njit(cache=True, nogil=True, fastmath=True)
 def _difference(a: Picture, b: Picture) -> NDArray[np.float32]:
     """Squared difference of two overlaps as the eye sees it: of square roots of radiance."""
-    roots = [cv2.sqrt(np.ascontiguousarray(p).astype(np.float32)) for p in (a, b)]
-    difference = roots[0] - roots[1]
-    return np.asarray(np.einsum("ijk,ijk->ij", difference, difference), dtype=np.float32)
+    rows, columns, bands = a.shape
+    out = np.zeros((rows, columns), np.float32)
+    for i in range(rows):
+        for j in range(columns):
+            for k in range(bands):
+                root = np.sqrt(np.float32(a[i, j, k])) - np.sqrt(np.float32(b[i, j, k]))
+                out[i, j] += root * root
+    return out
 
 
 def _edges(
@@ -179,9 +248,7 @@ def _edges(
     """The four overlap strips of every patch on thumbnails, shape (patches, values)."""
     size = PATCH_PX // THUMB
     width = OVERLAP_PX // THUMB
-    strips: dict[str, list[NDArray[np.float32]]] = {
-        k: [] for k in ("left", "right", "top", "bottom")
-    }
+    strips: dict[str, list[NDArray[np.float32]]] = {k: [] for k in _SIDES}
     cells: dict[tuple[int, int, int], NDArray[np.float32]] = {}
     for patch in patches:
         if patch.cell not in cells:
@@ -200,6 +267,40 @@ def _edges(
     return {side: np.stack(values) for side, values in strips.items()}
 
 
+def _mismatches(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Squared differences of all strips of one side (n, values) to all of the other, (n, n)."""
+    squares = np.sum(first**2, axis=1)[:, None] + np.sum(second**2, axis=1)[None, :]
+    return np.asarray(np.maximum(squares - 2.0 * first @ second.T, 0.0), dtype=np.float32)
+
+
 def _mismatch(candidates: NDArray[np.float32], placed: NDArray[np.float32]) -> NDArray[np.float64]:
     difference = candidates - placed
     return np.asarray(np.einsum("ij,ij->i", difference, difference), dtype=np.float64)
+
+
+def _paint(sources: Sequence[Picture], patches: Sequence[ImagePatch]) -> NDArray[np.float32]:
+    """Cost of patches with the coloured survey lines of the photographs, (patches,)."""
+    found = []
+    for source in sources:
+        small = source[::PAINT_STEP, ::PAINT_STEP].astype(np.float32)
+        red, green, blue = (small[..., k] for k in range(3))
+        pink = np.minimum(red, blue) > PAINT_RATIO * green
+        turquoise = np.minimum(green, blue) > PAINT_RATIO * red
+        found.append((pink | turquoise) & (blue > PAINT_LEVEL))
+    painted = []
+    for patch in patches:
+        r, c, size = (n // PAINT_STEP for n in (patch.row, patch.column, PATCH_PX))
+        painted.append(found[patch.source][r : r + size, c : c + size].sum())
+    return np.where(np.array(painted) >= PAINT_SAMPLES, PAINT_COST, 0.0).astype(np.float32)
+
+
+def _ends(strips: NDArray[np.float32], side: str, bands: int) -> NDArray[np.float32]:
+    """Logarithm of the mean radiance at both ends of the strips of a side, (n, 2, bands)."""
+    size, width = PATCH_PX // THUMB, OVERLAP_PX // THUMB
+    if side in ("left", "right"):
+        along = strips.reshape(-1, size, width, bands).mean(axis=2)
+    else:
+        along = strips.reshape(-1, width, size, bands).mean(axis=1)
+    third = size // 3
+    ends = np.stack([along[:, :third].mean(axis=1), along[:, -third:].mean(axis=1)], axis=1)
+    return np.asarray(2.0 * np.log(np.maximum(ends, 1.0)), dtype=np.float32)

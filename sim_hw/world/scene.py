@@ -156,7 +156,8 @@ def _quilted(settings: SceneSettings) -> tuple[quilting.Picture, int, int]:
     """A landscape of the shipped photographs, its patches, and those used again."""
     sources = [radiance(path) for path in shipped_pictures()]
     size = {"height_px": settings.height_px, "width_px": settings.width_px}
-    quilt = quilting.plan_quilt(sources, **size, random=random_stream(settings.seed, "quilt"))
+    plan = quilting.plan_land if GROUNDS[settings.ground].arranged else quilting.plan_quilt
+    quilt = plan(sources, **size, random=random_stream(settings.seed, "quilt"))
     return quilting.assemble(sources, quilt, **size), sum(map(len, quilt.rows)), quilt.reused
 
 
@@ -200,7 +201,7 @@ def emulated_nir(rgb: NDArray[np.float32]) -> NDArray[np.float32]:
 
     Made from the other three bands, so it holds no information of its own.
     """
-    red, green, blue = (rgb[..., i] for i in range(3))
+    red, green, blue = (np.ascontiguousarray(rgb[..., i]) for i in range(3))
     excess_green = (2 * green - red - blue) / (red + green + blue + 0.02)
     vegetation = np.clip(excess_green * 4.0, 0.0, 1.0)
     soil = 0.9 * red + 0.2 * green

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sim_hw.world import quilting, spline
+from sim_hw.world import quilt_layout, quilt_levelling, quilting, spline
 from sim_hw.world.scene import (
     UNIT,
     SceneError,
@@ -25,35 +25,40 @@ from sim_hw.world.seeding import random_stream
 SETTINGS = SceneSettings(seed=1, width_px=1500, height_px=1200, sample_m=0.2, colour_ratio=3)
 
 
+PLANS = pytest.mark.parametrize("plan", [quilting.plan_quilt, quilting.plan_land])
+
+
 @pytest.fixture(scope="module")
 def sources() -> list[quilting.Picture]:
     return [radiance(path) for path in shipped_pictures()]
 
 
-def test_a_line_of_the_small_rig_repeats_no_patch(sources: list[quilting.Picture]) -> None:
-    quilt = quilting.plan_quilt(
-        sources, height_px=13623, width_px=4246, random=random_stream(1, "quilt")
-    )
+@PLANS
+def test_a_line_of_the_small_rig_repeats_no_patch(plan, sources: list[quilting.Picture]) -> None:
+    quilt = plan(sources, height_px=13623, width_px=4246, random=random_stream(1, "quilt"))
     used = [patch for row in quilt.rows for patch in row]
     assert len(used) == len(set(used)) == 43 * 14
     assert quilt.reused == 0
 
 
-def test_one_cell_is_not_used_twice_near_itself(sources: list[quilting.Picture]) -> None:
-    quilt = quilting.plan_quilt(
-        sources, height_px=13623, width_px=4246, random=random_stream(1, "quilt")
-    )
-    for row in quilt.rows:
-        for left, right in pairwise(row):
-            assert left.cell != right.cell
+@PLANS
+def test_one_cell_is_not_used_twice_near_itself(plan, sources: list[quilting.Picture]) -> None:
+    quilt = plan(sources, height_px=13623, width_px=4246, random=random_stream(1, "quilt"))
+    for upper, lower in pairwise(quilt.rows):
+        for one, right in pairwise(upper):
+            assert one.cell != right.cell
+        for one, below in zip(upper, lower, strict=True):
+            assert one.cell != below.cell
 
 
-def test_every_sample_is_one_of_a_source_and_none_is_a_blend() -> None:
+@PLANS
+def test_every_sample_is_one_of_a_source_and_none_is_a_blend(plan) -> None:
     random = np.random.default_rng(0)
     # Two sources of values no other holds: a blend of them would be seen at once.
     low = random.integers(0, 1000, (800, 800, 4), dtype=np.uint16)
     high = random.integers(60000, 61000, (800, 800, 4), dtype=np.uint16)
-    quilt = quilting.plan_quilt([low, high], height_px=1400, width_px=1400, random=random)
+    quilt = plan([low, high], height_px=1400, width_px=1400, random=random)
+    quilt = replace(quilt, gains=None)
     picture = quilting.assemble([low, high], quilt, height_px=1400, width_px=1400)
     assert picture.shape == (1400, 1400, 4)
     assert np.all((picture < 1000) | (picture >= 60000))
@@ -83,6 +88,65 @@ def test_patches_meet_better_at_a_seam_than_by_chance(sources: list[quilting.Pic
         ]
     )
     assert seam < straight
+
+
+def test_neighbours_fit_and_are_of_one_brightness(sources: list[quilting.Picture]) -> None:
+    """A patch differs from its neighbours by far less than from any other; levelling helps."""
+    size = {"height_px": 2288, "width_px": 2288}
+    quilt = quilting.plan_land(sources, **size, random=random_stream(1, "quilt"))
+    step = quilting.PATCH_PX - quilting.OVERLAP_PX
+    differences = []
+    for gains in (quilt.gains, None):
+        picture = quilting.assemble(sources, replace(quilt, gains=gains), **size)
+        tiles = picture[: 7 * step, : 7 * step, 1].reshape(7, step, 7, step).astype(np.float64)
+        # Strips on both sides of a seam, past the reach of its cut.
+        left = np.log(tiles[..., 316:318].mean(axis=(1, 3)))[:, :-1]
+        right = np.log(tiles[..., 50:52].mean(axis=(1, 3)))[:, 1:]
+        differences.append(np.sqrt(np.mean((left - right) ** 2)))
+        spread = np.log(tiles.mean(axis=(1, 3))).std()
+    levelled, plain = differences
+    assert levelled < plain < 1.5 * spread
+
+
+def test_levelling_keeps_the_borders_of_the_ground_and_evens_out_the_light() -> None:
+    """Four patches in a row: light of +-10 %, and a border to ground half as bright."""
+    signal = np.log(np.array([1.1, 0.9, 0.45, 0.5], np.float32)).reshape(1, 4, 1, 1)
+    side = np.broadcast_to(signal, (1, 4, 2, 1))
+    none = np.zeros((1, 4, 2, 1), np.float32)
+    gains = quilt_levelling.corner_gains(side, side, none, none)[0, ..., 0]
+    level = gains * np.exp(signal[0])
+    seams = level[1:, :, 0] / level[:-1, :, 1]
+    assert seams[0] == pytest.approx([1.0, 1.0], abs=0.06)
+    assert seams[2] == pytest.approx([1.0, 1.0], abs=0.06)
+    assert (seams[1] < 0.65).all()
+
+
+def test_gains_are_bilinear_and_saturate() -> None:
+    patch = np.full((5, 5, 2), 40000, np.uint16)
+    corners = np.array([[[1.0, 1.0], [2.0, 0.5]], [[0.5, 1.0], [1.0, 0.5]]], np.float32)
+    found = quilt_levelling.scaled(patch, corners)
+    assert found[0, :, 0].tolist() == [40000, 50000, 60000, 65535, 65535]
+    assert found[4, :, 0].tolist() == [20000, 25000, 30000, 35000, 40000]
+    assert found[:, 2, 1].tolist() == [30000] * 5
+
+
+def test_an_arrangement_finds_the_only_order_that_fits() -> None:
+    """Patches whose right edge fits one left edge alone, in a row."""
+    n = 6
+    right_of = np.ones((n, n), np.float32)
+    right_of[np.arange(n - 1), np.arange(1, n)] = 0.0
+    order = quilt_layout.arrange(
+        (1, n), right_of, np.ones((n, n), np.float32), np.zeros(n, np.float32),
+        np.arange(n), np.random.default_rng(3),
+    )  # fmt: skip
+    assert order.tolist() == [list(range(n))]
+
+
+def test_costly_patches_are_left_out_as_long_as_there_are_others() -> None:
+    own = np.array([0.0, 9.0, 0.0, 0.0, 9.0, 0.0], np.float32)
+    same = np.ones((6, 6), np.float32)
+    order = quilt_layout.arrange((2, 2), same, same, own, np.arange(6), np.random.default_rng(0))
+    assert sorted(order.ravel()) == [0, 2, 3, 5]
 
 
 def test_a_scene_is_built_once_and_found_again(tmp_path: Path) -> None:

@@ -1,0 +1,1 @@
+"""Orthomosaic of a mission after landing."""

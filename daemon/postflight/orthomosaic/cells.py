@@ -1,0 +1,207 @@
+"""Survey of a block in cells: what every image shows of each, which image is nearest to it, gains.
+
+A cell is a block of ground pixels. Every cell is taken from one image, so that seams follow the
+borders of cells.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon.postflight.orthomosaic.inputs import OrthoBlock, OrthoImage
+from daemon.postflight.orthomosaic.pixels import image_pixels
+from processing.image.orthoimage.ground_grid import GroundGrid
+from processing.image.orthoimage.ground_resampling import reduced_image, resample_to_ground
+from processing.image.orthoimage.levelling import GainField, ImageLevels, level_block, levelled
+
+Array = NDArray[Any]
+
+CELL_PX: Final = 16
+BLOCK_CELLS: Final = 4
+"""Cells along a block whose mean signal is levelled."""
+SEAM_MAX: Final = 0.5
+"""Seam steps beyond this show moving things; they do not count in the figures."""
+
+
+@dataclass(frozen=True)
+class CellSurvey:
+    """Seams and gains of a block.
+
+    Attributes:
+        owner: (rows, columns) int32, index of the image each cell is taken from, -1 where none
+            covers it whole.
+        gains: of each image, by bands as in `bands`.
+        bands: "pan" first.
+        seam_rms: relative step across seams, RMS, by band, before and after levelling.
+    """
+
+    owner: Array
+    gains: tuple[GainField, ...]
+    bands: tuple[str, ...]
+    seam_rms: dict[str, tuple[float | None, float | None]]
+
+
+def cell_grid(grid: GroundGrid) -> GroundGrid:
+    """Grid of the cells of a grid."""
+    return grid.coarser(CELL_PX)
+
+
+def survey(
+    block: OrthoBlock,
+    bands: Sequence[str],
+    *,
+    level: bool = True,
+    threads: int = 1,
+    progress: Callable[[int], None] = lambda _done: None,
+) -> CellSurvey:
+    """Look at every image once: which cells it covers, and with what signal.
+
+    Args:
+        block: images, poses and grid.
+        bands: "pan", and colour bands that every image has.
+        level: whether gains are computed; else they are one.
+        threads: images looked at simultaneously.
+        progress: called with the count of images done.
+
+    Raises:
+        RasterError, OSError: an image cannot be read.
+    """
+    grid = cell_grid(block.grid)
+    owner = np.full((grid.height_px, grid.width_px), -1, np.int32)
+    nearest = np.full(owner.shape, np.inf, np.float32)
+    found: list[ImageLevels] = []
+
+    def look(image: OrthoImage) -> tuple[tuple[int, int], Array]:
+        return _cells_of(block, image, bands, grid)
+
+    with ThreadPoolExecutor(threads) as pool:
+        for k, (place, cells) in enumerate(pool.map(look, block.images)):
+            row, column = place
+            height, width = cells.shape[1:]
+            part = np.s_[row : row + height, column : column + width]
+            distance = _nadir_distance(block.images[k], grid.window(column, row, width, height))
+            mine = (cells[0] > 0.0) & (distance < nearest[part])
+            owner[part][mine] = k
+            nearest[part][mine] = distance[mine]
+            found.append(_levels(place, cells))
+            progress(k + 1)
+    blocks = owner[BLOCK_CELLS // 2 :: BLOCK_CELLS, BLOCK_CELLS // 2 :: BLOCK_CELLS]
+    shape = tuple(-(-n // BLOCK_CELLS) for n in owner.shape)
+    taken = np.full(shape, -1, np.int32)
+    taken[: blocks.shape[0], : blocks.shape[1]] = blocks
+    gains = level_block(found, taken)
+    if not level:
+        gains = tuple(_flat(one) for one in gains)
+    before = _seam_steps(found, [one.log_signal for one in found], taken)
+    after = _seam_steps(
+        found, [levelled(one, gain) for one, gain in zip(found, gains, strict=True)], taken
+    )
+    steps = {name: (before[k], after[k]) for k, name in enumerate(bands)}
+    return CellSurvey(owner, gains, tuple(bands), steps)
+
+
+def _cells_of(
+    block: OrthoBlock, image: OrthoImage, bands: Sequence[str], grid: GroundGrid
+) -> tuple[tuple[int, int], Array]:
+    """First row and column, a multiple of `BLOCK_CELLS`, and means of cells (bands, h, w)."""
+    pose = image.pose
+    reach = np.hypot(pose.width_px, pose.height_px) * block.grid.gsd_m * 0.75
+    row = int((grid.north_m - image.nadir_m[1] - reach) / grid.gsd_m)
+    column = int((image.nadir_m[0] - reach - grid.east_m) / grid.gsd_m)
+    side = int(2 * reach / grid.gsd_m) + BLOCK_CELLS
+    row, column = (max(n, 0) // BLOCK_CELLS * BLOCK_CELLS for n in (row, column))
+    height, width = min(side, grid.height_px - row), min(side, grid.width_px - column)
+    part = grid.window(column, row, width, height)
+    # Cells are as large as this many pixels of the image.
+    factor = max(round(grid.gsd_m / _pixel_m(block, image)), 1)
+    small = reduced_image(image_pixels(block, image, bands), factor)
+    cells = resample_to_ground(
+        small, pose.reduced(factor), block.surface(part), interpolation="bilinear"
+    )
+    # The reduced image has data where all its pixels have; a cell reaches half of one further.
+    whole = _shrunk(np.asarray((cells > 0.0).all(axis=0)))
+    cells[:, ~whole] = 0.0
+    return _cropped((row, column), cells)
+
+
+def _pixel_m(block: OrthoBlock, image: OrthoImage) -> float:
+    ground = block.ground.surface
+    level = ground if isinstance(ground, float) else float(np.nanmean(ground.height_m))
+    return (image.height_m - level) * block.image.pitch_mm / block.image.f_mm
+
+
+def _shrunk(mask: Array) -> Array:
+    """Without the outermost cells."""
+    padded = np.pad(mask, 1)
+    return np.asarray(
+        padded[1:-1, 1:-1] & padded[:-2, 1:-1] & padded[2:, 1:-1] & padded[1:-1, :-2]
+        & padded[1:-1, 2:]
+    )  # fmt: skip
+
+
+def _cropped(place: tuple[int, int], cells: Array) -> tuple[tuple[int, int], Array]:
+    """The part with data, beginning at a multiple of `BLOCK_CELLS`."""
+    rows, columns = np.nonzero(cells[0])
+    if not len(rows):
+        return place, cells[:, :BLOCK_CELLS, :BLOCK_CELLS]
+    r, c = (int(n.min()) // BLOCK_CELLS * BLOCK_CELLS for n in (rows, columns))
+    cut = cells[:, r : int(rows.max()) + 1, c : int(columns.max()) + 1]
+    return (place[0] + r, place[1] + c), np.ascontiguousarray(cut)
+
+
+def _nadir_distance(image: OrthoImage, grid: GroundGrid) -> Array:
+    """Distance of cells from below the camera, (h, w), m."""
+    east, north = image.nadir_m
+    d = np.hypot((grid.rows_m - north)[:, None], (grid.columns_m - east)[None, :])
+    return np.asarray(d, dtype=np.float32)
+
+
+def _levels(place: tuple[int, int], cells: Array) -> ImageLevels:
+    """Means of blocks of cells that an image covers whole."""
+    bands, height, width = cells.shape
+    rows, columns = -(-height // BLOCK_CELLS), -(-width // BLOCK_CELLS)
+    padded = np.zeros((bands, rows * BLOCK_CELLS, columns * BLOCK_CELLS), np.float32)
+    padded[:, :height, :width] = cells
+    parts = padded.reshape(bands, rows, BLOCK_CELLS, columns, BLOCK_CELLS)
+    whole = (parts > 0.0).all(axis=(0, 2, 4))
+    means = np.log(np.maximum(parts.mean(axis=(2, 4)), 1e-3))
+    means[:, ~whole] = np.nan
+    return ImageLevels(place[0] // BLOCK_CELLS, place[1] // BLOCK_CELLS, means)
+
+
+def _flat(gain: GainField) -> GainField:
+    return GainField(gain.row, gain.column, gain.step, np.zeros_like(gain.log_gain))
+
+
+def _seam_steps(
+    images: Sequence[ImageLevels], signals: Sequence[Array], owner: Array
+) -> list[float | None]:
+    """RMS difference of both images of a seam in the blocks along it, relative, by band."""
+    bands = images[0].log_signal.shape[0]
+    squares, count = np.zeros(bands), 0
+    taken = np.full((bands, *owner.shape), np.nan, np.float32)
+    for k, (one, signal) in enumerate(zip(images, signals, strict=True)):
+        rows, columns = signal.shape[1:]
+        part = np.s_[one.row : one.row + rows, one.column : one.column + columns]
+        mine = owner[part] == k
+        taken[:, *part][:, mine] = signal[:, mine]
+    for k, (one, signal) in enumerate(zip(images, signals, strict=True)):
+        rows, columns = signal.shape[1:]
+        part = np.s_[one.row : one.row + rows, one.column : one.column + columns]
+        own = owner[part]
+        next_to = np.zeros(own.shape, bool)
+        next_to[1:] |= own[:-1] == k
+        next_to[:-1] |= own[1:] == k
+        next_to[:, 1:] |= own[:, :-1] == k
+        next_to[:, :-1] |= own[:, 1:] == k
+        step = np.expm1(signal - taken[:, *part])
+        used = next_to & (own >= 0) & (own != k) & (np.abs(step) < SEAM_MAX).all(axis=0)
+        squares += (step[:, used] ** 2).sum(axis=1)
+        count += int(used.sum())
+    return [float(v) for v in np.sqrt(squares / count)] if count else [None] * bands

@@ -1,0 +1,367 @@
+"""Inputs of an orthomosaic: images with their pose, the ground, and the grid.
+
+Orientations are those of a triangulation, or those delivered with the mission. What an image looks
+like on the ground is computed in `processing.image.orthoimage`.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon import DaemonError
+from daemon.mission.canonical_json import canonical_bytes, sha256_hex
+from daemon.mission.exposure_batch import ExposureFailure, for_each_exposure
+from daemon.mission.layout import Mission
+from daemon.mission.store.level0 import check_tiff, read_description
+from daemon.orientation.elevation import read_elevation
+from daemon.orientation.exterior_orientation import mount_of
+from daemon.orientation.georeference import Georeference
+from daemon.orientation.local_frame import FRAME_FILE, LocalFrame
+from daemon.postflight.adjustment.csv_tables import read_table
+from daemon.postflight.triangulation.triangulation import block_of
+from processing.geometry.orientation import grid_from_enu
+from processing.geometry.rotation import rotation_matrix
+from processing.geometry.terrain_rays import HeightModel
+from processing.image.orthoimage.ground_grid import GroundGrid, GroundSurface, ground_surface
+from processing.image.orthoimage.ground_resampling import ImagePose
+from processing.rig import VirtualImage, load_rig
+
+Array = NDArray[np.float64]
+
+EXTERIOR_FILE: Final = "exterior.csv"
+POINTS_FILE: Final = "adjusted_points.csv"
+_CRS_LINE: Final = re.compile(r"^# Adjusted exterior orientation in ([^\s,]+),")
+_ANGLES: Final = ("omega_deg", "phi_deg", "kappa_deg")
+_PLACE: Final = ("east_m", "north_m", "height_m")
+_ALSO: Final = ("latitude_deg", "longitude_deg", "sx_m", "sy_m", "sz_m", "so_deg", "sp_deg")
+MARKS: Final = ("simulated", "uncalibrated")
+SIDE_MAX_PX: Final = 400_000
+"""A grid with a longer side is refused: the GSD is meant in metres."""
+
+
+class OrthomosaicError(DaemonError, ValueError):
+    """A mission without an orthomosaic; the message states what is missing."""
+
+
+@dataclass(frozen=True)
+class OrthoImage:
+    """A stitched image with its pose in the local frame.
+
+    `colour` are the bands of its colour raster; `marks` what its description marks it as, such as
+    simulated or uncalibrated.
+    """
+
+    name: str
+    exposure: int
+    pose: ImagePose
+    nadir_m: tuple[float, float]
+    height_m: float
+    colour: tuple[str, ...]
+    marks: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Ground:
+    """Heights in the grid's system: a model, or a plane, and what is known of relief over it."""
+
+    surface: HeightModel | float
+    sha256: str
+    relief_rms_m: float | None = None
+
+
+@dataclass(frozen=True)
+class OrthoBlock:
+    """Everything that an orthomosaic is computed from.
+
+    `orientation` is the sentence that states where orientations come from; `failures` are images
+    that cannot be read and are not in the block.
+    """
+
+    mission: Mission
+    image: VirtualImage
+    images: tuple[OrthoImage, ...]
+    georeference: Georeference
+    frame: LocalFrame
+    ground: Ground
+    grid: GroundGrid
+    orientation: str
+    failures: tuple[ExposureFailure, ...]
+
+    @property
+    def marks(self) -> tuple[str, ...]:
+        """Marks of any image; that the mission is simulated is one."""
+        found = {mark for image in self.images for mark in image.marks}
+        if self.mission.is_simulated:
+            found.add("simulated")
+        return tuple(mark for mark in MARKS if mark in found)
+
+    def surface(self, grid: GroundGrid) -> GroundSurface:
+        """Surface under a part of the grid, in the local frame."""
+
+        def cartesian(points_m: Array) -> Array:
+            return self.frame.from_geodetic(*self.georeference.geodetic(points_m).T)
+
+        return ground_surface(grid, self.ground.surface, cartesian)
+
+    def key(self) -> str:
+        """Hash of all inputs; the pixels of Level-2 by size and time of their files."""
+        files = [
+            [image.name, file, status.st_size, str(status.st_mtime_ns)]
+            for image in self.images
+            for file in ("pan.tif", *(("rgbn.tif",) if image.colour else ()))
+            for status in [(self.mission.level2(image.exposure) / file).stat()]
+        ]
+        poses = [[i.name, *i.pose.centre_m.tolist(), *i.pose.rotation.ravel()] for i in self.images]
+        grid = self.grid
+        facts = {
+            "format": 1,
+            "files": files,
+            "poses": [[v if isinstance(v, str) else float(v).hex() for v in p] for p in poses],
+            "crs": self.georeference.name,
+            "ground": self.ground.sha256,
+            "grid": [grid.east_m, grid.north_m, grid.gsd_m, grid.width_px, grid.height_px],
+        }
+        return sha256_hex(canonical_bytes(facts))
+
+
+def block_for_orthomosaic(
+    mission: Mission,
+    *,
+    triangulation: Path | None = None,
+    elevation: Path | None = None,
+    plane_height_m: float | None = None,
+    gsd_m: float | None = None,
+    crs: str | None = None,
+    trajectory_file: Path | None = None,
+    mount_file: Path | None = None,
+) -> OrthoBlock:
+    """Collect the inputs of an orthomosaic.
+
+    Args:
+        triangulation: folder of `syntopic triangulate`; None: the mission's only one, else the
+            delivered orientations.
+        elevation: height model; None: that of the flight, else a plane.
+        plane_height_m: height of a plane in the height system of the grid, in place of a model.
+        gsd_m: of the grid; None: the mean of the images.
+
+    Raises:
+        OrthomosaicError: no stitched images, no orientations, or a ground that does not fit.
+    """
+    rig = load_rig(mission.rig_path)
+    if rig.virtual_image is None:
+        raise OrthomosaicError(
+            f"rig {rig.name} stitches no PAN image; an orthomosaic is made of stitched images"
+        )
+    folder = triangulation or _only_triangulation(mission)
+    if folder is not None:
+        georeference, names, place, angles = _triangulated(folder, crs)
+        orientation = f"adjusted orientations of {folder.name}"
+        failures: tuple[ExposureFailure, ...] = ()
+    else:
+        block = block_of(mission, crs=crs, trajectory_file=trajectory_file, mount_file=mount_file)
+        georeference, failures = Georeference(block.crs), block.failures
+        names = [eo.name for eo in block.oriented]
+        place = np.array([eo.centre_m for eo in block.oriented])
+        angles = np.array([eo.omega_phi_kappa_deg for eo in block.oriented])
+        orientation = (
+            "delivered orientations: the mission has no triangulation. Run syntopic triangulate "
+            "for adjusted ones"
+        )
+    geodetic = georeference.geodetic(place)
+    frame = LocalFrame(float(geodetic[:, 0].mean()), float(geodetic[:, 1].mean()))
+    images, unread = _images(
+        mission, rig.virtual_image, georeference, frame, names, place, geodetic, angles
+    )
+    offset_m = float(np.median(place[:, 2] - geodetic[:, 2]))
+    ground = _ground(mission, georeference, elevation, plane_height_m)
+    if ground is None and folder is not None:
+        ground = _plane_of_points(folder, _frame_of(folder), offset_m)
+    if ground is None:
+        _, plan = mount_of(mission)
+        ground = _plane(plan.ground_height_m + offset_m, None)
+    grid = _grid(images, rig.virtual_image, ground, gsd_m)
+    return OrthoBlock(
+        mission, rig.virtual_image, images, georeference, frame, ground, grid, orientation,
+        (*failures, *unread),
+    )  # fmt: skip
+
+
+def _only_triangulation(mission: Mission) -> Path | None:
+    """The mission's triangulation; several are refused, for they differ."""
+    found = sorted(p.parent for p in mission.export_dir.glob(f"triangulation/*/{EXTERIOR_FILE}"))
+    if len(found) > 1:
+        raise OrthomosaicError(
+            f"{mission.path}: {len(found)} triangulations ({', '.join(p.name for p in found)}); "
+            "name one with --triangulation"
+        )
+    return found[0] if found else None
+
+
+def _triangulated(
+    folder: Path, crs: str | None
+) -> tuple[Georeference, Sequence[str], Array, Array]:
+    """System, names, places (n, 3) and angles (n, 3) deg of adjusted orientations."""
+    file = folder / EXTERIOR_FILE
+    table = read_table(file, ("image", *_PLACE, *_ANGLES), (*_ALSO, "sk_deg"))
+    with file.open(encoding="utf-8") as text:
+        stated = _CRS_LINE.match(text.readline())
+    if stated is None:
+        raise OrthomosaicError(f"{file}: its first line names no coordinate system")
+    if crs is not None and crs != stated[1]:
+        raise OrthomosaicError(
+            f"{folder} is in {stated[1]}, not in {crs}; leave --crs out, or triangulate in {crs}"
+        )
+    names = table.names("image")
+    place = np.array([table.numbers(c) for c in _PLACE]).T.reshape(-1, 3)
+    angles = np.array([table.numbers(c) for c in _ANGLES]).T.reshape(-1, 3)
+    if table.problems or not np.isfinite(place).all() or not np.isfinite(angles).all():
+        raise OrthomosaicError("; ".join(table.problems) or f"{file}: a cell without a number")
+    return Georeference(stated[1]), names, place, angles
+
+
+def _images(
+    mission: Mission,
+    image: VirtualImage,
+    georeference: Georeference,
+    frame: LocalFrame,
+    names: Sequence[str],
+    place: Array,
+    geodetic: Array,
+    angles_deg: Array,
+) -> tuple[tuple[OrthoImage, ...], tuple[ExposureFailure, ...]]:
+    at = {int(name): k for k, name in enumerate(names) if name.isdecimal()}
+    if not at:
+        raise OrthomosaicError(
+            "no orientation is that of a stitched image; an orthomosaic is made of stitched images"
+        )
+    centre = frame.from_geodetic(*geodetic.T)
+
+    def oriented(number: int) -> OrthoImage:
+        k = at[number]
+        check_tiff(
+            mission.level2(number) / "pan.tif", width_px=image.width_px, height_px=image.height_px
+        )
+        latitude, longitude, height = (float(v) for v in geodetic[k])
+        azimuth = georeference.place(latitude, longitude, height).azimuth_of_north_rad
+        enu = grid_from_enu(azimuth).T @ rotation_matrix(*np.radians(angles_deg[k]))
+        rotation = frame.local_from_enu(latitude, longitude) @ enu
+        pose = ImagePose(
+            image.f_mm, image.pitch_mm, image.width_px, image.height_px, centre[k], rotation
+        )
+        east, north, up = (float(v) for v in place[k])
+        described = read_description(mission.level2(number) / "pan.tif")
+        marks = tuple(mark for mark in MARKS if described.get(mark) is True)
+        bands = _bands(mission, number)
+        return OrthoImage(names[k], number, pose, (east, north), up, bands, marks)
+
+    read = for_each_exposure(sorted(at), oriented)
+    if not read.results:
+        causes = "; ".join(f"exposure {one.exposure}: {one.cause}" for one in read.failures)
+        raise OrthomosaicError(f"{mission.path}: no stitched image can be read; {causes}")
+    return tuple(read.results.values()), read.failures
+
+
+def _bands(mission: Mission, number: int) -> tuple[str, ...]:
+    path = mission.level2(number) / "rgbn.tif"
+    if not path.exists():
+        return ()
+    bands = read_description(path).get("bands")
+    return tuple(bands) if isinstance(bands, list) and len(bands) > 1 else ()
+
+
+def _ground(
+    mission: Mission,
+    georeference: Georeference,
+    elevation: Path | None,
+    plane_height_m: float | None,
+) -> Ground | None:
+    """The ground as asked for, else the height model of the flight; None: neither is there."""
+    if elevation is not None and plane_height_m is not None:
+        raise OrthomosaicError("--elevation and --ground-height exclude each other; give one")
+    if plane_height_m is not None:
+        return _plane(plane_height_m, None)
+    _, plan = mount_of(mission)
+    if elevation is None and plan.elevation is not None and plan.elevation.is_file():
+        elevation = plan.elevation
+    if elevation is None:
+        return None
+    model = read_elevation(elevation, georeference)
+    return Ground(model, sha256_hex(elevation.read_bytes()))
+
+
+def _frame_of(folder: Path) -> LocalFrame | None:
+    """The local frame of a triangulation's points."""
+    try:
+        stated = json.loads((folder / FRAME_FILE).read_text(encoding="utf-8"))
+        return LocalFrame(float(stated["latitude_deg"]), float(stated["longitude_deg"]))
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def _plane(height_m: float, relief_rms_m: float | None) -> Ground:
+    return Ground(height_m, f"plane {height_m!r}", relief_rms_m)
+
+
+def _plane_of_points(folder: Path, frame: LocalFrame | None, offset_m: float) -> Ground | None:
+    """A plane at the median height of the adjusted object points, and their RMS about it.
+
+    Args:
+        offset_m: heights of the grid's system less those above the ellipsoid.
+    """
+    if frame is None or not (folder / POINTS_FILE).exists():
+        return None
+    axes = ("x_m", "y_m", "z_m")
+    table = read_table(folder / POINTS_FILE, ("point", *axes), ("sx_m", "sy_m", "sz_m", "rays"))
+    xyz = np.array([table.numbers(c) for c in axes]).T.reshape(-1, 3)
+    xyz = xyz[np.isfinite(xyz).all(axis=1)]
+    if not len(xyz):
+        return None
+    height = frame.to_geodetic(xyz)[:, 2] + offset_m
+    middle = float(np.median(height))
+    spread = np.abs(height - middle)
+    kept = spread <= np.percentile(spread, 99.0)
+    return _plane(round(middle, 3), float(np.sqrt(np.mean(spread[kept] ** 2))))
+
+
+def _grid(
+    images: Sequence[OrthoImage], image: VirtualImage, ground: Ground, gsd_m: float | None
+) -> GroundGrid:
+    """Grid over what the images see, its corner at a multiple of the GSD."""
+    model = ground.surface
+    level = float(np.nanmean(model.height_m)) if isinstance(model, HeightModel) else model
+    above = np.array([one.height_m - level for one in images])
+    if not (above > 1.0).all():
+        raise OrthomosaicError(
+            f"the ground at {level:.1f} m is not below all cameras; is the height model in the "
+            "height system of the orientations?"
+        )
+    gsd = gsd_m or float(f"{above.mean() * image.pitch_mm / image.f_mm:.4g}")
+    half = math.hypot(image.width_px, image.height_px) / 2.0 * image.pitch_mm / image.f_mm
+    reach = above * half * 1.15
+    at = np.array([one.nadir_m for one in images])
+    low, high = (at - reach[:, None]).min(axis=0), (at + reach[:, None]).max(axis=0)
+    first = math.floor(low[0] / gsd)
+    top = math.ceil(high[1] / gsd)
+    width, height = math.ceil(high[0] / gsd) - first, top - math.floor(low[1] / gsd)
+    if max(width, height) > SIDE_MAX_PX:
+        raise OrthomosaicError(
+            f"{width} x {height} ground pixels of {gsd:g} m; a side has {SIDE_MAX_PX} at most. "
+            "Give a larger --gsd, in metres"
+        )
+    return GroundGrid((first + 0.5) * gsd, (top - 0.5) * gsd, gsd, width, height)
+
+
+def described_ground(ground: Ground) -> dict[str, Any]:
+    """The ground as JSON types."""
+    if isinstance(ground.surface, HeightModel):
+        return {"kind": "height model", "sha256": ground.sha256}
+    return {"kind": "plane", "height_m": ground.surface, "relief_rms_m": ground.relief_rms_m}

@@ -1,0 +1,212 @@
+"""Orthomosaic of a mission at full resolution: survey, tiles, files, published as one folder."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from daemon.mission.canonical_json import canonical_bytes
+from daemon.mission.store import durable
+from daemon.mission.store.publication import published, sweep
+from daemon.postflight.orthomosaic.cells import CellSurvey, cell_grid, survey
+from daemon.postflight.orthomosaic.inputs import OrthoBlock, OrthomosaicError, described_ground
+from daemon.postflight.orthomosaic.rasters import IMAGES, tone_curves, write_cog
+from daemon.postflight.orthomosaic.seam_file import write_seams
+from daemon.postflight.orthomosaic.tiles import TilePlan, compute_tiles, plan_tiles
+from processing.image.orthoimage.ground_grid import GroundGrid
+from processing.radiometry.tone_curve import curve_as_json
+
+SEAM_FILE: Final = "seams.gpkg"
+REPORT_FILE: Final = "orthomosaic.json"
+WORK_SUFFIX: Final = ".work"
+DEPTHS: Final = (16, 8)
+_BYTES_PER_SAMPLE: Final = 2
+_DISK_SHARE: Final = 3.0
+"""Tiles, a plain GeoTIFF of one image, and the finished files, in bytes of the tiles."""
+
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class OrthomosaicSettings:
+    """What is made: `images` of `rasters.IMAGES`, `depths` of 16 and 8, gains levelled or one."""
+
+    images: tuple[str, ...] = tuple(IMAGES)
+    depths: tuple[int, ...] = DEPTHS
+    levelled: bool = True
+    threads: int = 2
+
+
+def make_orthomosaic(
+    block: OrthoBlock, final: Path, settings: OrthomosaicSettings, progress: Progress
+) -> dict[str, Any]:
+    """Make the orthomosaic in a folder; an earlier one there is replaced when all is complete.
+
+    An interrupted run leaves its tiles next to the folder; repeated with the same inputs it
+    continues and gives the same bytes.
+
+    Args:
+        progress: called with the step, what is done of it, and of how much.
+
+    Returns:
+        The report, as in `orthomosaic.json`, with `files` and `tiles_computed` in addition.
+
+    Raises:
+        OrthomosaicError: no image covers the ground, or the disk is too small.
+        RasterError, OSError: an image cannot be read, or the disk refused.
+    """
+    bands, left_out = _bands(block, settings.images)
+    work = final.with_name(final.name + WORK_SUFFIX)
+    key = f"{block.key()[:24]}-{'-'.join(bands)}-{'level' if settings.levelled else 'plain'}"
+    tiles = work / key
+    durable.make_directories(tiles)
+    sweep(final.parent)
+    for other in work.iterdir():
+        if other != tiles:
+            durable.remove_tree(other) if other.is_dir() else other.unlink()
+    count = len(block.images)
+    found = survey(
+        block, bands, level=settings.levelled, threads=settings.threads,
+        progress=lambda done: progress("survey of the images", done, count),
+    )  # fmt: skip
+    if not (found.owner >= 0).any():
+        raise OrthomosaicError(
+            "no image covers the ground of the grid: is the ground in the height system of the "
+            "orientations, and does the height model reach below the images?"
+        )
+    plan = plan_tiles(block, found)
+    _refuse_full_disk(final.parent, plan.grid, len(bands))
+    computed = compute_tiles(
+        block, found, plan, tiles, threads=settings.threads,
+        progress=lambda done, total: progress("tiles", done, total),
+    )  # fmt: skip
+    curves, pixels = tone_curves(tiles, plan, bands)
+    report = _report(block, found, plan, settings, left_out)
+    report["pixels_with_data"] = pixels
+    report["tone_curves"] = {
+        name: curve_as_json(curves[IMAGES[name][0]])
+        for name in ("pan", "rgb") if IMAGES[name][0] in curves
+    }  # fmt: skip
+    tags = {f"SYNTOPIC_{mark.upper()}": "YES" for mark in block.marks}
+    images = [name for name in settings.images if not set(IMAGES[name]) - set(bands)]
+    files: dict[str, int] = {}
+    with published(final) as part:
+        total = len(images) * len(settings.depths)
+        for image in images:
+            for depth in settings.depths:
+                name = f"{image}-{depth}.tif"
+                files[name] = write_cog(
+                    part / name, work, plan, tiles, bands, image,
+                    curves=curves if depth == 8 else None,
+                    georeference=block.georeference, tags=tags,
+                )  # fmt: skip
+                progress("files", len(files), total)
+        report["seams"]["lines"] = write_seams(
+            part / SEAM_FILE, found.owner, cell_grid(block.grid),
+            [(image.name, image.exposure) for image in block.images], block.georeference,
+        )  # fmt: skip
+        durable.create_file(part / REPORT_FILE, [canonical_bytes(report)], mode=0o644)
+    durable.remove_tree(work)
+    return report | {"files": files, "tiles_computed": computed}
+
+
+def _bands(block: OrthoBlock, images: Sequence[str]) -> tuple[tuple[str, ...], list[str]]:
+    """PAN and the colour bands that every image has, and sentences on what is left out."""
+    wanted = dict.fromkeys(band for name in images for band in IMAGES[name] if band != "pan")
+    bands, left_out = ["pan"], []
+    for band in wanted:
+        absent = [image.name for image in block.images if band not in image.colour]
+        if absent:
+            left_out.append(
+                f"{band}: {len(absent)} of {len(block.images)} images have none at Level-2, "
+                f"{absent[0]} the first; process them again"
+            )
+        else:
+            bands.append(band)
+    return tuple(bands), left_out
+
+
+def _refuse_full_disk(folder: Path, grid: GroundGrid, bands: int) -> None:
+    needed = grid.width_px * grid.height_px * bands * _BYTES_PER_SAMPLE * _DISK_SHARE
+    free = shutil.disk_usage(folder).free
+    if free < needed:
+        raise OrthomosaicError(
+            f"{folder}: {free / 1e9:.1f} GB free; {grid.width_px} x {grid.height_px} pixels of "
+            f"{bands} bands need up to {needed / 1e9:.1f} GB. Free space, or give a larger --gsd"
+        )
+
+
+def _report(
+    block: OrthoBlock,
+    found: CellSurvey,
+    plan: TilePlan,
+    settings: OrthomosaicSettings,
+    left_out: Sequence[str],
+) -> dict[str, Any]:
+    grid = plan.grid
+    report: dict[str, Any] = {
+        "format": 1,
+        "mission": block.mission.id,
+        **dict.fromkeys(block.marks, True),
+        "orientation": block.orientation,
+        "crs": block.georeference.name,
+        "height_system": block.georeference.height_system,
+        "ground": described_ground(block.ground),
+        "gsd_m": grid.gsd_m,
+        "width_px": grid.width_px,
+        "height_px": grid.height_px,
+        "first_pixel_m": [grid.east_m, grid.north_m],
+        "images": len(block.images),
+        "images_used": len(np.unique(found.owner[found.owner >= 0])),
+        "levelled": settings.levelled,
+        "bands": list(found.bands),
+        "left_out": list(left_out),
+        "seams": {
+            "step_rms_before": {band: steps[0] for band, steps in found.seam_rms.items()},
+            "step_rms_after": {band: steps[1] for band, steps in found.seam_rms.items()},
+        },
+        "failures": [failure.as_json() for failure in block.failures],
+    }
+    if isinstance(block.ground.surface, float):
+        report["relief"] = _relief(block, found)
+    return report
+
+
+def _relief(block: OrthoBlock, found: CellSurvey) -> dict[str, Any]:
+    """What relief over a plane displaces: metres outward for each metre of height."""
+    grid = cell_grid(block.grid)
+    rows, columns = np.nonzero(found.owner >= 0)
+    owner = found.owner[rows, columns]
+    nadir = np.array([image.nadir_m for image in block.images])[owner]
+    above = np.array([image.height_m for image in block.images])[owner] - block.ground.surface
+    d = np.hypot(grid.columns_m[columns] - nadir[:, 0], grid.rows_m[rows] - nadir[:, 1]) / above
+    rms, worst = float(np.sqrt(np.mean(d**2))), float(d.max())
+    spread = block.ground.relief_rms_m
+    return {
+        "displacement_per_m_rms": rms,
+        "displacement_per_m_max": worst,
+        "expected_rms_m": None if spread is None else rms * spread,
+    }
+
+
+def relief_sentence(report: dict[str, Any]) -> str | None:
+    """What the plane costs, for a person; None with a height model."""
+    relief = report.get("relief")
+    if relief is None:
+        return None
+    text = (
+        f"Ground is a plane at {report['ground']['height_m']:.2f} m: ground 1 m above it is "
+        f"displaced by {relief['displacement_per_m_rms']:.3f} m RMS, "
+        f"{relief['displacement_per_m_max']:.3f} m at most"
+    )
+    if relief["expected_rms_m"] is not None:
+        text += (
+            f"; tie points lie {report['ground']['relief_rms_m']:.2f} m RMS off the plane, "
+            f"which displaces by {relief['expected_rms_m'] / report['gsd_m']:.2f} px RMS"
+        )
+    return text + ". Give --elevation for a height model."

@@ -1,0 +1,80 @@
+"""Pixels of the images of an orthomosaic, whole or a window: PAN, and colour at its resolution."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon.mission.store.level0 import read_description, read_tiff
+from daemon.postflight.orthomosaic.inputs import OrthoBlock, OrthoImage
+from processing.image.pansharpening import pansharpened
+
+Array = NDArray[Any]
+
+MARGIN_PX: Final = 10
+"""Colour pixels around a window that pansharpening sees."""
+
+
+def image_pixels(
+    block: OrthoBlock,
+    image: OrthoImage,
+    bands: Sequence[str],
+    window: tuple[int, int, int, int] | None = None,
+) -> Array:
+    """Bands of an image, colour bands pansharpened.
+
+    Args:
+        block: of the image.
+        image: whose pixels.
+        bands: "pan" first, then colour bands.
+        window: first column and row, columns, rows; None: the whole image.
+
+    Returns:
+        (bands, rows, columns) uint16, 0 is no data.
+
+    Raises:
+        RasterError: a raster that cannot be read.
+    """
+    size = block.image
+    c, r, width, height = window or (0, 0, size.width_px, size.height_px)
+    folder = block.mission.level2(image.exposure)
+    pan = read_tiff(folder / "pan.tif", width_px=size.width_px, height_px=size.height_px)
+    if len(bands) == 1:
+        return np.ascontiguousarray(pan[r : r + height, c : c + width])[None]
+    ratio = size.colour_ratio
+    # Windows begin and end where a colour pixel begins on a whole PAN pixel.
+    unit = next(n for n in range(1, 13) if abs(n * ratio - round(n * ratio)) < 1e-6)
+    pixels = round(unit * ratio)
+    colour_width, colour_height = (
+        math.floor(n / ratio + 1e-9) for n in (size.width_px, size.height_px)
+    )
+
+    def aligned(first: int, count: int, end: int) -> tuple[int, int]:
+        low = max((first // pixels) - -(-MARGIN_PX // unit), 0)
+        high = -(-(first + count) // pixels) + -(-MARGIN_PX // unit)
+        return low * pixels, min(high * pixels, end)
+
+    c0, c1 = aligned(c, width, size.width_px)
+    r0, r1 = aligned(r, height, size.height_px)
+    in_colour = np.s_[
+        round(r0 / ratio) : min(math.floor(r1 / ratio + 1e-9), colour_height),
+        round(c0 / ratio) : min(math.floor(c1 / ratio + 1e-9), colour_width),
+    ]
+    path = folder / "rgbn.tif"
+    names = list(read_description(path)["bands"])
+    colour = {
+        band: np.ascontiguousarray(
+            read_tiff(
+                path, width_px=colour_width, height_px=colour_height, plane=names.index(band)
+            )[in_colour]
+        )
+        for band in bands[1:]
+    }
+    sharp = pansharpened(np.ascontiguousarray(pan[r0:r1, c0:c1]), colour, ratio)
+    planes = [pan[r0:r1, c0:c1], *(sharp[band] for band in bands[1:])]
+    part = np.s_[r - r0 : r - r0 + height, c - c0 : c - c0 + width]
+    return np.stack([plane[part] for plane in planes])
