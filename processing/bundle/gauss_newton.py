@@ -47,7 +47,8 @@ _OBJECTIVE_CONVERGED: Final = 1e-10
 """Predicted decrease, in squared a priori sigmas, below the printed precision."""
 
 _SLOW_CONVERGED: Final = 1e-6
-"""After the last iteration: every unknown is within a thousandth of its a priori sigma."""
+"""After the last iteration: every unknown is within a thousandth of its a priori sigma, or of its
+a posteriori sigma where residuals are larger than expected."""
 
 _WEAK_INFORMATION: Final = 1e-3
 """Smallest over largest eigenvalue of a point's normal matrix: rays about 3 degrees apart."""
@@ -118,11 +119,13 @@ def iterate(run: Run) -> tuple[Equations, ReducedEquations]:
         if damping.value > 0.0 and step.predicted_decrease <= 1e6 * small:
             damping.value = 0.0
             reduced, step = trial.step(0.0)
-        slow = iteration == run.max_iterations and step.predicted_decrease <= _SLOW_CONVERGED
+        last = iteration == run.max_iterations
+        variance = max(1.0, objective / max(len(rows.misclosure), 1))
+        slow = last and step.predicted_decrease <= _SLOW_CONVERGED * variance
         if step.predicted_decrease <= small or slow:
             trial.refuse_held()
             return rows, reduced
-        if iteration == run.max_iterations:
+        if last:
             trial.refuse_moving(step.dpoints)
         elif not trial.take(step, damping):
             break

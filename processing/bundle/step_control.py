@@ -78,7 +78,8 @@ class Rays:
     Attributes:
         stations, points: station and eliminated point of each image point.
         count: (p,) image points of each.
-        free: (p,) points at finite distance of which no coordinate is held.
+        free: (p,) points at finite distance whose place follows from rays alone, without a given
+            coordinate.
     """
 
     stations: NDArray[np.int64]
@@ -128,7 +129,7 @@ def rays_of(network: Network, layout: ParameterLayout) -> Rays:
         network.images.station[table.image[own]],
         point[own],
         np.bincount(point[own], minlength=len(points)).astype(np.float64),
-        ~layout.locked[points].any(axis=1) & ~network.points.at_infinity[points],
+        np.isnan(network.points.sigma_m[points]).all(axis=1) & ~network.points.at_infinity[points],
     )
 
 

@@ -271,7 +271,7 @@ def _converged(
             board_sigma_mm=settings.board_sigma_mm,
         )
         try:
-            result = adjust(network, AdjustmentSettings(robust=False, max_iterations=60))
+            result = adjust(network, AdjustmentSettings(robust=False, max_iterations=200))
         except RankDefectError as error:
             raise BoardError(*(d.sentence for d in error.rank_defects)) from error
         except NetworkError as error:

@@ -140,3 +140,17 @@ def test_points_without_a_parallax_are_set_aside_by_name_and_a_block_of_them_is_
     xy[(table.image == 2) & (table.point >= CONTROL), 0] += 6.0
     with pytest.raises(NetworkError, match=r"nearly parallel|no convergence"):
         adjust(replace(network, image_points=replace(table, xy_mm=xy)))
+
+
+def test_a_point_that_is_given_and_seen_from_one_place_only_keeps_its_depth() -> None:
+    network = _subset(1, 3, 20.0, 0.1)
+    own = network.image_points
+    single = CONTROL + 1
+    sigma = network.points.sigma_m.copy()
+    sigma[single] = 1e-4
+    start = network.points.xyz_m.copy()
+    kept = (own.point != single) | (own.image == 0)
+    table = ImagePoints(own.image[kept], own.point[kept], own.xy_mm[kept], own.sigma_mm[kept])
+    points = replace(network.points, sigma_m=sigma)
+    result = adjust(replace(network, points=points, image_points=table), AdjustmentSettings())
+    assert np.linalg.norm(result.state.points[single] - start[single]) < 1e-3
