@@ -69,12 +69,7 @@ class Georeference:
             ) from error
         self.name = crs
         _refuse_unfit(self.crs, crs)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # what it warns of is the error below
-            group = TransformerGroup(GEODETIC, self.crs, always_xy=True, allow_ballpark=False)
-        if not group.transformers or not group.best_available:
-            raise GeoreferenceError(_missing_grids(crs, group.unavailable_operations))
-        self._transformer: pyproj.Transformer = group.transformers[0]
+        self._transformer = accurate_transformer(self.crs, crs)
         self.operation = str(self._transformer.description)
         self.accuracy_m = float(self._transformer.accuracy)
 
@@ -126,6 +121,26 @@ class Georeference:
                 f"{latitude_deg:.6f} N {longitude_deg:.6f} E is outside the area of {self.name}"
             )
         return float(x), float(y), float(z)
+
+
+def accurate_transformer(crs: pyproj.CRS, name: str) -> pyproj.Transformer:
+    """From longitude, latitude (deg) and ellipsoidal height of WGS 84 to a system, not roughly.
+
+    Args:
+        crs: projected or geographic, with a height system or not; without one heights stay above
+            the ellipsoid of WGS 84.
+        name: what the user wrote.
+
+    Raises:
+        GeoreferenceError: a grid is missing, or PROJ knows no accurate operation.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # what it warns of is the error below
+        group = TransformerGroup(GEODETIC, crs, always_xy=True, allow_ballpark=False)
+    if not group.transformers or not group.best_available:
+        raise GeoreferenceError(_missing_grids(name, group.unavailable_operations))
+    transformer: pyproj.Transformer = group.transformers[0]
+    return transformer
 
 
 def _refuse_unfit(crs: pyproj.CRS, name: str) -> None:

@@ -13,8 +13,11 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from pyproj import CRS
+from pyproj.exceptions import CRSError, ProjError
 
 from daemon.mission.foreign_files import ForeignFileError, read_regular_file
+from daemon.orientation.georeference import GeoreferenceError, accurate_transformer
 from daemon.orientation.local_frame import LocalFrame
 from daemon.postflight.adjustment.csv_tables import read_table
 from daemon.postflight.triangulation.photograph_block import PhotographBlock
@@ -57,7 +60,8 @@ def read_gcp_list(path: Path, images: Mapping[str, int], frame: LocalFrame) -> G
 
     First line: coordinate system (EPSG code, PROJ text, or "WGS84 UTM 16N"). Then a measurement a
     line: east north height column row image [name]. Points without a name are joined by their
-    coordinates. Heights are those of the coordinate system; without one, ellipsoidal.
+    coordinates. Heights are those of the coordinate system; without one, above the ellipsoid of
+    WGS 84.
 
     Args:
         path: the file.
@@ -167,20 +171,28 @@ def read_control_tables(
 
 def _geodetic(path: Path, system: str, xyz: Array) -> Array:
     """Latitude, longitude, ellipsoidal height (n, 3) of coordinates in a system."""
-    from pyproj import CRS, Transformer
-    from pyproj.exceptions import CRSError, ProjError
-
+    place = f"{path.name} line 1: {system[:80]!r}"
     try:
-        source = CRS.from_user_input(_named_utm(system) or system)
-        to = Transformer.from_crs(source.to_3d(), CRS.from_epsg(4979), always_xy=True)
-        if to.source_crs is None or source.is_geocentric:
-            raise TriangulationError(f"{path.name}: {system}: a projected or geographic system")
-        longitude, latitude, height = to.transform(xyz[:, 0], xyz[:, 1], xyz[:, 2], errcheck=True)
-    except (CRSError, ProjError) as error:
+        crs = CRS.from_user_input(_named_utm(system) or system)
+    except CRSError as error:
         raise TriangulationError(
-            f"{path.name} line 1: {system[:80]!r} is no coordinate system; write EPSG:32616, a "
-            f"PROJ text or WGS84 UTM 16N"
+            f"{place} is no coordinate system; write EPSG:32616, a PROJ text or WGS84 UTM 16N"
         ) from error
+    horizontal = crs.sub_crs_list[0] if crs.is_compound else crs
+    if not (horizontal.is_projected or horizontal.is_geographic):
+        raise TriangulationError(f"{place} is neither a projected nor a geographic system")
+    units = {axis.unit_name for axis in horizontal.axis_info} - {"metre", "degree"}
+    if units and not crs.is_compound:
+        raise TriangulationError(
+            f"{place} counts in {', '.join(sorted(units))} and has no height system: the unit of "
+            "heights is unknown; add a height system, such as EPSG:2236+6360, or convert to metres"
+        )
+    try:
+        longitude, latitude, height = accurate_transformer(crs, system[:80]).transform(
+            *xyz.T, direction="INVERSE", errcheck=True
+        )
+    except (GeoreferenceError, ProjError) as error:
+        raise TriangulationError(f"{path.name} line 1: {error}") from error
     return np.stack([latitude, longitude, height], axis=-1)
 
 
