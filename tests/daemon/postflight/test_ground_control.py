@@ -22,9 +22,7 @@ def _read(folder: Path, system: str, place: str = "538000 180000 100.0") -> np.n
 
 @pytest.mark.parametrize("system", ["EPSG:25831+7837", "EPSG:32631+3855", "EPSG:32631+5773"])
 def test_heights_above_a_geoid_without_its_grid_are_refused(tmp_path: Path, system: str) -> None:
-    with pytest.raises(
-        TriangulationError, match="line 1"
-    ):
+    with pytest.raises(TriangulationError, match="line 1"):
         _read(tmp_path, system, "291000 5709000 100.0")
 
 
