@@ -29,7 +29,7 @@ class CommandEntry(NamedTuple):
     group: str
 
 
-_IN_FLIGHT: Final = "In the air"
+_IN_FLIGHT: Final = "In flight"
 _GROUND: Final = "After landing"
 _LABORATORY: Final = "In the laboratory"
 _BENCH: Final = "On the bench"

@@ -17,8 +17,7 @@ from daemon.cli.options import AsJson
 from daemon.terminal.console import Console, light_table
 from drivers.base.extras import require
 
-ORIENTATION_HELP = """Compute the exterior orientation of every cone at the middle of every
-exposure.
+ORIENTATION_HELP = """Compute the exterior orientation of every cone at each mid-exposure time.
 
 The source is the navigation of the flight or a post-processed trajectory; each trajectory has its
 own folder. Writes CSV, PAT-B, angles for BINGO, footprints (GeoJSON) and STAC items.
@@ -78,7 +77,7 @@ def raw(
     mission: Annotated[Path, typer.Argument(help="Mission folder.")],
     as_json: AsJson = False,
 ) -> None:
-    """The receivers' own bytes, one file each in its native format, and the event file.
+    """Export the bytes of each receiver in its native format, and the event file.
 
     Example: `syntopic export raw missions/20261121T101500Z-ultracam-x-mini`
     """
@@ -111,7 +110,7 @@ def foxglove(
     mission: Annotated[Path, typer.Argument(help="Mission folder.")],
     as_json: AsJson = False,
 ) -> None:
-    """Track, thumbnails and messages as one MCAP file that Foxglove opens.
+    """Export track, thumbnails and messages as one MCAP file for Foxglove.
 
     Example: `syntopic export foxglove missions/20261121T101500Z-ultracam-x-mini`
     """

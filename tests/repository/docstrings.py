@@ -86,7 +86,7 @@ def raised(function: Function) -> set[str]:
 
 
 def missing_sections(function: Function, *, is_method: bool = False) -> list[str]:
-    """What the docstring of a function absent."""
+    """Sections that the docstring of a function does not have."""
     docstring = ast.get_docstring(function)
     if docstring is None:
         return ["a docstring"]
@@ -142,7 +142,7 @@ def is_inherited(method: str, bases: tuple[str, ...], known: dict[str, Class]) -
 
 
 def incomplete(package: Path, top: Path) -> Iterator[tuple[Path, int, str, list[str]]]:
-    """Path, line, name and absent of each public function below `package`."""
+    """Path, line, name and absent sections of each public function below `package`."""
     known = classes(top)
     paths = [package] if package.is_file() else sorted(package.rglob("*.py"))
     for path in paths:

@@ -1,5 +1,6 @@
 """Words of `tests.repository.vocabulary` stand nowhere, and each exception is one."""
 
+import ast
 import subprocess
 
 from tests.repository.vocabulary import ALLOWED, INSTEAD, ROOT, occurrences
@@ -40,3 +41,40 @@ def test_public_class_names_are_unique() -> None:
     names = [line.partition(" ")[2] for line in listed if line]
     twice = sorted({name for name in names if names.count(name) > 1})
     assert twice == []
+
+
+UNIT_SUFFIX = {
+    **dict.fromkeys(("seconds", "secs", "sec"), "s"),
+    **dict.fromkeys(("milliseconds", "millis", "msec"), "ms"),
+    **dict.fromkeys(("microseconds", "micros", "usec"), "us"),
+    **dict.fromkeys(("nanoseconds", "nanos", "nsec"), "ns"),
+    **dict.fromkeys(("metres", "meters"), "m"),
+    **dict.fromkeys(("millimetres", "millimeters"), "mm"),
+    **dict.fromkeys(("micrometres", "micrometers", "microns"), "um"),
+    **dict.fromkeys(("degrees", "degs"), "deg"),
+    **dict.fromkeys(("radians", "rads"), "rad"),
+    **dict.fromkeys(("celsius", "degc", "deg_c"), "c"),
+    **dict.fromkeys(("pix", "pxl"), "px"),
+    **dict.fromkeys(("hertz",), "hz"),
+    **dict.fromkeys(("pct",), "percent"),
+}
+# A term; fields of MAVLink; fields of the kernel.
+FOREIGN_NAMES = ("leap_seconds", "time_usec", "time_unix_usec", "tv_sec", "tv_usec")
+
+
+def test_a_unit_has_one_suffix_in_names() -> None:
+    found = []
+    for package in ("daemon", "drivers", "processing", "sim_hw"):
+        for path in sorted((ROOT / package).rglob("*.py")):
+            for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+                if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+                    name = node.target.id
+                elif isinstance(node, ast.arg):
+                    name = node.arg
+                else:
+                    continue
+                stem, _, suffix = name.lower().rpartition("_")
+                if stem and suffix in UNIT_SUFFIX and not name.lower().endswith(FOREIGN_NAMES):
+                    place = f"{path.relative_to(ROOT)}:{node.lineno}"
+                    found.append(f"{place}: {name}; write _{UNIT_SUFFIX[suffix]}")
+    assert not found, "\n".join(found)

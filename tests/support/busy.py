@@ -2,7 +2,7 @@
 
     python -m tests.support.busy [--runs 5] [--loops 4] [PYTEST ARGUMENT ...]
 
-Stops at the first run that fails. A line with the result is added to `busy.md` next to this file.
+Stops at the first run that fails. A line with the result is added to `tests/busy.md`.
 """
 
 from __future__ import annotations

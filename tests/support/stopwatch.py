@@ -11,9 +11,18 @@ import os
 import time
 from collections.abc import Iterator
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 CALIBRATION_S = 0.2
+
+
+@dataclass(frozen=True)
+class Scheduled:
+    """How long a thread ran and how long it waited for a core since it began, ns."""
+
+    run_ns: int = 0
+    waited_ns: int = 0
 
 
 class Stopwatch:
@@ -21,8 +30,8 @@ class Stopwatch:
 
     def __init__(self) -> None:
         self._begun_s = time.monotonic()
-        self._waited_ns = _waited_ns()
-        self._last_ns: dict[str, int] = {}
+        self._before = _scheduled()
+        self._last: dict[str, Scheduled] = {}
 
     @property
     def elapsed_s(self) -> float:
@@ -31,13 +40,22 @@ class Stopwatch:
 
     @property
     def withheld_s(self) -> float:
-        """Seconds for which threads were ready and waited for a core, all threads added up.
+        """Seconds by which waiting for a core may have delayed a result.
 
-        Threads that ended count up to the last reading; zero where the kernel does not count.
+        A result passes through one thread after another: at least the longest wait of one thread
+        counts. The waits of all threads count together as far as they fit into the share of the
+        wall time in which a thread that is ready has no core. Threads that ended count up to the
+        last reading; zero where the kernel does not count.
         """
-        self._last_ns |= _waited_ns()
-        waited_ns = sum(ns - self._waited_ns.get(task, 0) for task, ns in self._last_ns.items())
-        return waited_ns * 1e-9
+        self._last |= _scheduled()
+        elapsed_ns = self.elapsed_s * 1e9
+        none = Scheduled()
+        before = {task: self._before.get(task, none) for task in self._last}
+        waits = [now.waited_ns - before[task].waited_ns for task, now in self._last.items()]
+        ran_ns = sum(now.run_ns - before[task].run_ns for task, now in self._last.items())
+        together_ns = sum(waits)
+        share = together_ns / max(1, ran_ns + together_ns)
+        return max(0, *waits, min(together_ns, elapsed_ns * share)) * 1e-9
 
     @property
     def own_s(self) -> float:
@@ -57,8 +75,8 @@ def slowdown() -> float:
     return max(1.0, (time.monotonic() - begun_s) / CALIBRATION_S)
 
 
-def _waited_ns() -> dict[str, int]:
-    """How long each thread has waited for a core since it began, by its path in /proc.
+def _scheduled() -> dict[str, Scheduled]:
+    """Every thread by its path in /proc.
 
     Source: Documentation/scheduler/sched-stats.rst of the kernel, /proc/<pid>/schedstat.
     """
@@ -66,8 +84,9 @@ def _waited_ns() -> dict[str, int]:
     for process in _family(os.getpid()):
         with suppress(OSError):
             for task in Path(f"/proc/{process}/task").iterdir():
-                with suppress(OSError, IndexError):
-                    found[str(task)] = int((task / "schedstat").read_text("ascii").split()[1])
+                with suppress(OSError, ValueError):
+                    run_ns, waited_ns, _ = (task / "schedstat").read_text("ascii").split()
+                    found[str(task)] = Scheduled(int(run_ns), int(waited_ns))
     return found
 
 
