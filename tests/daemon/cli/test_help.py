@@ -71,9 +71,45 @@ def test_a_former_name_is_refused_with_the_present_one(former: str, present: str
 
 
 IMPERATIVES = set(
-    """Adjust Bring Calibrate Check Compile Compute Copy Create Describe Detect Estimate Explain Export
-    Find Fly Give Import Install Join Keep List Monitor Print Process Propose Read Remove Replay
-    Revoke Run Send Stop Time Triangulate Validate Verify Write""".split()
+    [
+        "Adjust",
+        "Bring",
+        "Calibrate",
+        "Check",
+        "Compile",
+        "Compute",
+        "Copy",
+        "Create",
+        "Describe",
+        "Detect",
+        "Estimate",
+        "Explain",
+        "Export",
+        "Find",
+        "Fly",
+        "Give",
+        "Import",
+        "Install",
+        "Join",
+        "Keep",
+        "List",
+        "Monitor",
+        "Print",
+        "Process",
+        "Propose",
+        "Read",
+        "Remove",
+        "Replay",
+        "Revoke",
+        "Run",
+        "Send",
+        "Stop",
+        "Time",
+        "Triangulate",
+        "Validate",
+        "Verify",
+        "Write",
+    ]
 )
 
 
