@@ -70,59 +70,23 @@ def test_a_former_name_is_refused_with_the_present_one(former: str, present: str
     assert f"Use '{present}'" in done.output
 
 
-IMPERATIVES = set(
-    [
-        "Adjust",
-        "Bring",
-        "Calibrate",
-        "Check",
-        "Compile",
-        "Compute",
-        "Copy",
-        "Create",
-        "Describe",
-        "Detect",
-        "Estimate",
-        "Explain",
-        "Export",
-        "Find",
-        "Fly",
-        "Give",
-        "Import",
-        "Install",
-        "Join",
-        "Keep",
-        "List",
-        "Monitor",
-        "Print",
-        "Process",
-        "Propose",
-        "Read",
-        "Remove",
-        "Replay",
-        "Revoke",
-        "Run",
-        "Send",
-        "Stop",
-        "Time",
-        "Triangulate",
-        "Validate",
-        "Verify",
-        "Write",
-    ]
-)
+IMPERATIVES = """
+    Adjust Bring Calibrate Check Compile Compute Copy Create Describe Detect Estimate
+    Explain Export Find Fly Give Import Install Join Keep List Monitor Print Process Propose
+    Read Remove Replay Revoke Run Send Stop Time Triangulate Validate Verify Write
+"""
 
 
 def test_summaries_are_imperative_sentences() -> None:
     for entry in TABLE.values():
         assert entry.summary.endswith(".") and len(entry.summary) <= 66
-        assert entry.summary.split()[0].rstrip(",") in IMPERATIVES, entry.summary
+        assert entry.summary.split()[0].rstrip(",") in IMPERATIVES.split(), entry.summary
 
 
 @pytest.mark.parametrize("name", [name for name in ALL if " " in name])
 def test_the_help_of_every_command_begins_with_an_imperative_sentence(name: str) -> None:
     summary = ALL[name].help.partition("\n\n")[0]
-    assert summary.split()[0] in IMPERATIVES, summary
+    assert summary.split()[0] in IMPERATIVES.split(), summary
     assert summary.rstrip().endswith("."), summary
 
 
