@@ -130,6 +130,46 @@ def read_tiff(
     return pixels
 
 
+def read_tiff_rows(
+    path: Path,
+    first_row: int,
+    rows: int,
+    *,
+    width_px: int,
+    height_px: int,
+    planes: Sequence[int] | None = None,
+) -> NDArray[np.uint16]:
+    """Some rows of a 16-bit TIFF; only their bytes are read if its pixels are one plain block.
+
+    `planes` takes these of several planes, shape (planes, rows, width); None: the only one, shape
+    (rows, width).
+
+    Raises:
+        RasterError: as `read_tiff`.
+    """
+    with _first_page(path) as page:
+        shape = page.shape if planes is None else page.shape[1:]
+        if planes is not None and max(planes, default=0) >= page.shape[0]:
+            shape = page.shape
+        _refuse_other_pixels(page, path, shape, width_px, height_px)
+        cut = np.s_[first_row : first_row + rows]
+        if not (page.is_contiguous and page.is_final):
+            pixels = page.asarray()
+            return np.ascontiguousarray(
+                pixels[cut] if planes is None else pixels[list(planes), cut]
+            )
+        kind = np.dtype(np.uint16).newbyteorder(page.parent.byteorder)
+        file, nbytes = page.parent.filehandle, rows * width_px * 2
+        found = np.empty((1 if planes is None else len(planes), rows, width_px), np.uint16)
+        for out, plane in zip(found, (0,) if planes is None else planes, strict=True):
+            file.seek(page.dataoffsets[0] + (plane * height_px + first_row) * width_px * 2)
+            data = file.read(nbytes)
+            if len(data) != nbytes:
+                raise RasterError(f"{path.name}: its pixels end early")
+            out[:] = np.frombuffer(data, kind).reshape(rows, width_px)
+    return found[0] if planes is None else found
+
+
 def check_tiff(path: Path, *, width_px: int, height_px: int) -> None:
     """Whether a raster of one or more planes can be read, without taking its pixels into memory.
 

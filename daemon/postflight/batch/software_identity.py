@@ -5,8 +5,10 @@ from __future__ import annotations
 import functools
 import hashlib
 import platform
+from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
+from types import ModuleType
 from typing import Final
 
 import daemon
@@ -33,16 +35,21 @@ def software_identity() -> dict[str, str]:
     features = ",".join(sorted(name for name, on in binding.get_host_cpu_features().items() if on))
     return {
         "software": version("syntopic"),
-        "code_sha256": _code_sha256(),
+        "code_sha256": code_sha256(_RELATED),
         "python": platform.python_version(),
         "cpu": f"{binding.get_host_cpu_name()}-{hashlib.sha256(features.encode()).hexdigest()[:8]}",
         **{name: version(name) for name in LIBRARIES},
     }
 
 
-def _code_sha256() -> str:
+def code_sha256(related: Mapping[ModuleType, Sequence[str]]) -> str:
+    """SHA-256 over names and contents of source files.
+
+    Args:
+        related: folders of each package.
+    """
     digest = hashlib.sha256()
-    for package, folders in _RELATED.items():
+    for package, folders in related.items():
         root = Path(str(package.__file__)).parent
         for folder in folders:
             for path in sorted((root / folder).rglob("*")):

@@ -14,6 +14,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from daemon.postflight.orthomosaic.ground_reach import ground_reach_m
 from daemon.postflight.orthomosaic.inputs import OrthoBlock, OrthoImage
 from daemon.postflight.orthomosaic.pixels import image_pixels
 from processing.image.orthoimage.ground_grid import GroundGrid
@@ -111,12 +112,12 @@ def _cells_of(
 ) -> tuple[tuple[int, int], Array]:
     """First row and column, a multiple of `BLOCK_CELLS`, and means of cells (bands, h, w)."""
     pose = image.pose
-    reach = np.hypot(pose.width_px, pose.height_px) * block.grid.gsd_m * 0.75
+    reach = ground_reach_m(pose, image.nadir_m, image.height_m, block.ground.surface)
     row = int((grid.north_m - image.nadir_m[1] - reach) / grid.gsd_m)
     column = int((image.nadir_m[0] - reach - grid.east_m) / grid.gsd_m)
     side = int(2 * reach / grid.gsd_m) + BLOCK_CELLS
     row, column = (max(n, 0) // BLOCK_CELLS * BLOCK_CELLS for n in (row, column))
-    height, width = min(side, grid.height_px - row), min(side, grid.width_px - column)
+    height, width = (max(min(side, n), 1) for n in (grid.height_px - row, grid.width_px - column))
     part = grid.window(column, row, width, height)
     # Cells are as large as this many pixels of the image.
     factor = max(round(grid.gsd_m / _pixel_m(block, image)), 1)

@@ -17,6 +17,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+import daemon
 from daemon import DaemonError
 from daemon.mission.canonical_json import canonical_bytes, sha256_hex
 from daemon.mission.exposure_batch import ExposureFailure, for_each_exposure
@@ -27,6 +28,12 @@ from daemon.orientation.exterior_orientation import mount_of
 from daemon.orientation.georeference import Georeference
 from daemon.orientation.local_frame import FRAME_FILE, LocalFrame
 from daemon.postflight.adjustment.csv_tables import read_table
+from daemon.postflight.batch.software_identity import code_sha256, software_identity
+from daemon.postflight.orthomosaic.ground_reach import (
+    DEPRESSION_MIN_DEG,
+    corner_slope,
+    ground_reach_m,
+)
 from daemon.postflight.triangulation.triangulation import block_of
 from processing.geometry.orientation import grid_from_enu
 from processing.geometry.rotation import rotation_matrix
@@ -43,6 +50,8 @@ _CRS_LINE: Final = re.compile(r"^# Adjusted exterior orientation in ([^\s,]+),")
 _ANGLES: Final = ("omega_deg", "phi_deg", "kappa_deg")
 _PLACE: Final = ("east_m", "north_m", "height_m")
 _ALSO: Final = ("latitude_deg", "longitude_deg", "sx_m", "sy_m", "sz_m", "so_deg", "sp_deg")
+_CODE: Final = {daemon: ("postflight/orthomosaic",)}
+"""What computes an orthomosaic, in addition to what computes Level-2."""
 MARKS: Final = ("simulated", "uncalibrated")
 SIDE_MAX_PX: Final = 400_000
 """A grid with a longer side is refused: the GSD is meant in metres."""
@@ -113,17 +122,26 @@ class OrthoBlock:
         return ground_surface(grid, self.ground.surface, cartesian)
 
     def key(self) -> str:
-        """Hash of all inputs; the pixels of Level-2 by size and time of their files."""
+        """Hash of all inputs and of the code; the pixels of Level-2 by size and time of their
+        files."""
         files = [
             [image.name, file, status.st_size, str(status.st_mtime_ns)]
             for image in self.images
             for file in ("pan.tif", *(("rgbn.tif",) if image.colour else ()))
             for status in [(self.mission.level2(image.exposure) / file).stat()]
         ]
-        poses = [[i.name, *i.pose.centre_m.tolist(), *i.pose.rotation.ravel()] for i in self.images]
+        poses = [
+            [
+                i.name, i.pose.f_mm, i.pose.pixel_mm, *i.pose.principal,
+                *i.pose.centre_m.tolist(), *i.pose.rotation.ravel(),
+            ]
+            for i in self.images
+        ]  # fmt: skip
         grid = self.grid
         facts = {
-            "format": 1,
+            "format": 2,
+            "software": software_identity() | {"orthomosaic": code_sha256(_CODE)},
+            "colour": [self.image.colour_ratio, [i.colour for i in self.images]],
             "files": files,
             "poses": [[v if isinstance(v, str) else float(v).hex() for v in p] for p in poses],
             "crs": self.georeference.name,
@@ -257,6 +275,11 @@ def _images(
         pose = ImagePose(
             image.f_mm, image.pitch_mm, image.width_px, image.height_px, centre[k], rotation
         )
+        if not math.isfinite(corner_slope(pose)):
+            raise OrthomosaicError(
+                f"a corner looks less than {DEPRESSION_MIN_DEG:.0f} degrees below the horizon; an "
+                "orthomosaic is made of images that look down"
+            )
         east, north, up = (float(v) for v in place[k])
         described = read_description(mission.level2(number) / "pan.tif")
         marks = tuple(mark for mark in MARKS if described.get(mark) is True)
@@ -345,8 +368,7 @@ def _grid(
             "height system of the orientations?"
         )
     gsd = gsd_m or float(f"{above.mean() * image.pitch_mm / image.f_mm:.4g}")
-    half = math.hypot(image.width_px, image.height_px) / 2.0 * image.pitch_mm / image.f_mm
-    reach = above * half * 1.15
+    reach = np.array([ground_reach_m(i.pose, i.nadir_m, i.height_m, model) for i in images])
     at = np.array([one.nadir_m for one in images])
     low, high = (at - reach[:, None]).min(axis=0), (at + reach[:, None]).max(axis=0)
     first = math.floor(low[0] / gsd)

@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.mission.store.level0 import read_description, read_tiff
+from daemon.mission.store.level0 import read_description, read_tiff_rows
 from daemon.postflight.orthomosaic.inputs import OrthoBlock, OrthoImage
 from processing.image.pansharpening import pansharpened
 
@@ -42,9 +42,14 @@ def image_pixels(
     size = block.image
     c, r, width, height = window or (0, 0, size.width_px, size.height_px)
     folder = block.mission.level2(image.exposure)
-    pan = read_tiff(folder / "pan.tif", width_px=size.width_px, height_px=size.height_px)
+
+    def pan_rows(first: int, count: int) -> Array:
+        return read_tiff_rows(
+            folder / "pan.tif", first, count, width_px=size.width_px, height_px=size.height_px
+        )
+
     if len(bands) == 1:
-        return np.ascontiguousarray(pan[r : r + height, c : c + width])[None]
+        return np.ascontiguousarray(pan_rows(r, height)[:, c : c + width])[None]
     ratio = size.colour_ratio
     # Windows begin and end where a colour pixel begins on a whole PAN pixel.
     unit = next(n for n in range(1, 13) if abs(n * ratio - round(n * ratio)) < 1e-6)
@@ -60,21 +65,19 @@ def image_pixels(
 
     c0, c1 = aligned(c, width, size.width_px)
     r0, r1 = aligned(r, height, size.height_px)
-    in_colour = np.s_[
-        round(r0 / ratio) : min(math.floor(r1 / ratio + 1e-9), colour_height),
-        round(c0 / ratio) : min(math.floor(c1 / ratio + 1e-9), colour_width),
-    ]
+    rows = slice(round(r0 / ratio), min(math.floor(r1 / ratio + 1e-9), colour_height))
+    columns = slice(round(c0 / ratio), min(math.floor(c1 / ratio + 1e-9), colour_width))
     path = folder / "rgbn.tif"
     names = list(read_description(path)["bands"])
+    planes = read_tiff_rows(
+        path, rows.start, rows.stop - rows.start,
+        width_px=colour_width, height_px=colour_height, planes=[names.index(b) for b in bands[1:]],
+    )  # fmt: skip
     colour = {
-        band: np.ascontiguousarray(
-            read_tiff(
-                path, width_px=colour_width, height_px=colour_height, plane=names.index(band)
-            )[in_colour]
-        )
-        for band in bands[1:]
+        band: np.ascontiguousarray(plane[:, columns])
+        for band, plane in zip(bands[1:], planes, strict=True)
     }
-    sharp = pansharpened(np.ascontiguousarray(pan[r0:r1, c0:c1]), colour, ratio)
-    planes = [pan[r0:r1, c0:c1], *(sharp[band] for band in bands[1:])]
+    pan = np.ascontiguousarray(pan_rows(r0, r1 - r0)[:, c0:c1])
+    sharp = pansharpened(pan, colour, ratio)
     part = np.s_[r - r0 : r - r0 + height, c - c0 : c - c0 + width]
-    return np.stack([plane[part] for plane in planes])
+    return np.stack([plane[part] for plane in (pan, *(sharp[band] for band in bands[1:]))])

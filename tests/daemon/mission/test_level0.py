@@ -11,6 +11,7 @@ from daemon.mission.store.level0 import (
     RasterError,
     read_description,
     read_tiff,
+    read_tiff_rows,
     tiff_parts,
 )
 
@@ -113,3 +114,30 @@ def test_a_torn_or_foreign_file_is_refused_at_every_length(tmp_path):
 def test_arrays_that_are_no_frame_are_refused(planes):
     with pytest.raises(RasterError):
         tiff_parts(planes, {})
+
+
+@pytest.mark.parametrize("options", [{}, {"compression": "zlib"}, {"byteorder": ">"}])
+def test_rows_of_planes_are_those_of_the_whole_raster(tmp_path, options):
+    planes = np.stack([PIXELS + band for band in range(3)])
+    if options:
+        tifffile.imwrite(
+            tmp_path / "x.tif", planes, planarconfig="separate", photometric="rgb", **options
+        )
+    else:
+        _write(tmp_path / "x.tif", list(planes))
+    size = {"width_px": 64, "height_px": 48}
+    found = read_tiff_rows(tmp_path / "x.tif", 5, 7, planes=[2, 0], **size)
+    assert np.array_equal(found, planes[[2, 0], 5:12]) and found.dtype == np.uint16
+    with pytest.raises(RasterError):
+        read_tiff_rows(tmp_path / "x.tif", 5, 7, planes=[3], **size)
+
+
+def test_only_the_bytes_of_the_rows_are_read(tmp_path, monkeypatch):
+    path = _write(tmp_path / "large.tif", [np.zeros((3000, 3000), np.uint16)])
+    counts = []
+    real = tifffile.FileHandle.read
+    monkeypatch.setattr(
+        tifffile.FileHandle, "read", lambda self, n=-1: counts.append(n) or real(self, n)
+    )
+    rows = read_tiff_rows(path, 2990, 10, width_px=3000, height_px=3000)
+    assert rows.shape == (10, 3000) and -1 not in counts and sum(counts) < 3 * 10 * 3000 * 2

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import sqlite3
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,8 +22,16 @@ from benchmarks.orthomosaic import (
     owners,
 )
 from daemon.cli import app
+from daemon.mission.layout import Mission
+from daemon.postflight.orthomosaic import inputs
 from daemon.postflight.orthomosaic import orthomosaic as making
+from daemon.postflight.orthomosaic.cells import CELL_PX, survey
+from daemon.postflight.orthomosaic.ground_reach import corner_slope, ground_reach_m
+from daemon.postflight.orthomosaic.inputs import block_for_orthomosaic
 from daemon.postflight.orthomosaic.tiles import TILE_PX
+from processing.geometry.rotation import rotation_matrix
+from processing.geometry.terrain_rays import HeightModel
+from processing.image.orthoimage.ground_resampling import ImagePose
 
 pytestmark = pytest.mark.timeout(300)
 
@@ -154,6 +163,51 @@ def test_a_plane_states_what_relief_does(flown) -> None:
     ]  # fmt: skip
     relief = json.loads((out / "orthomosaic.json").read_text())["relief"]
     assert 0.01 < relief["displacement_per_m_rms"] < relief["displacement_per_m_max"] < 0.3
+
+
+def _block(flown: OrthoFlight, **options):
+    return block_for_orthomosaic(
+        Mission.open(flown.mission), trajectory_file=flown.folder / "trajectory.csv",
+        plane_height_m=420.0, **options,
+    )  # fmt: skip
+
+
+def test_a_finer_grid_shows_the_same_ground(flown) -> None:
+    """Also the corners of images, at an eighth of their sampling distance."""
+    area_m2 = []
+    for gsd_m in (0.16, 0.02):
+        block = _block(flown, gsd_m=gsd_m)
+        found = survey(block, ["pan"], threads=2)
+        area_m2.append((found.owner >= 0).sum() * (gsd_m * CELL_PX) ** 2)
+    # Cells are taken where an image covers them whole; smaller ones come nearer to its edge.
+    assert 1.0 < area_m2[1] / area_m2[0] < 1.1
+
+
+def test_tiles_of_another_geometry_or_other_code_have_another_key(flown, monkeypatch) -> None:
+    block = _block(flown)
+    first = block.images[0]
+    keys = {block.key(), _block(flown).key()}
+    assert len(keys) == 1
+    for changed in ({"f_mm": first.pose.f_mm + 0.01}, {"pixel_mm": first.pose.pixel_mm * 1.01}):
+        image = replace(first, pose=replace(first.pose, **changed))
+        keys.add(replace(block, images=(image, *block.images[1:])).key())
+    monkeypatch.setattr(inputs, "software_identity", lambda: {"software": "another"})
+    keys.add(block.key())
+    assert len(keys) == 4
+
+
+def test_a_view_to_the_horizon_is_refused_and_low_ground_widens_the_reach() -> None:
+    turned = rotation_matrix(np.radians(65.0), 0.0, 0.0)
+    down = ImagePose(100.0, 0.01, 8000, 6000, np.zeros(3), np.eye(3))
+    assert corner_slope(down) == pytest.approx(0.5)
+    assert corner_slope(replace(down, rotation=turned)) == np.inf
+    heights = np.full((200, 200), 500.0)
+    heights[:, 120:] = 0.0
+    model = HeightModel(heights, 0.0, 1990.0, 10.0, -10.0)
+    plain = ground_reach_m(down, (300.0, 1000.0), 1000.0, 500.0)
+    assert plain == pytest.approx(275.0)
+    assert ground_reach_m(down, (300.0, 1000.0), 1000.0, model) < 1.5 * plain
+    assert ground_reach_m(down, (1200.0, 1000.0), 1000.0, model) == pytest.approx(550.0)
 
 
 @pytest.mark.parametrize(
