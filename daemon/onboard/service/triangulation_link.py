@@ -22,6 +22,7 @@ from daemon.onboard.service.messages import (
     UseMission,
 )
 from daemon.onboard.service.supervisor import Supervisor
+from daemon.onboard.triangulation.exposure_ranges import ranges
 from daemon.products.processing_threads import thread_counts
 
 TARGET: Final = "daemon.onboard.triangulation.triangulation_process:main"
@@ -49,6 +50,8 @@ class TriangulationLink:
         self._emit = emit
         self._mission: Path | None = None
         self._pending: deque[object] = deque()
+        self._processed: dict[int, None] = {}
+        self._triangulated: set[int] = set()
         self._finished = asyncio.Event()
         self.restarts = 0
         self.is_running = False
@@ -74,7 +77,11 @@ class TriangulationLink:
         if not self.is_running:
             return
         if event.get("event") == "processed":
-            self._pending.append(TriangulateExposure(int(event["number"])))
+            number = int(event["number"])
+            self._processed[number] = None
+            self._pending.append(TriangulateExposure(number))
+        elif event.get("event") == "triangulated":
+            self._triangulated.add(int(event["number"]))
         self.send_pending()
 
     def use_mission(self, mission: Path) -> None:
@@ -126,7 +133,7 @@ class TriangulationLink:
                 "triangulation-failed",
                 fault=True,
                 sentence="The live triangulation was not complete "
-                f"{self._section.landing_timeout_s:g} s after landing. Run "
+                f"{self._section.landing_timeout_s:g} s after landing{self._left_out()}. Run "
                 "`syntopic triangulate MISSION --live`.",
             )
         self._has_landed, self.is_running = True, False
@@ -147,6 +154,11 @@ class TriangulationLink:
         except TimeoutError:
             return False
         return self.is_running and self._is_written
+
+    def _left_out(self) -> str:
+        """Exposures with products that the process did not report, as text."""
+        left = [number for number in self._processed if number not in self._triangulated]
+        return f"; exposures {ranges(left)} are not in its orientations" if left else ""
 
     def _on_finished(self, done: TriangulationFinished) -> None:
         self._is_written = done.is_written

@@ -9,6 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 from daemon.onboard.triangulation.drifts import MOUNTING, Drift
+from daemon.onboard.triangulation.exposure_ranges import ranges
 from processing.pipelines.live_triangulation import LiveTriangulation
 
 MIN_TIES: Final = 6
@@ -21,6 +22,12 @@ CONTRADICTED_FACTOR: Final = 4.0
 """Variance factor of measured positions or attitudes: their errors are twice the stated ones."""
 HEIGHT_MODEL_SIGMAS: Final = 3.0
 HEIGHT_MODEL_MIN_M: Final = 5.0
+
+LOST: Final = "lost, no head delivered an image"
+NOT_SEALED: Final = "it is not sealed"
+NOT_PROCESSED: Final = "it was not processed"
+CUT_OFF: Final = "landing did not wait for it"
+"""Reasons why an exposure is not in the block."""
 
 
 @dataclass(frozen=True)
@@ -125,17 +132,6 @@ def untied_pairs(live: LiveTriangulation) -> tuple[tuple[str, str], ...]:
     )
 
 
-def ranges(numbers: Sequence[int]) -> str:
-    """Numbers as text: `3-5, 9`."""
-    parts: list[list[int]] = []
-    for number in sorted(numbers):
-        if parts and number == parts[-1][1] + 1:
-            parts[-1][1] = number
-        else:
-            parts.append([number, number])
-    return ", ".join(str(a) if a == b else f"{a}-{b}" for a, b in parts)
-
-
 def _skipped(live: LiveTriangulation, skipped: Mapping[int, str]) -> list[TriangulationFinding]:
     by_reason: dict[str, list[int]] = {}
     for number, reason in skipped.items():
@@ -147,6 +143,10 @@ def _skipped(live: LiveTriangulation, skipped: Mapping[int, str]) -> list[Triang
             name, why = "NO_GNSS", f"{reason}. Check the receiver and its antenna."
         elif reason == "no attitude":
             name, why = "NO_ATTITUDE", "no attitude. Check the inertial unit and its configuration."
+        elif reason == LOST:
+            name, why = "EXPOSURES_LOST", f"{reason}. Fly them again."
+        elif reason == CUT_OFF:
+            name, why = "NOT_TRIANGULATED", f"{reason}. Run `syntopic triangulate MISSION --live`."
         else:
             name, why = "NO_IMAGE", f"{reason}. Run `syntopic process` after landing."
         if not live.images:

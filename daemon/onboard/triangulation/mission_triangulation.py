@@ -7,7 +7,7 @@ Used in flight and to replay a mission. It reads records and Level-2, and writes
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -20,12 +20,21 @@ from daemon.mission.layout import Mission
 from daemon.mission.store.level0 import read_tiff
 from daemon.onboard.triangulation.drifts import Drift, drifts_of
 from daemon.onboard.triangulation.findings import (
+    CUT_OFF,
+    LOST,
+    NOT_PROCESSED,
+    NOT_SEALED,
     HeightModelCheck,
     TriangulationFinding,
     findings_of,
 )
+from daemon.onboard.triangulation.flown_lines import FlownLines
 from daemon.onboard.triangulation.measured_images import SensorSigmas, measured_image, oriented
-from daemon.orientation.exterior_orientation import NavigationSource, mount_of
+from daemon.orientation.exterior_orientation import (
+    NavigationSource,
+    mount_of,
+    sealed_exposure,
+)
 from daemon.orientation.local_frame import LocalFrame
 from daemon.planning.plan_readers import read_plan
 from daemon.planning.relief import TerrainRelief, relief_of
@@ -114,6 +123,7 @@ class MissionTriangulation:
         self.is_simulated = False
         self._relief = self._read_relief()
         self._planned_lines = self._read_plan()
+        self._lines = FlownLines(self._planned_lines)
 
     @property
     def folder(self) -> Path:
@@ -130,6 +140,8 @@ class MissionTriangulation:
         self.is_simulated |= exposure.simulated
         if self.live is not None and any(one.number == number for one in self.live.images):
             return ExposureTriangulated(number, None, "came before", 0.0)
+        if exposure.state == "lost" or not exposure.frames:
+            return self._skip(number, LOST, begun)
         eo = oriented(exposure, self.rig, self.mount, self.trajectory)
         if isinstance(eo, str):
             return self._skip(number, eo, begun)
@@ -154,6 +166,9 @@ class MissionTriangulation:
             )
             self.live = LiveTriangulation(image, float(ground[2]), self.settings)
         measured = measured_image(exposure, eo, self.frame, self.sigmas)
+        above_m = max(float(measured.position_m[2]) - self.live.block.ground_m, 0.0)
+        width_m = image.width_px * image.pitch_mm / image.f_mm * above_m
+        measured = replace(measured, line=self._lines.name(measured, width_m))
         if self.live.images and self.live.images[-1].line != measured.line:
             self.adjust_block()
         try:
@@ -175,9 +190,31 @@ class MissionTriangulation:
         self._find()
 
     def land(self) -> None:
-        """The last adjustment of the block, with what was planned and not flown."""
+        """The last adjustment of the block, with what was planned and not flown, and with every
+        exposure of the mission that is not in it."""
         self.has_landed = True
+        self.note_absent()
         self.adjust_block()
+
+    def note_absent(self) -> None:
+        """Note every exposure of the mission that was not added, with the reason."""
+        added = {one.number for one in self.live.images} if self.live is not None else set()
+        for number in self.mission.numbers():
+            if number not in added and number not in self.skipped:
+                self.skipped[number] = self._why_absent(number)
+
+    def _why_absent(self, number: int) -> str:
+        try:
+            exposure = sealed_exposure(self.mission, number)
+        except (OSError, DaemonError, ValueError) as error:
+            return f"its record cannot be read ({error})"
+        if exposure is None:
+            return NOT_SEALED
+        if exposure.state == "lost" or not exposure.frames:
+            return LOST
+        if not (self.mission.level2(number) / "pan.tif").exists():
+            return NOT_PROCESSED
+        return CUT_OFF
 
     def accuracy(self) -> GroundAccuracy | None:
         """Expected accuracy on the ground without control; None before the block is adjusted."""

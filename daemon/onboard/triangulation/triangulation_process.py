@@ -14,6 +14,7 @@ import sys
 import threading
 import time
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -31,6 +32,7 @@ from daemon.onboard.service.messages import (
     UseMission,
 )
 from daemon.onboard.service.processes import ServiceConnection
+from daemon.onboard.triangulation.findings import CUT_OFF, NOT_SEALED
 from daemon.onboard.triangulation.live_record import summary_json, write_live
 from daemon.onboard.triangulation.measured_images import SensorSigmas
 from daemon.onboard.triangulation.mission_triangulation import (
@@ -45,7 +47,20 @@ from processing.pipelines.live_triangulation import LiveSettings
 NICENESS: Final = 19
 OOM_SCORE: Final = 1000
 """Of 1000: the kernel ends this process before any other of the service."""
+ADDING_SHARE: Final = 0.5
+"""Of the time for landing in which exposures are still added; the rest is for the adjustment."""
 _WAIT_S: Final = 1.0
+
+
+@dataclass
+class _Landing:
+    """Until when exposures are added, monotonic; without a landing, for ever."""
+
+    until_s: float = math.inf
+
+    @property
+    def is_over(self) -> bool:
+        return time.monotonic() > self.until_s
 
 
 def main(link: ServiceConnection, mission: Path, section: TriangulationSection) -> None:
@@ -53,8 +68,11 @@ def main(link: ServiceConnection, mission: Path, section: TriangulationSection) 
     lower_priority(section.memory_max_mb)
     configure_threads()
     tasks: queue.Queue[object] = queue.Queue()
+    landing = _Landing()
     thread = threading.Thread(
-        target=_run, args=(link, mission, section, tasks), name="triangulation", daemon=True
+        target=lambda: _Work(link, mission, section, tasks, landing).run(),
+        name="triangulation",
+        daemon=True,
     )
     thread.start()
     # Pings are answered here: an adjustment takes seconds, on a busy machine minutes.
@@ -64,6 +82,8 @@ def main(link: ServiceConnection, mission: Path, section: TriangulationSection) 
         if isinstance(message, Ping):
             link.send(Pong({}))
         elif message is not None:
+            if isinstance(message, FinishTriangulation):
+                landing.until_s = time.monotonic() + ADDING_SHARE * section.landing_timeout_s
             tasks.put(message)
 
 
@@ -83,15 +103,6 @@ def lower_priority(memory_max_mb: int) -> None:
         resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
 
 
-def _run(
-    link: ServiceConnection,
-    mission: Path,
-    section: TriangulationSection,
-    tasks: queue.Queue[object],
-) -> None:
-    _Work(link, mission, section, tasks).run()
-
-
 class _Work:
     def __init__(
         self,
@@ -99,8 +110,9 @@ class _Work:
         mission: Path,
         section: TriangulationSection,
         tasks: queue.Queue[object],
+        landing: _Landing,
     ) -> None:
-        self._link, self._tasks = link, tasks
+        self._link, self._tasks, self._landing = link, tasks, landing
         folder = Mission(mission, mission.name)
         settings = LiveSettings(
             prior=MountingPrior(
@@ -134,13 +146,16 @@ class _Work:
                 self._finish()
 
     def _triangulate(self, done: MissionTriangulation, number: int) -> None:
+        if self._landing.is_over:
+            done.skipped.setdefault(number, CUT_OFF)
+            return
         try:
             exposure = sealed_exposure(done.mission, number)
         except (OSError, DaemonError, ValueError) as error:
             done.skipped[number] = f"its record cannot be read ({error})"
             return
         if exposure is None:
-            done.skipped[number] = "it is not sealed"
+            done.skipped[number] = NOT_SEALED
             return
         blocks = done.block_count
         one = done.add(exposure)
@@ -169,6 +184,8 @@ class _Work:
         begun = time.monotonic()
         written = False
         if self._done is not None:
+            for number in [n for n, why in self._done.skipped.items() if why == NOT_SEALED]:
+                self._triangulate(self._done, number)
             self._done.land()
             written = self._write(self._done)
             self._emit("triangulation", **summary_json(self._done))

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import json
 import math
+import queue
 import shutil
+import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -14,13 +18,19 @@ from scipy import stats
 from typer.testing import CliRunner
 
 from daemon.cli import app
+from daemon.configuration.model import TriangulationSection
 from daemon.mission.layout import Mission
+from daemon.onboard.service.messages import TriangulationFinished
+from daemon.onboard.service.processes import ServiceConnection
+from daemon.onboard.triangulation import triangulation_process
+from daemon.onboard.triangulation.flown_lines import FlownLines
 from daemon.onboard.triangulation.live_record import live_json, summary_json, write_live
 from daemon.onboard.triangulation.mission_triangulation import MissionTriangulation
 from daemon.orientation.exterior_orientation import sealed_exposures
 from daemon.orientation.local_frame import LocalFrame
 from processing.bundle.block_adjustment import added_parameters
 from processing.geometry.rotation import vectors_from_rotations
+from processing.pipelines.live_triangulation import MeasuredImage
 from tests.daemon.flown_block import (
     FlownBlock,
     flown_block,
@@ -226,6 +236,77 @@ def test_an_image_that_cannot_be_read_is_left_out_and_named(copied) -> None:
     numbers = {n for f in done.findings if f.name == "NO_IMAGE" for n in f.exposures}
     assert numbers == {4, 5}
     assert {o.image.number for o in done.live.orientations} == {1, 2, 3, 6, 7, 8, 9, 10}
+
+
+def test_landing_names_exposures_that_never_came(copied) -> None:
+    """Lost, not processed, and processed too late."""
+    record = read_record(copied, 5)
+    write_record(copied, record | {"frames": [], "state": "lost"})
+    for number in (4, 5):
+        shutil.rmtree(copied / f"L2/{number:06d}")
+    done = _replayed(copied, range(1, 4))
+    found = {f.name: f for f in done.findings}
+    assert found["EXPOSURES_LOST"].exposures == (5,)
+    assert "Exposures 5 are not in the block: lost" in found["EXPOSURES_LOST"].sentence
+    assert found["NO_IMAGE"].exposures == (4,)
+    assert "it was not processed" in found["NO_IMAGE"].sentence
+    assert found["NOT_TRIANGULATED"].exposures == (6, 7, 8, 9, 10)
+    advised = [(r["from"], r["to"]) for r in summary_json(done)["reflights"] if "from" in r]
+    assert advised == [(4, 4), (5, 5), (6, 10)]
+
+
+def test_exposures_behind_at_landing_do_not_take_the_time_of_the_adjustment(copied) -> None:
+    sent: list[object] = []
+    link = cast(ServiceConnection, SimpleNamespace(send=sent.append))
+    landing = triangulation_process._Landing()
+    work = triangulation_process._Work(
+        link, copied, TriangulationSection(enabled=True), queue.Queue(), landing
+    )
+    for number in (1, 2, 3):
+        work._triangulate(work._done, number)
+    landing.until_s = time.monotonic() - 1.0
+    work._triangulate(work._done, 4)
+    work._finish()
+    assert isinstance(sent[-1], TriangulationFinished) and sent[-1].is_written
+    record = json.loads((copied / "export/triangulation/live/live.json").read_text())
+    assert not record["is_preliminary"] and record["adjusted"] == 3
+    assert {s["exposure"] for s in record["skipped"]} == set(range(4, EACH * LINES + 1))
+    assert "NOT_TRIANGULATED" in {f["name"] for f in record["findings"]}
+
+
+def test_without_a_plan_lines_are_those_that_were_flown(copied) -> None:
+    """All exposures bear one name; the block is adjusted at the turn, too."""
+    for number in range(1, EACH * LINES + 1):
+        write_record(copied, read_record(copied, number) | {"line_id": ""})
+    done = _replayed(copied)
+    assert [i.line for i in done.live.images] == ["line 1"] * EACH + ["line 2"] * EACH
+    assert "SINGLE_STRIP" not in _names(done) and done.block_count == LINES
+
+
+def _measured_image(east_m: float, north_m: float, heading_deg: float, line: str = ""):
+    angle = math.radians(heading_deg)
+    forward = np.array([math.sin(angle), math.cos(angle), 0.0])
+    right = np.array([forward[1], -forward[0], 0.0])
+    rotation = np.column_stack([right, forward, [0.0, 0.0, 1.0]])
+    return MeasuredImage(
+        1, line, 0.0, np.array([east_m, north_m, 1000.0]), rotation, np.ones(3), np.ones(3),
+        np.full(3, np.nan),
+    )  # fmt: skip
+
+
+def test_a_gap_or_a_slow_curve_begins_no_line_a_turn_or_a_step_aside_does() -> None:
+    lines = FlownLines(("A",))
+    flown = [
+        (0, 0, 0, ""), (0, 100, 0, ""), (5, 2000, 4, ""), (80, 2200, 20, ""),
+        (400, 2000, 180, ""), (400, 1900, 180, ""),
+        (800, 0, 180, ""), (800, -100, 180, ""), (805, -100, 270, ""), (0, 0, 0, "A"),
+        (0, 0, 180, "A"),
+    ]  # fmt: skip
+    names = [lines.name(_measured_image(*one), 1000.0) for one in flown]
+    assert names == [
+        "line 1", "line 1", "line 1", "line 1", "line 2", "line 2", "line 3", "line 3", "line 4",
+        "A", "A",
+    ]  # fmt: skip
 
 
 def test_an_exposure_that_comes_twice_counts_once(flown) -> None:

@@ -117,6 +117,16 @@ def test_landing_waits_no_longer_than_its_limit_and_reports_it() -> None:
     assert "not complete" in events[-1]["sentence"]
 
 
+def test_a_landing_that_was_cut_off_names_the_exposures_left_out() -> None:
+    link, _, events = _link()
+    link.start(Path("m"))
+    for number in (1, 2, 3, 5):
+        link.note({"event": "processed", "number": number})
+    link.note({"event": "triangulated", "number": 2})
+    assert not asyncio.run(link.land())
+    assert "exposures 1, 3, 5 are not in its orientations" in events[-1]["sentence"]
+
+
 def test_landing_without_power_ends_the_process_at_once() -> None:
     link, supervisor, events = _link()
     link.start(Path("m"))
