@@ -205,5 +205,6 @@ def block(
     )
     for note in block.notes:
         console.print(note, style="yellow", markup=False)
-    console.print(f"Coordinates: {frame or 'a frame that the file does not state'}")
-    console.print(f"Next: syntopic adjust {out}")
+    console.print(f"Coordinates: {frame or 'a frame that the file does not state'}", soft_wrap=True)
+    if counts["image_points"]:
+        console.print(f"Next: syntopic adjust {out}", soft_wrap=True)

@@ -99,7 +99,10 @@ class BlockPoints:
 
 @dataclass(frozen=True)
 class Block:
-    """Cameras, images and, where known, the frame, the coordinate system and the object points."""
+    """Cameras, images and, where known, the frame, the coordinate system and the object points.
+
+    `is_metric` is false where the file states that its coordinates have a scale of their own.
+    """
 
     name: str
     cameras: tuple[BlockCamera, ...]
@@ -108,6 +111,7 @@ class Block:
     georeference: Georeference | None = None
     points: BlockPoints = field(default_factory=BlockPoints)
     notes: tuple[str, ...] = ()
+    is_metric: bool = True
 
 
 def fitted(

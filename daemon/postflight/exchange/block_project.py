@@ -6,6 +6,7 @@ deviations of positions the project is a free network.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,13 +15,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from daemon.orientation.local_frame import FRAME_FILE
 from daemon.postflight.adjustment.project import CheckPoints
 from daemon.postflight.adjustment.project_file import AdjustSection, CameraSection, ProjectFile
 from daemon.postflight.adjustment.project_writer import write_project
 from daemon.postflight.exchange.block import FIT_LIMIT_PX, Block, BlockCamera, BlockError
 from daemon.postflight.exchange.bundler import read_bal, read_bundler
 from daemon.postflight.exchange.colmap import read_colmap
-from daemon.postflight.exchange.metashape import read_metashape
+from daemon.postflight.exchange.metashape_reader import read_metashape
 from daemon.postflight.exchange.opensfm import read_opensfm
 from processing.bundle.network import (
     INTERIOR,
@@ -49,6 +51,10 @@ READERS: Mapping[str, Callable[[Path], Block]] = {
 }
 NOMINAL_PITCH_MM = 1e-3
 """Of cameras whose file states no pixel size: a residual in um is one in px."""
+NO_POINTS = (
+    "the file has no image measurements: the project holds cameras and orientations alone, and "
+    "`syntopic adjust` needs points.csv and image_points.csv"
+)
 _TERMS = ("k1", "k2", "k3", "p1", "p2", "b1", "b2")
 _GRID = 25
 
@@ -79,10 +85,17 @@ def import_block(
         position_sigma_m: of the projection centres as observations, x, y, z; None: free network.
 
     Raises:
-        BlockError: files that cannot be read, or a distortion that cannot be converted.
+        BlockError: files that cannot be read, a distortion that cannot be converted, or standard
+            deviations in metres for positions that are not in metres.
         ProjectError: `out` holds a project.
     """
     block = READERS[program](path)
+    if position_sigma_m is not None and not block.is_metric:
+        raise BlockError(
+            f"{path}: its positions are not in metres ({'; '.join(block.notes)}), so that "
+            "--position-sigma in metres does not hold; leave it out, or georeference the block in "
+            "the other program"
+        )
     pitches = [camera.pitch_mm or NOMINAL_PITCH_MM for camera in block.cameras]
     fits = [_lens_of(c, pitch) for c, pitch in zip(block.cameras, pitches, strict=True)]
     network = _network(block, pitches, [lens for lens, _ in fits], sigma_px, position_sigma_m)
@@ -97,6 +110,14 @@ def import_block(
     )
     none = CheckPoints((), np.zeros((0, 3)), np.zeros((0, 3)))
     write_project(out, file, network, none)
+    if block.frame is not None:
+        stated = {
+            "latitude_deg": block.frame.latitude_deg,
+            "longitude_deg": block.frame.longitude_deg,
+        }
+        (out / FRAME_FILE).write_text(json.dumps(stated) + "\n", encoding="utf-8")
+    if not len(block.points.image):
+        block = replace(block, notes=(*block.notes, NO_POINTS))
     residuals = {c.name: worst for c, (_, worst) in zip(block.cameras, fits, strict=True)}
     return ImportedBlock(block, residuals)
 

@@ -1,7 +1,8 @@
-"""Metashape's camera file (`cameras.xml`): sensors, rig, cameras, reference; out and back.
+"""Metashape's camera file (`cameras.xml`): sensors, rig, cameras, reference of one component.
 
-Chunk coordinates are those of the local frame, and the chunk's transformation carries them to the
-earth's centre. Axes are those of computer vision; principal points count from the image's middle.
+Chunk coordinates are those of the local frame, and the component's transformation carries them to
+the earth's centre. Axes are those of computer vision; principal points count from the image's
+middle. `daemon.postflight.exchange.metashape_reader` reads such files.
 
 Source: Agisoft Metashape User Manual, Professional Edition, version 2.1, appendix D "Camera
 models", and the files that its "Export Cameras" writes.
@@ -9,16 +10,12 @@ models", and the files that its "Export Cameras" writes.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from pathlib import Path
 from xml.etree import ElementTree as ET
 
 import numpy as np
 import pyproj
 from numpy.typing import NDArray
 
-from daemon.mission.foreign_files import ForeignFileError, read_regular_file
-from daemon.mission.foreign_xml import XmlError, parse_xml
 from daemon.orientation.geodesy import ECEF_FROM_GEODETIC
 from daemon.orientation.local_frame import LocalFrame, enu_axes
 from daemon.postflight.exchange.block import (
@@ -36,9 +33,8 @@ from processing.geometry.forward_distortion import ForwardDistortion
 Array = NDArray[np.float64]
 
 VERSION = "2.0.0"
-XML_MAX_BYTES = 1_000_000_000
-ELEMENTS_MAX = 5_000_000
-_TERMS = {
+COMPONENT = "0"
+TERMS = {
     "k1": "k1", "k2": "k2", "k3": "k3", "k4": "radial_r8", "p1": "p2", "p2": "p1",
 }  # fmt: skip
 """Metashape's coefficients by name, and ours: its P1 acts along x, ours along y."""
@@ -69,13 +65,13 @@ def metashape_texts(
     for number, camera in enumerate(block.cameras):
         _, model, residuals[camera.name] = fitted(camera, ("pinhole", "metashape"))
         _sensor(sensors, number, camera, model, rig)
+    _component(chunk, block, block.frame)
     cameras = ET.SubElement(chunk, "cameras", next_id=str(len(block.images)), next_group_id="0")
     masters = _masters(block, rig)
     for number, image in enumerate(block.images):
         _camera(cameras, number, image, masters[number], suffix)
     reference = ET.SubElement(chunk, "reference")
     reference.text = pyproj.CRS.from_epsg(4326).to_wkt("WKT1_GDAL")
-    _chunk_transform(chunk, block.frame)
     ET.indent(root)
     text = '<?xml version="1.0" encoding="UTF-8"?>\n' + ET.tostring(root, encoding="unicode") + "\n"
     return {"cameras.xml": text}, residuals
@@ -113,7 +109,7 @@ def _sensor(
         "cy": model.cy_px - (camera.height_px - 1) / 2.0,
         "b1": model.fx_px - model.fy_px,
         "b2": model.skew_px,
-        **{theirs: getattr(model, ours) for theirs, ours in _TERMS.items()},
+        **{theirs: getattr(model, ours) for theirs, ours in TERMS.items()},
     }
     for name, value in values.items():
         ET.SubElement(calibration, name).text = repr(value)
@@ -147,7 +143,12 @@ def _masters(block: Block, rig: BlockRig | None) -> list[int | None]:
 def _camera(
     parent: ET.Element, number: int, image: BlockImage, master: int | None, suffix: str
 ) -> None:
-    attributes = {"id": str(number), "sensor_id": str(image.camera), "label": image.name + suffix}
+    attributes = {
+        "id": str(number),
+        "sensor_id": str(image.camera),
+        "component_id": COMPONENT,
+        "label": image.name + suffix,
+    }
     if master is not None:
         attributes["master_id"] = str(master)
     camera = ET.SubElement(parent, "camera", attributes | {"enabled": "true"})
@@ -172,133 +173,19 @@ def _camera(
     ET.SubElement(camera, "reference", reference | flags)
 
 
-def _chunk_transform(chunk: ET.Element, frame: LocalFrame) -> None:
-    transform = ET.SubElement(chunk, "transform")
+def _component(chunk: ET.Element, block: Block, frame: LocalFrame) -> None:
+    components = ET.SubElement(chunk, "components", next_id="1", active_id=COMPONENT)
+    component = ET.SubElement(components, "component", id=COMPONENT, label="Component 1")
+    transform = ET.SubElement(component, "transform")
     axes = enu_axes(frame.latitude_deg, frame.longitude_deg)
     origin = ECEF_FROM_GEODETIC.transform(frame.longitude_deg, frame.latitude_deg, 0.0)
     ET.SubElement(transform, "rotation", locked="true").text = _text(axes)
     ET.SubElement(transform, "translation", locked="true").text = _text(np.array(origin))
     ET.SubElement(transform, "scale", locked="true").text = "1.0"
+    partition = ET.SubElement(component, "partition")
+    numbers = " ".join(str(number) for number in range(len(block.images)))
+    ET.SubElement(partition, "camera_ids").text = numbers
 
 
 def _text(values: Array) -> str:
     return " ".join(repr(float(v)) for v in np.asarray(values).ravel())
-
-
-def read_metashape(path: Path) -> Block:
-    """Read the cameras of the one chunk of a camera file; images not aligned are left out.
-
-    Raises:
-        BlockError: no such file, several chunks, or a sensor of another type than frame.
-    """
-    try:
-        root = parse_xml(read_regular_file(path, XML_MAX_BYTES), elements_max=ELEMENTS_MAX)
-    except (ForeignFileError, XmlError) as error:
-        raise BlockError(f"{path}: {error}; give the file of Metashape's Export Cameras") from error
-    chunks = root.findall("chunk")
-    if len(chunks) != 1:
-        raise BlockError(f"{path}: {len(chunks)} chunks; export one chunk to a file")
-    try:
-        return _block_of(path, chunks[0])
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise BlockError(f"{path}: not Metashape's camera file ({error!r})") from error
-
-
-def _block_of(path: Path, chunk: ET.Element) -> Block:
-    index: dict[str, int] = {}
-    cameras: list[BlockCamera] = []
-    for sensor in chunk.iterfind("sensors/sensor"):
-        index[sensor.attrib["id"]] = len(cameras)
-        cameras.append(_camera_of(path, sensor))
-    scale = float(chunk.findtext("transform/scale") or 1.0)
-    frame = _frame_of(chunk, scale)
-    images, left_out = [], []
-    frames: dict[str, int] = {}
-    every = list(_cameras(chunk))
-    for number, camera in enumerate(every, 1):
-        frames[camera.attrib["id"]] = frames.get(camera.get("master_id", ""), number)
-        text = camera.findtext("transform")
-        if text is None:
-            left_out.append(camera.attrib["label"])
-            continue
-        if camera.attrib["sensor_id"] not in index:
-            raise BlockError(
-                f"{path}: camera {camera.attrib['label']} names sensor "
-                f"{camera.attrib['sensor_id']}, which is not in the file"
-            )
-        pose = _numbers(text, 16).reshape(4, 4)
-        images.append(
-            BlockImage(
-                camera.attrib["label"],
-                index[camera.attrib["sensor_id"]],
-                frames[camera.attrib["id"]],
-                np.asarray(pose[:3, 3] * scale),
-                np.asarray(pose[:3, :3] @ VISION_FROM_CAMERA),
-            )
-        )
-    if not images:
-        raise BlockError(f"{path}: no camera has a transform; align the photos first")
-    notes = (f"not aligned: {', '.join(left_out)}",) if left_out else ()
-    return Block(chunk.get("label", path.stem), tuple(cameras), tuple(images), frame, notes=notes)
-
-
-def _cameras(chunk: ET.Element) -> Iterable[ET.Element]:
-    yield from chunk.iterfind("cameras/camera")
-    yield from chunk.iterfind("cameras/group/camera")
-
-
-def _camera_of(path: Path, sensor: ET.Element) -> BlockCamera:
-    label = sensor.attrib["label"]
-    if sensor.attrib["type"] != "frame":
-        raise BlockError(
-            f"{path}: sensor {label} is of type {sensor.attrib['type']}; frame cameras are carried"
-        )
-    known = {one.attrib["class"]: one for one in sensor.iterfind("calibration")}
-    calibration = known.get("adjusted", known.get("initial"))
-    if calibration is None:
-        raise BlockError(f"{path}: sensor {label} has no calibration")
-    size = sensor.find("resolution")
-    if size is None:
-        raise BlockError(f"{path}: sensor {label} has no resolution")
-    width, height = int(size.attrib["width"]), int(size.attrib["height"])
-    focal = calibration.findtext("f") or calibration.findtext("fy")
-    if focal is None:
-        raise BlockError(f"{path}: sensor {label} has no f")
-
-    def value(name: str) -> float:
-        return float(calibration.findtext(name) or 0.0)
-
-    model = ForwardDistortion(
-        float(focal) + value("b1"),
-        float(focal),
-        value("cx") + (width - 1) / 2.0,
-        value("cy") + (height - 1) / 2.0,
-        skew_px=value("b2"),
-        **{ours: value(theirs) for theirs, ours in _TERMS.items()},
-    )
-    pitch = {p.attrib["name"]: p.attrib["value"] for p in sensor.iterfind("property")}
-    pitch_mm = float(pitch["pixel_width"]) if "pixel_width" in pitch else None
-    bands = tuple(band.attrib["label"].lower() for band in sensor.iterfind("bands/band"))
-    return BlockCamera(label, width, height, model, pitch_mm, bands)
-
-
-def _frame_of(chunk: ET.Element, scale: float) -> LocalFrame | None:
-    """The local frame of the chunk, where its transformation is one onto the ellipsoid."""
-    rotation, translation = (
-        chunk.findtext("transform/rotation"),
-        chunk.findtext("transform/translation"),
-    )
-    if rotation is None or translation is None:
-        return None
-    x, y, z = _numbers(translation, 3).tolist()
-    longitude, latitude, height = ECEF_FROM_GEODETIC.transform(x, y, z, direction="INVERSE")
-    axes = _numbers(rotation, 9).reshape(3, 3)
-    is_level = np.abs(axes - enu_axes(latitude, longitude)).max() < 1e-9 and abs(height) < 1e-4
-    return LocalFrame(float(latitude), float(longitude)) if is_level and scale == 1.0 else None
-
-
-def _numbers(text: str, count: int) -> Array:
-    values: Sequence[float] = [float(v) for v in text.split()]
-    if len(values) != count or not np.isfinite(values).all():
-        raise ValueError(f"{len(values)} numbers; {count} finite ones are needed")
-    return np.array(values)

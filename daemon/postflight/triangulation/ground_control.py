@@ -188,8 +188,10 @@ def _geodetic(path: Path, system: str, xyz: Array) -> Array:
             "heights is unknown; add a height system, such as EPSG:2236+6360, or convert to metres"
         )
     try:
-        longitude, latitude, height = accurate_transformer(crs, system[:80]).transform(
-            *xyz.T, direction="INVERSE", errcheck=True
+        transformer = accurate_transformer(crs, system[:80])
+        x, y, z = xyz.T
+        longitude, latitude, height = transformer.transform(
+            x, y, z, direction="INVERSE", errcheck=True
         )
     except (GeoreferenceError, ProjError) as error:
         raise TriangulationError(f"{path.name} line 1: {error}") from error

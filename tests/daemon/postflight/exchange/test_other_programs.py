@@ -17,7 +17,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from daemon.postflight.exchange.block import BlockError, rig_of
-from daemon.postflight.exchange.metashape import metashape_texts, read_metashape
+from daemon.postflight.exchange.block_project import import_block
+from daemon.postflight.exchange.metashape import metashape_texts
+from daemon.postflight.exchange.metashape_reader import read_metashape
 from daemon.postflight.exchange.opensfm import read_opensfm
 from tests.daemon.postflight.exchange.flown_block import (
     FLIGHT,
@@ -149,9 +151,13 @@ def test_metashape_cameras_project_right_and_lie_on_the_earth(flown) -> None:
     assert worst_px(flown, about["origin"], pixels) < 0.02
     assert worst_px(flown, about["origin"], lambda n, p: pixels(n, p, by_master=True)) < 0.02
     chunk = root.find("chunk")
-    turn = numbers(chunk, "transform/rotation").reshape(3, 3)
+    component = chunk.find("components/component")
+    assert component.findtext("partition/camera_ids").split() == [
+        c.get("id") for c in cameras.values()
+    ]
+    turn = numbers(component, "transform/rotation").reshape(3, 3)
     at = turn @ numbers(cameras["000002_nadir.jpg"], "transform").reshape(4, 4)[:3, 3]
-    at += numbers(chunk, "transform/translation")
+    at += numbers(component, "transform/translation")
     to_earth = pyproj.Transformer.from_crs("EPSG:4979", "EPSG:4978")
     truth = to_earth.transform(*FLIGHT.geodetic(FLIGHT.pose(flown.marks[2]).position_enu_m))
     assert np.abs(at - truth).max() < 0.001
@@ -216,6 +222,124 @@ def test_opensfm_and_metashape_come_back_as_they_went(flown) -> None:
     written, _ = metashape_texts(again, rig_of(again, 0), "")
     first = (other / "cameras.xml").read_text()
     assert sensors_of(written["cameras.xml"]) == sensors_of(first)
+
+
+TURN = Rotation.from_euler("xyz", [20, -130, 75], degrees=True).as_matrix()
+SHIFT, SCALE = np.array([3.0, -8.0, 11.0]), 12.354
+
+
+def as_metashape_writes(text: str) -> ElementTree.Element:
+    """Our file with chunk units of its own, and slaves without a transform."""
+    root = ElementTree.fromstring(text)
+    place = root.find("chunk/components/component/transform")
+    rotation = np.array(place.findtext("rotation").split(), float).reshape(3, 3)
+    origin = np.array(place.findtext("translation").split(), float)
+    for camera in root.iter("camera"):
+        own = camera.find("transform")
+        if camera.get("master_id") is not None:
+            camera.remove(own)
+            continue
+        pose = np.array(own.text.split(), float).reshape(4, 4)
+        pose[:3, :3] = TURN @ pose[:3, :3]
+        pose[:3, 3] = TURN @ pose[:3, 3] / SCALE + SHIFT
+        own.text = " ".join(map(repr, pose.ravel().tolist()))
+    to_earth = rotation @ TURN.T
+    place.find("rotation").text = " ".join(map(repr, to_earth.ravel().tolist()))
+    moved = origin - SCALE * to_earth @ SHIFT
+    place.find("translation").text = " ".join(map(repr, moved.tolist()))
+    place.find("scale").text = repr(SCALE)
+    return root
+
+
+def test_a_component_with_a_scale_of_its_own_is_read_in_metres(flown, tmp_path) -> None:
+    _, folder = export(flown, "--images", "raw", to="metashape")
+    root = as_metashape_writes((folder / "cameras.xml").read_text())
+    file = tmp_path / "cameras.xml"
+    file.write_bytes(ElementTree.tostring(root))
+    first, again = read_metashape(folder / "cameras.xml"), read_metashape(file)
+    assert again.is_metric and again.frame is not None
+    at = {image.name: again.frame.to_geodetic(image.centre_m[None]) for image in again.images}
+    for image in first.images:
+        there = again.frame.from_geodetic(*first.frame.to_geodetic(image.centre_m[None]).T)
+        back = again.frame.from_geodetic(*at[image.name].T)
+        assert np.abs(there - back).max() < 1e-4
+    turn = again.frame.local_from_enu(first.frame.latitude_deg, first.frame.longitude_deg)
+    for a, b in zip(first.images, again.images, strict=True):
+        assert np.abs(turn @ a.rotation - b.rotation).max() < 1e-9
+    truth = FLIGHT.geodetic(FLIGHT.pose(flown.marks[2]).position_enu_m)
+    assert np.abs(at["000002_nadir.jpg"] - truth).max() < 0.001
+    assert any("is taken as metres" in note for note in again.notes)
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ("p3", r"sensor nadir has p3 0\.5; b1, .* are carried"),
+        ("fx", "PhotoScan before 1.2"),
+        ("component", r"2 components, Component 1 \(15 cameras\), other \(5 cameras\)"),
+        ("master", "names master 99"),
+        ("datum", "not on the ellipsoid of WGS 84"),
+        ("feet", "local coordinates in foot"),
+        ("scale", "scale -2"),
+        ("skewed", "is no rotation"),
+    ],
+)
+def test_what_metashape_writes_and_is_not_carried_is_refused(
+    flown, tmp_path, change, sentence
+) -> None:
+    _, folder = export(flown, "--images", "raw", to="metashape")
+    root = as_metashape_writes((folder / "cameras.xml").read_text())
+    place = root.find("chunk/components/component/transform")
+    calibration, reference = root.find(".//calibration"), root.find("chunk/reference")
+    if change in ("p3", "fx"):
+        ElementTree.SubElement(calibration, change).text = "0.5"
+    elif change == "component":
+        other = ElementTree.SubElement(root.find("chunk/components"), "component", id="1")
+        other.set("label", "other")
+        for camera in [c for c in root.iter("camera") if c.get("label").startswith("000003")]:
+            camera.set("component_id", "1")
+    elif change == "master":
+        root.findall(".//camera[@master_id]")[0].set("master_id", "99")
+    elif change == "datum":
+        reference.text = pyproj.CRS.from_epsg(4267).to_wkt("WKT1_GDAL")
+    elif change == "feet":
+        reference.text = 'LOCAL_CS["Local (ft)",LOCAL_DATUM["Local",0],UNIT["foot",0.3048]]'
+    elif change == "scale":
+        place.find("scale").text = "-2"
+    else:
+        place.find("rotation").text = "1 0 0 0 1 0 0 0 1.1"
+    file = tmp_path / "cameras.xml"
+    file.write_bytes(ElementTree.tostring(root))
+    with pytest.raises(BlockError, match=sentence):
+        read_metashape(file)
+
+
+def test_chunk_units_are_no_metres(flown, tmp_path) -> None:
+    _, folder = export(flown, "--images", "raw", to="metashape")
+    root = as_metashape_writes((folder / "cameras.xml").read_text())
+    component = root.find("chunk/components/component")
+    component.remove(component.find("transform"))
+    file = tmp_path / "cameras.xml"
+    file.write_bytes(ElementTree.tostring(root))
+    with pytest.raises(BlockError, match="not in metres"):
+        import_block(file, "metashape", tmp_path / "p", position_sigma_m=(0.02, 0.02, 0.03))
+    assert not (tmp_path / "p").exists()
+    assert not import_block(file, "metashape", tmp_path / "p").block.is_metric
+    place = 'LOCAL_CS["Local (m)",LOCAL_DATUM["Local",0],UNIT["metre",1]]'
+    transform = ElementTree.SubElement(component, "transform")
+    ElementTree.SubElement(transform, "scale").text = "2"
+    root.find("chunk/reference").text = place
+    file.write_bytes(ElementTree.tostring(root))
+    block = read_metashape(file)
+    assert block.is_metric and block.frame is None
+
+
+def test_a_project_without_image_measurements_says_so(flown, tmp_path) -> None:
+    _, folder = export(flown, to="metashape")
+    done = import_block(folder / "cameras.xml", "metashape", tmp_path / "p")
+    assert any("no image measurements" in note for note in done.block.notes)
+    stated = json.loads((tmp_path / "p/frame.json").read_text())
+    assert stated["latitude_deg"] == pytest.approx(done.block.frame.latitude_deg, abs=1e-12)
 
 
 def sensors_of(text: str) -> list[str]:
