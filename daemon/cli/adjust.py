@@ -20,6 +20,7 @@ from daemon.terminal.console import Console
 
 if TYPE_CHECKING:
     from processing.bundle.critical_values import TestName
+    from processing.bundle.free_datum import FreeDatum
     from processing.bundle.robust_weights import WeightFunction
 
 HELP = """Adjust a bundle from a project of text files.
@@ -71,6 +72,13 @@ def adjust(
         bool | None,
         typer.Option("--free-network/--no-free-network", help="Accept a network without datum."),
     ] = None,
+    free_datum: Annotated[
+        str | None,
+        typer.Option(
+            help="Datum of a free network: unknowns, points, stations, all or dependent "
+            "(default: unknowns)."
+        ),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     from daemon.postflight.adjustment.csv_tables import ProjectError
@@ -83,7 +91,9 @@ def adjust(
     from processing.bundle.network import NetworkError
     from processing.bundle.rank_diagnosis import RankDefectError
 
-    _refuse_unknown_choices(weight_function, test)
+    _refuse_unknown_choices(weight_function, test, free_datum)
+    if free_datum is not None and free_network is False:
+        raise ConfigurationError(["--free-datum is of a free network; leave out --no-free-network"])
     if reject is not None and significance is not None:
         raise ConfigurationError(["--reject and --significance both set the limit; give one"])
     if out is not None and (out / "project.toml").exists():
@@ -108,6 +118,8 @@ def adjust(
         settings = replace(settings, variance_components=components)
     if free_network is not None:
         settings = replace(settings, minimum_norm=free_network)
+    if free_datum is not None:
+        settings = replace(settings, minimum_norm=True, free_datum=cast("FreeDatum", free_datum))
     problems: tuple[str, ...] = ()
     try:
         with Progress(console=Console(stderr=True), transient=True) as progress:
@@ -152,12 +164,18 @@ def adjust(
         raise typer.Exit(ExitStatus.PROBLEM)
 
 
-def _refuse_unknown_choices(weight_function: str | None, test: str | None) -> None:
+def _refuse_unknown_choices(
+    weight_function: str | None, test: str | None, free_datum: str | None
+) -> None:
     problems = []
     if weight_function not in (None, "huber", "cauchy", "tukey", "danish"):
         problems.append(f"--weight-function is {weight_function}; huber, cauchy, tukey or danish")
     if test not in (None, "pope", "baarda"):
         problems.append(f"--test is {test}; pope or baarda")
+    if free_datum not in (None, "unknowns", "points", "stations", "all", "dependent"):
+        problems.append(
+            f"--free-datum is {free_datum}; unknowns, points, stations, all or dependent"
+        )
     if problems:
         raise ConfigurationError(problems)
 

@@ -183,9 +183,12 @@ def triangulate(
         Progress(console=Console(stderr=True), transient=True) as progress,
     ):
         task = progress.add_task("matching", total=len(block.names))
-        tied = match_mission_block(
-            block, requirements.matching, lambda done: progress.update(task, completed=done)
-        )
+        try:
+            tied = match_mission_block(
+                block, requirements.matching, lambda done: progress.update(task, completed=done)
+            )
+        except NetworkError as error:
+            raise TriangulationError(f"{folder.path}: {error}") from error
         project = project_of(block, tied, requirements, points_file=points, measured_file=measured)
         progress.update(task, total=None, description="starting values")
         try:

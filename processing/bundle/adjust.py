@@ -42,6 +42,7 @@ from processing.bundle.statistics import ObservationGroup, groups_of, spread_of
 from processing.bundle.step_control import points_in_front
 from processing.bundle.undetermined_points import undetermined_points
 from processing.bundle.unknowns import ParameterLayout, ParameterValues, initial_values, layout_of
+from processing.bundle.variance_components import are_changing, estimable_factors, rescaled
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -49,7 +50,6 @@ Flags = NDArray[np.bool_]
 _MIN_POINTS: Final = 4
 _MIN_SHARE: Final = 0.3
 _MAX_COMPONENT_ROUNDS: Final = 12
-_COMPONENT_CONVERGED: Final = 0.02
 
 
 @dataclass(frozen=True)
@@ -198,10 +198,13 @@ def adjust(
     history: list[float] = []
     robust = settings.robust
     weak = np.zeros(len(network.points.names), dtype=bool)
+    began = state
     while True:
         active = selection.active()
         weight = np.where(selection.excluded.image, 0.0, 1.0)
         left_out = undetermined_points(active, state, weight) | weak
+        if weak.any():
+            _refuse_without_points(~undetermined_points(network, began), left_out)
         layout = layout_of(active, left_out)
         run = Run(
             active,
@@ -213,18 +216,19 @@ def adjust(
             max_iterations=settings.max_iterations,
             minimum_norm=settings.minimum_norm,
         )
-        if robust:
-            found = robust_exclusions(run, settings.weight_function)
-            selection.excluded = selection.excluded.joined(found)
-            state, robust = run.state, False
-            continue
         try:
+            if robust:
+                found = robust_exclusions(run, settings.weight_function)
+                selection.excluded = selection.excluded.joined(found)
+                state, robust = run.state, False
+                continue
             rows, reduced = iterate(run)
         except WeakPointsError as error:
             weak[error.points] = True
             state = run.state
-            _refuse_without_points(active, weak)
-            report_progress(f"weak points set aside: {int(weak.sum())}", len(history), history[-1])
+            # Robust iterations leave no history.
+            squares = history[-1] if history else 0.0
+            report_progress(f"weak points set aside: {int(weak.sum())}", len(history), squares)
             continue
         state = run.state
         result = _figures(run, settings, network, rows, reduced, left_out, selection)
@@ -240,14 +244,13 @@ def adjust(
         report_progress(what, selection.rounds, history[-1])
 
 
-def _refuse_without_points(network: Network, weak: Flags) -> None:
+def _refuse_without_points(determined: Flags, left_out: Flags) -> None:
     """Refuse a block of which nearly parallel rays leave next to no object points."""
-    seen = np.unique(network.image_points.point)
-    left = int((~weak[seen]).sum())
-    if left < max(_MIN_POINTS, _MIN_SHARE * len(seen)):
+    before, left = int(determined.sum()), int((determined & ~left_out).sum())
+    if left < max(_MIN_POINTS, _MIN_SHARE * before):
         raise NetworkError(
             [
-                f"rays are nearly parallel: {len(seen) - left} of {len(seen)} object points have "
+                f"rays are nearly parallel: {before - left} of {before} object points have "
                 "no place in front of the cameras; images with larger distances between them, or "
                 "better starting values, are needed"
             ]
@@ -261,6 +264,13 @@ def _validate_settings(settings: AdjustmentSettings) -> None:
     for name, value in (("significance", settings.significance), ("power", settings.power)):
         if value is not None and not 0.0 < value < 1.0:
             problems.append(f"{name} is {value:g}; it is between 0 and 1")
+    if not settings.minimum_norm and (settings.free_datum != "unknowns" or settings.datum_names):
+        problems.append("free_datum and datum_names are of a free network: set minimum_norm, too")
+    elif settings.datum_names and settings.free_datum == "unknowns":
+        problems.append(
+            "datum_names name points or stations of a datum, and free_datum is unknowns: set it to "
+            "points, stations, all or dependent"
+        )
     if problems:
         raise NetworkError(problems)
 
@@ -282,7 +292,7 @@ class _Selection:
 
     def active(self) -> Network:
         """The network to adjust next."""
-        return self.excluded.applied(_rescaled(self.given, self.factors))
+        return self.excluded.applied(rescaled(self.given, self.factors))
 
     def advance(self, result: Adjustment, reduced: ReducedEquations) -> str | None:
         """Choose again after an adjustment; what was done, None when the selection is final."""
@@ -296,10 +306,10 @@ class _Selection:
         if (
             settings.variance_components
             and self.component_rounds < _MAX_COMPONENT_ROUNDS
-            and _components_changing(result)
+            and are_changing(result.groups, result.factors)
         ):
             self.component_rounds += 1
-            self.factors = {g.name: g.factor for g in result.groups if _is_estimable(g)}
+            self.factors = estimable_factors(result.groups)
             return "variance components"
         return None
 
@@ -350,7 +360,7 @@ class _Selection:
         if not candidates.count:
             return candidates
         return fitting_again(
-            _rescaled(self.given, self.factors),
+            rescaled(self.given, self.factors),
             result.layout,
             result.state,
             candidates,
@@ -448,44 +458,3 @@ def _figures(
 def _fixed_distance_points(layout: ParameterLayout) -> Flags:
     """Fully held points that distances end at: neither eliminated nor with columns."""
     return np.asarray(layout.locked.all(axis=1) & (layout.eliminated < 0))
-
-
-def _components_changing(result: Adjustment) -> bool:
-    """Whether a variance component still differs from what the sigmas hold."""
-    return any(
-        _is_estimable(g)
-        and abs(np.log(g.factor / result.factors.get(g.name, 1.0))) > _COMPONENT_CONVERGED
-        for g in result.groups
-    )
-
-
-def _is_estimable(group: ObservationGroup) -> bool:
-    """Enough redundancy for a variance component: known to about a third or better."""
-    return bool(np.isfinite(group.factor) and group.factor > 0.0 and group.redundancy >= 15.0)
-
-
-def _rescaled(network: Network, factors: Mapping[str, float]) -> Network:
-    """The network with each kind's sigmas multiplied by the root of its variance factor."""
-    if not factors:
-        return network
-    root = {name: float(np.sqrt(value)) for name, value in factors.items()}
-
-    def of(name: str) -> float:
-        return root.get(name, 1.0)
-
-    table, points, gnss = network.image_points, network.points, network.gnss
-    plan_height = np.array([of("control plan"), of("control plan"), of("control height")])
-    gnss_scale = np.array([of("GNSS plan"), of("GNSS plan"), of("GNSS height")])
-    return replace(
-        network,
-        image_points=replace(
-            table, sigma_mm=table.sigma_mm * np.array([of("image x"), of("image y")])
-        ),
-        points=replace(points, sigma_m=points.sigma_m * plan_height),
-        gnss=replace(gnss, sigma_m=gnss.sigma_m * gnss_scale),
-        measured_attitudes=replace(
-            network.measured_attitudes,
-            sigma_rad=network.measured_attitudes.sigma_rad * of("attitude"),
-        ),
-        distances=replace(network.distances, sigma_m=network.distances.sigma_m * of("distance")),
-    )

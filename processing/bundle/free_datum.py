@@ -19,7 +19,7 @@ from processing.geometry.rotation import rotations_from_vectors
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
-FreeDatum = Literal["unknowns", "points", "stations", "all"]
+FreeDatum = Literal["unknowns", "points", "stations", "all", "dependent"]
 
 _MAX_STEPS: Final = 50
 _STEP_CONVERGED: Final = 1e-14
@@ -148,10 +148,12 @@ def in_datum(
     datum: FreeDatum,
     chosen: tuple[str, ...] = (),
 ) -> DatumFigures:
-    """Move a free network to the datum of chosen object points and stations.
+    """Move a free network to another datum.
 
-    The sum of squares of the differences between adjusted and starting coordinates of the chosen is
-    smallest, and so is the trace of their covariance (inner constraints).
+    Of chosen object points and stations: the sum of squares of the differences between their
+    adjusted and starting coordinates is smallest, and so is the trace of their covariance (inner
+    constraints). `dependent`: one exposure keeps its starting position and attitude, and another
+    one coordinate.
 
     Args:
         network: starting values.
@@ -160,8 +162,10 @@ def in_datum(
         reduced: reduced equations of the adjustment.
         row_point: eliminated point of each row, -1 where there is none, shape (m,).
         motions: what is free.
-        datum: object points, stations, or both.
-        chosen: names of those that define it; all of them if empty.
+        datum: object points, stations, or both; or `dependent`.
+        chosen: names of those that define it; all of them if empty. Of `dependent` the exposure
+            that is held, and the one that keeps a coordinate; the first, and that of the largest
+            coordinate relative to it, where they are not given.
 
     Returns:
         The same in the datum.
@@ -171,12 +175,17 @@ def in_datum(
 
     Source: Meissl (1962); docs/explanation/mathematics/bundle.md#rank-and-free-networks.
     """
-    points, stations = _members(network, layout, datum, chosen)
-    state = _best_fit(network, figures.state, motions, points, stations)
-    at_station = layout.station[stations]
-    g_points, g_stations = motions.points[points], motions.columns[at_station]
-    normal = np.einsum("pid,pie->de", g_points, g_points)
-    normal += np.einsum("pid,pie->de", g_stations, g_stations)
+    if datum == "dependent":
+        dependent = dependent_datum(network, layout, motions, chosen)
+        points = np.zeros(0, dtype=np.int64)
+        taken = dependent.columns(layout)
+        state = dependent.applied(network, figures.state)
+    else:
+        points, stations = _members(network, layout, datum, chosen)
+        taken = layout.station[stations].ravel()
+        state = _best_fit(network, figures.state, motions, points, stations)
+    g_points, g_columns = motions.points[points], motions.columns[taken]
+    normal = np.einsum("pid,pie->de", g_points, g_points) + g_columns.T @ g_columns
     d = len(normal)
     scale = np.sqrt(np.clip(np.diag(normal), 1e-300, None))
     values = np.linalg.eigvalsh(normal / scale[:, None] / scale)
@@ -187,13 +196,10 @@ def in_datum(
     inverse = np.linalg.inv(normal)
     # t = by_columns x + sum of by_point p over the eliminated points of the datum.
     by_columns = np.zeros((d, layout.columns))
-    for of_kind, its_columns in (
-        (g_stations, at_station),
-        (g_points, layout.retained_points[points]),
-    ):
-        there = its_columns >= 0
-        part = np.einsum("de,pie->pid", inverse, of_kind)
-        by_columns[:, its_columns[there]] += part[there].T
+    by_columns[:, taken] = inverse @ g_columns.T
+    retained = layout.retained_points[points]
+    there = retained >= 0
+    by_columns[:, retained[there]] += np.einsum("de,pie->pid", inverse, g_points)[there].T
     own = layout.eliminated[points] >= 0
     where = layout.eliminated[points[own]]
     factor = reduced.point_factor
@@ -235,6 +241,122 @@ def in_datum(
     return DatumFigures(state, cofactor, point_cofactor, influence)
 
 
+@dataclass(frozen=True)
+class DependentDatum:
+    """Dependent relative orientation: a held exposure, and a coordinate of another for the scale.
+
+    Attributes:
+        station, attitude: of the held exposure.
+        base: station that keeps a coordinate; -1 where the scale is determined.
+        axis: that coordinate.
+    """
+
+    station: int
+    attitude: int
+    base: int
+    axis: int
+
+    def columns(self, layout: ParameterLayout) -> NDArray[np.int64]:
+        """Columns that the datum holds.
+
+        Args:
+            layout: columns.
+
+        Returns:
+            Six or seven of them.
+        """
+        held = [*layout.station[self.station], *layout.attitude[self.attitude]]
+        if self.base >= 0:
+            held.append(layout.station[self.base, self.axis])
+        return np.array(held, dtype=np.int64)
+
+    def applied(self, network: Network, state: ParameterValues) -> ParameterValues:
+        """The whole block moved so that what is held has its starting values.
+
+        Args:
+            network: starting values.
+            state: adjusted values in any datum.
+
+        Returns:
+            Adjusted values in this datum.
+        """
+        given, rotation = network.stations.position_m, network.attitudes.rotation[self.attitude]
+        turned = rotation @ state.attitude[self.attitude].T
+        centre = state.station[self.station]
+        scale = 1.0
+        if self.base >= 0:
+            now = (turned @ (state.station[self.base] - centre))[self.axis]
+            scale = float((given[self.base] - given[self.station])[self.axis] / now)
+        infinite = network.points.at_infinity[:, None]
+
+        def place(xyz: Array) -> Array:
+            return np.asarray(given[self.station] + scale * (xyz - centre) @ turned.T)
+
+        return replace(
+            state,
+            station=place(state.station),
+            attitude=turned @ state.attitude,
+            head_offset=scale * state.head_offset,
+            points=np.where(infinite, state.points @ turned.T, place(state.points)),
+        )
+
+
+def dependent_datum(
+    network: Network, layout: ParameterLayout, motions: Motions, chosen: tuple[str, ...] = ()
+) -> DependentDatum:
+    """The exposure and the coordinate that a dependent datum holds.
+
+    Args:
+        network: starting values.
+        layout: columns.
+        motions: what is free.
+        chosen: names of the held exposure and of the one that keeps a coordinate; where they are
+            not given the first free exposure, and that with the largest coordinate relative to it.
+
+    Returns:
+        The datum.
+
+    Raises:
+        NetworkError: names that are no free exposures, or observations that fix part of the
+            position and orientation.
+
+    Source: the option `depend` of the Damped Bundle Adjustment Toolbox.
+    """
+    names = network.stations.names
+    free = (layout.station >= 0).all(axis=1)
+    at = {name: k for k, name in enumerate(names) if free[k]}
+    foreign = [name for name in chosen if name not in at]
+    if foreign or len(chosen) > 2 or len(set(chosen)) < len(chosen):
+        raise NetworkError(
+            [
+                f"the dependent datum names {', '.join(chosen[:5])}; the names of one or two free "
+                "exposures are right"
+            ]
+        )
+    has_scale = bool(np.abs(motions.combinations[:, 6]).max(initial=0.0) > 0.0)
+    station = at[chosen[0]] if chosen else int(np.flatnonzero(free)[0]) if free.any() else -1
+    of_image = np.flatnonzero(network.images.station == station)
+    attitude = int(network.images.attitude[of_image[0]]) if len(of_image) else -1
+    held = attitude >= 0 and bool((layout.attitude[attitude] >= 0).all())
+    if not held or len(motions.combinations) != 6 + has_scale:
+        raise NetworkError(
+            [
+                "a dependent datum needs a block of which nothing fixes position and orientation, "
+                "and an exposure with an attitude of its own; free_datum = stations fits others"
+            ]
+        )
+    if not has_scale:
+        return DependentDatum(station, attitude, -1, 0)
+    offset = network.stations.position_m - network.stations.position_m[station]
+    offset[~free] = 0.0
+    if len(chosen) == 2:
+        base = at[chosen[1]]
+        return DependentDatum(station, attitude, base, int(np.argmax(np.abs(offset[base]))))
+    largest = offset if (offset > 0.0).any() else np.abs(offset)
+    base, axis = np.unravel_index(int(np.argmax(largest)), largest.shape)
+    return DependentDatum(station, attitude, int(base), int(axis))
+
+
 def _members(
     network: Network, layout: ParameterLayout, datum: FreeDatum, chosen: tuple[str, ...]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -248,10 +370,21 @@ def _members(
         taken_points = adjusted & _named(network.points.names, names)
     if datum in ("stations", "all"):
         taken_stations = free & _named(network.stations.names, names)
-    known = {*network.points.names, *network.stations.names}
-    missing = sorted(names - known)
+    known = {
+        "points": {*network.points.names},
+        "stations": {*network.stations.names},
+    }
+    missing = sorted(names - known["points"] - known["stations"])
     if missing:
         raise NetworkError([f"the datum names {', '.join(missing[:5])}, which are not there"])
+    other = sorted(names - known[datum]) if datum in known else []
+    if other:
+        raise NetworkError(
+            [
+                f"the datum is of {datum} and names {', '.join(other[:5])}, which are none; "
+                "free_datum = all takes points and stations"
+            ]
+        )
     return np.flatnonzero(taken_points), np.flatnonzero(taken_stations)
 
 

@@ -16,6 +16,7 @@ from scipy import linalg, sparse
 
 from processing import ProcessingError
 from processing.bundle.equations import Equations
+from processing.bundle.network import NetworkError
 from processing.bundle.unknowns import ParameterLayout
 
 Array = NDArray[np.float64]
@@ -129,14 +130,11 @@ def reduced_equations(
         Normal equations of the columns, with what leads back to the points.
 
     Raises:
-        ValueError: more columns than `MAX_COLUMNS`, or a point that its rays do not fix.
+        NetworkError: more columns than `MAX_COLUMNS`.
+        LinAlgError: a point that its rays do not fix.
     """
     columns, points = layout.columns, len(layout.eliminated_points)
-    if columns > MAX_COLUMNS:
-        raise ValueError(
-            f"{columns} unknowns in addition to the object points; at most {MAX_COLUMNS} "
-            "are adjusted at once: split the block"
-        )
+    refuse_large_block(columns)
     design = equations.reduced
     fill = np.bincount(design.indices, minlength=columns) / max(design.shape[0], 1)
     dense = np.flatnonzero(fill > _DENSE_FILL)
@@ -200,6 +198,24 @@ def reduced_equations(
         damping=damping,
         point_diagonal=of_points,
     )
+
+
+def refuse_large_block(columns: int) -> None:
+    """Refuse a block whose reduced normal matrix would not fit into memory.
+
+    Args:
+        columns: unknowns in addition to the object points; six of an exposure that is free.
+
+    Raises:
+        NetworkError: more than `MAX_COLUMNS`.
+    """
+    if columns > MAX_COLUMNS:
+        raise NetworkError(
+            [
+                f"{columns} unknowns in addition to the object points; at most {MAX_COLUMNS} are "
+                f"adjusted at once, about {MAX_COLUMNS // 6} exposures: split the block"
+            ]
+        )
 
 
 def constrained_matrix(reduced: ReducedEquations, constraints: Array) -> tuple[Array, Array]:

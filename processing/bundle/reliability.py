@@ -65,9 +65,9 @@ def reliability_of(result: Adjustment) -> Reliability:
     controlled = share > MIN_REDUNDANCY
     safe = np.where(controlled, share, 1.0)
     in_sigmas = np.where(controlled, noncentrality / np.sqrt(safe), np.inf)
-    ratio = np.where(controlled, noncentrality * np.sqrt((1.0 - safe) / safe), np.inf)
     length = np.linalg.norm(result.influence, axis=1)
     with np.errstate(invalid="ignore"):
+        ratio = np.where(controlled, noncentrality * np.sqrt((1.0 - safe) / safe), np.inf)
         shift = unit * np.where(length > 0.0, length * in_sigmas, 0.0)
     return Reliability(
         limit=limit,

@@ -50,6 +50,15 @@ class AdjustSection(_ProjectSection):
             raise ValueError("reject_beyond and significance both set the limit; give one of them")
         return self
 
+    @model_validator(mode="after")
+    def _datum_of_a_free_network(self) -> AdjustSection:
+        if self.datum_names and self.free_datum == "unknowns":
+            raise ValueError(
+                "datum_names has no effect with free_datum unknowns; points, stations, all or "
+                "dependent is right"
+            )
+        return self
+
 
 class FilesSection(_ProjectSection):
     """Paths of the tables, relative to the project file."""

@@ -137,7 +137,7 @@ def print_report(console: Console, report: Mapping[str, Any]) -> None:
         highlight=False,
     )
     console.print(
-        f"sigma0 {report['sigma0']:.5g}, redundancy {report['redundancy']}, "
+        f"sigma0 {_number(report['sigma0'], 5)}, redundancy {report['redundancy']}, "
         f"{report['observations']} observations, {report['unknowns']} unknowns, "
         f"{report['iterations']} iterations, {report['seconds']} s, {report['peak_mib']} MiB",
         highlight=False,
@@ -168,8 +168,9 @@ def print_report(console: Console, report: Mapping[str, Any]) -> None:
         )
         for p in report["parameters"]:
             table.add_row(
-                p["camera"], p["name"], f"{p['value']:.6g}", f"{p['sigma']:.3g}", p["unit"],
-                f"{p['t']:.1f}", "may be dropped" if p["t"] < 2.0 else "",
+                p["camera"], p["name"], f"{p['value']:.6g}", _number(p["sigma"], 3), p["unit"],
+                "-" if p["t"] is None else f"{p['t']:.1f}",
+                "may be dropped" if p["t"] is not None and p["t"] < 2.0 else "",
             )  # fmt: skip
         console.print(table)
         _print_correlations(console, report)
@@ -263,17 +264,15 @@ def _print_correlations(console: Console, report: Mapping[str, Any]) -> None:
 def _print_reliability(console: Console, reliability: Mapping[str, Any]) -> None:
     tests = f", {reliability['tests']} tests" if reliability["tests"] else ""
     console.print(
-        f"Reliability: limit {reliability['limit']:.3f} ({reliability['test']}{tests}), power "
-        f"{reliability['power']:.0%}",
+        f"Reliability: limit {_number(reliability['limit'], 4)} ({reliability['test']}{tests}), "
+        f"power {reliability['power']:.0%}",
         highlight=False,
     )
     columns = ("uncontrolled", "MDB median", "MDB max", "unit", "bias/noise", "point m")
     table = light_table("Minimal detectable bias", ("",), columns)
     for g in reliability["groups"]:
         figures = ("detectable_median", "detectable_max", "bias_to_noise_max", "point_shift_max_m")
-        median, largest, ratio, shift = (
-            "-" if g[key] is None else f"{g[key]:.3g}" for key in figures
-        )
+        median, largest, ratio, shift = (_number(g[key], 3) for key in figures)
         table.add_row(
             g["name"],
             f"{g['uncontrolled']} of {g['count']}",
@@ -332,6 +331,22 @@ def _global_test(result: Adjustment) -> dict[str, Any]:
 def _cautions(result: Adjustment) -> list[str]:
     """What a reader would see at once in the tables."""
     found = []
+    if result.redundancy == 0:
+        found.append(
+            "redundancy is 0: no observation is controlled by the others, and sigma0 and standard "
+            "deviations are not known"
+        )
+    elif result.settings.is_snooping and not math.isfinite(result.reject_limit or math.nan):
+        found.append(
+            f"data snooping with redundancy {result.redundancy} cannot test any observation; the "
+            "test pope needs 2"
+        )
+    settings = result.settings
+    if settings.free_datum != "unknowns" and not result.rank_defects:
+        found.append(
+            f"free_datum = {settings.free_datum} has no effect: the observations determine the "
+            "position, orientation and scale of the block"
+        )
     if result.sigma0 > SUSPICIOUS_SIGMA0:
         found.append(
             f"sigma0 is {result.sigma0:.5g}: image coordinates may be of another unit, y may point "
@@ -347,6 +362,11 @@ def _cautions(result: Adjustment) -> list[str]:
             f"{len(unseen)} control points have no image point: {', '.join(unseen[:_MAX_LISTED])}"
         )
     return found
+
+
+def _number(value: float | None, digits: int) -> str:
+    """Significant digits, or a dash where there is no value."""
+    return "-" if value is None else f"{value:.{digits}g}"
 
 
 def _plain(value: Any) -> Any:

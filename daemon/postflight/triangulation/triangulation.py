@@ -41,6 +41,7 @@ from processing.bundle.network import (
     Points,
     Stations,
 )
+from processing.bundle.normal_equations import refuse_large_block
 from processing.bundle.self_calibration import SetName, parts_of, with_self_calibration
 from processing.matching.block_matching import BlockMatching, BlockTiePoints, image_mm, match_block
 from processing.pipelines.perspective import perspective_of
@@ -213,7 +214,12 @@ def _common_image(rig: Rig, heads: Sequence[str]) -> VirtualImage:
 def match_mission_block(
     block: ImageBlock, settings: BlockMatching, progress: Callable[[int], None]
 ) -> BlockTiePoints:
-    """Tie points of all overlapping images; a dozen of them are kept in memory."""
+    """Tie points of all overlapping images; a dozen of them are kept in memory.
+
+    Raises:
+        NetworkError: more images than are adjusted at once; nothing is matched.
+    """
+    refuse_large_block(6 * len(block.names))
     cache: OrderedDict[int, Picture] = OrderedDict()
 
     def load(k: int) -> Picture:

@@ -236,6 +236,8 @@ def test_the_limit_of_a_significance_and_reliability_are_reported_and_written(
         (("--reject", "4", "--significance", "0.05"), "both set the limit"),
         (("--weight-function", "best"), "huber, cauchy, tukey or danish"),
         (("--test", "t"), "pope or baarda"),
+        (("--free-datum", "camera"), "points, stations, all or dependent"),
+        (("--free-datum", "points", "--no-free-network"), "leave out --no-free-network"),
     ],
 )
 def test_options_that_do_not_fit_are_refused(options, sentence, written) -> None:

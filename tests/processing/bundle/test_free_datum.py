@@ -101,3 +101,60 @@ def test_a_datum_that_does_not_fix_the_block_or_names_nothing_is_refused(free) -
         in_datum(free, "points", ("p3",))
     with pytest.raises(NetworkError, match="x9, which are not there"):
         in_datum(free, "points", ("x9",))
+
+
+def test_names_that_are_not_of_the_kind_of_the_datum_are_refused(free) -> None:
+    with pytest.raises(NetworkError, match="the datum is of points and names e2, which are none"):
+        in_datum(free, "points", ("p3", "p7", "p12", "p20", "e2"))
+    with pytest.raises(NetworkError, match="the datum is of stations and names p3"):
+        in_datum(free, "stations", ("e0", "e1", "e4", "p3"))
+
+
+@pytest.mark.parametrize(
+    ("settings", "sentence"),
+    [
+        (AdjustmentSettings(free_datum="points"), "set minimum_norm"),
+        (AdjustmentSettings(datum_names=("p3",)), "set minimum_norm"),
+        (AdjustmentSettings(minimum_norm=True, datum_names=("p3",)), "free_datum is unknowns"),
+    ],
+)
+def test_a_datum_that_would_have_no_effect_is_refused(free, settings, sentence) -> None:
+    with pytest.raises(NetworkError, match=sentence):
+        adjust(free, settings)
+
+
+@pytest.mark.parametrize("names", [(), ("e4",), ("e1", "e3")])
+def test_the_dependent_datum_is_that_of_held_parameters(free, names) -> None:
+    result = in_datum(free, "dependent", names)
+    first = free.stations.names.index(names[0]) if names else 0
+    offset = free.stations.position_m - free.stations.position_m[first]
+    base, axis = np.unravel_index(np.argmax(offset), offset.shape)
+    if len(names) == 2:
+        base = free.stations.names.index(names[1])
+        axis = int(np.argmax(np.abs(offset[base])))
+    state = result.state
+    assert state.station[first] == pytest.approx(free.stations.position_m[first], abs=1e-9)
+    assert state.attitude[first] == pytest.approx(free.attitudes.rotation[first], abs=1e-12)
+    given = free.stations.position_m[base, axis]
+    assert state.station[base, axis] == pytest.approx(given, abs=1e-9)
+    normal, _, _ = dense(result)
+    layout = result.layout
+    held = [*layout.station[first], *layout.attitude[first], layout.station[base, axis]]
+    left = np.setdiff1d(np.arange(len(normal)), held)
+    own = normal[np.ix_(left, left)]
+    scale = np.sqrt(np.diag(own))
+    wanted = np.zeros(len(normal))
+    wanted[left] = np.diag(np.linalg.inv(own / scale[:, None] / scale)) / scale**2
+    c = layout.columns
+    found = np.diag(result.cofactor)
+    assert found[left[left < c]] == pytest.approx(wanted[left[left < c]], rel=1e-4)
+    assert np.abs(found[held]).max() < 1e-9 * found.max()
+    points = layout.eliminated_points
+    of_points = np.einsum("pii->pi", result.point_cofactor[points]).ravel()
+    assert of_points == pytest.approx(wanted[c:], rel=1e-4)
+    assert result.sigma0 == pytest.approx(in_datum(free, "unknowns").sigma0, rel=1e-9)
+
+
+def test_a_dependent_datum_of_names_that_are_no_exposures_is_refused(free) -> None:
+    with pytest.raises(NetworkError, match="the names of one or two free exposures are right"):
+        in_datum(free, "dependent", ("p3",))

@@ -154,3 +154,31 @@ def test_a_point_that_is_given_and_seen_from_one_place_only_keeps_its_depth() ->
     points = replace(network.points, sigma_m=sigma)
     result = adjust(replace(network, points=points, image_points=table), AdjustmentSettings())
     assert np.linalg.norm(result.state.points[single] - start[single]) < 0.1
+
+
+@pytest.mark.parametrize(
+    ("function", "angle_deg", "seed"), [("huber", 0.1, 0), ("tukey", 0.05, 1), ("tukey", 0.1, 0)]
+)
+def test_robust_weights_set_weak_points_aside_or_refuse_the_block(
+    function, angle_deg, seed
+) -> None:
+    network = _subset(seed, 8, angle_deg, 0.3 if seed else 0.0)
+    table, random = network.image_points, np.random.default_rng(seed + 100)
+    chosen = random.choice(np.arange(CONTROL, 80), 3, replace=False)
+    wrong = np.isin(table.point, chosen) & (random.random(len(table.point)) < 0.5)
+    xy = table.xy_mm.copy()
+    xy[wrong] += random.normal(0.0, 0.5, (int(wrong.sum()), 2))
+    network = completed(replace(network, image_points=replace(table, xy_mm=xy)))
+    reported: list[str] = []
+    settings = AdjustmentSettings(robust=True, weight_function=function)
+    try:
+        result = adjust(network, settings, progress=lambda what, *_: reported.append(what))
+    except NetworkError as error:
+        assert "nearly parallel" in str(error)
+    else:
+        assert result.sigma0 < 1.5
+        assert result.left_out.sum() < 0.7 * len(network.points.names)
+        # No blunder takes part.
+        taken = wrong & ~result.rejected & ~result.left_out[table.point]
+        assert not taken.any()
+    assert any(what.startswith("weak points set aside") for what in reported)
