@@ -198,8 +198,8 @@ def in_datum(
     by_columns = np.zeros((d, layout.columns))
     by_columns[:, taken] = inverse @ g_columns.T
     retained = layout.retained_points[points]
-    there = retained >= 0
-    by_columns[:, retained[there]] += np.einsum("de,pie->pid", inverse, g_points)[there].T
+    by_retained = np.einsum("de,pie->pid", inverse, g_points)[retained >= 0]
+    by_columns[:, retained[retained >= 0]] += by_retained.T
     own = layout.eliminated[points] >= 0
     where = layout.eliminated[points[own]]
     factor = reduced.point_factor
@@ -323,7 +323,7 @@ def dependent_datum(
     Source: the option `depend` of the Damped Bundle Adjustment Toolbox.
     """
     names = network.stations.names
-    free = (layout.station >= 0).all(axis=1)
+    free = np.asarray((layout.station >= 0).all(axis=1))
     at = {name: k for k, name in enumerate(names) if free[k]}
     foreign = [name for name in chosen if name not in at]
     if foreign or len(chosen) > 2 or len(set(chosen)) < len(chosen):
@@ -353,8 +353,7 @@ def dependent_datum(
         base = at[chosen[1]]
         return DependentDatum(station, attitude, base, int(np.argmax(np.abs(offset[base]))))
     largest = offset if (offset > 0.0).any() else np.abs(offset)
-    base, axis = np.unravel_index(int(np.argmax(largest)), largest.shape)
-    return DependentDatum(station, attitude, int(base), int(axis))
+    return DependentDatum(station, attitude, *divmod(int(np.argmax(largest)), 3))
 
 
 def _members(
