@@ -76,7 +76,11 @@ def executor_for(plan: ProcessAllocation, processes: int | None) -> BatchExecuto
 
 
 def cluster_executor(
-    scheduler: str, ca: Path | None, certificate: Path | None, key: Path | None
+    scheduler: str,
+    ca: Path | None,
+    certificate: Path | None,
+    key: Path | None,
+    processes: int | None = None,
 ) -> BatchExecutor:
     """The executor on a cluster.
 
@@ -85,18 +89,30 @@ def cluster_executor(
         ca: certificate of the authority.
         certificate: of this command.
         key: of the certificate.
+        processes: as requested for this machine; refused.
 
     Raises:
         MissingExtraError: dask is not installed.
-        ConfigurationError: an address off this machine without TLS.
+        ConfigurationError: an address off this machine without TLS, or processes of this machine.
     """
     from daemon.postflight.batch.cluster_address import cluster_address
     from drivers.base.extras import require
 
+    if processes is not None:
+        raise ConfigurationError(
+            [
+                "--processes counts processes of this machine; with --scheduler those of the "
+                f"cluster compute. Leave it out, and give it to: syntopic worker {scheduler}"
+            ]
+        )
     require("cluster")
     from daemon.postflight.batch.dask_executor import DaskExecutor
 
-    return DaskExecutor(cluster_address(scheduler, ca, certificate, key))
+    console = Console(stderr=True, soft_wrap=True)
+    return DaskExecutor(
+        cluster_address(scheduler, ca, certificate, key),
+        announce=lambda sentence: console.print(sentence, highlight=False),
+    )
 
 
 def process_plan(

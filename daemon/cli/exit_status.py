@@ -43,7 +43,7 @@ PROBLEMS: Final = {
     "verify": "a file is missing, altered or foreign",
     "repair": "something could not be repaired",
     "transfer": "a copy differs from its source, or could not be written",
-    "catalog": "a mission could not be read, or the query cannot be answered",
+    "catalog": "a mission could not be read or processed, or the query cannot be answered",
     "report": "a section of the report could not be computed",
     "process": "an exposure could not be processed; the others are done",
     "worker": "no scheduler answers",

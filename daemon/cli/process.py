@@ -106,7 +106,7 @@ def process(
         )
     cluster = None
     if scheduler is not None:
-        cluster = cluster_executor(scheduler, tls_ca, tls_certificate, tls_key)
+        cluster = cluster_executor(scheduler, tls_ca, tls_certificate, tls_key, processes)
     folder = Mission.open(mission)
     rig = load_rig(rig_file or folder.rig_path)
     plan, radiometry = as_flown(folder, radiometry, elevation)
@@ -133,7 +133,7 @@ def process(
         found = survey(work, folder, only or folder.numbers(), overlaps_of(folder, rig))
         placed = process_plan(work.memory_nbytes, len(found.pending), processes, threads)
         if dry_run:
-            _print_dry_run(folder, found, placed, as_json=as_json)
+            _print_dry_run(folder, found, None if cluster else placed, as_json=as_json)
             return
         executor = executor_for(placed, processes)
         if cluster is not None:
@@ -208,11 +208,12 @@ def _refuse_unsuitable(folder: Mission, work: Level2Work) -> None:
 
 
 def _print_dry_run(
-    folder: Mission, found: Level2Survey, placed: ProcessAllocation, *, as_json: bool
+    folder: Mission, found: Level2Survey, placed: ProcessAllocation | None, *, as_json: bool
 ) -> None:
+    """Print what would be computed; `placed` is None on a cluster, which is not asked."""
     count = len(found.pending)
     expected_s = None
-    if found.expected_s is not None:
+    if found.expected_s is not None and placed is not None:
         expected_s = round(found.expected_s * count / max(1, placed.processes), 1)
     if as_json:
         content = {
@@ -220,20 +221,25 @@ def _print_dry_run(
             "complete": sorted(found.complete),
             "pending": [task.number for task in found.pending],
             "read_nbytes": found.pending_nbytes,
-            "processes": placed.processes,
-            "threads": placed.threads,
+            "processes": placed and placed.processes,
+            "threads": placed and placed.threads,
             "expected_s": expected_s,
         }
         typer.echo(json.dumps(content))
         return
     console = Console(soft_wrap=True)
     time_text = "unknown: no exposure of this mission was processed before"
+    where = "those of the cluster"
+    if placed is not None:
+        where = f"{placed.processes}, {placed.threads} threads each ({placed.reason})"
+    elif found.expected_s is not None:
+        time_text = f"{found.expected_s * count:.0f} s over the number of workers"
     if expected_s is not None:
         time_text = f"{expected_s:.0f} s, from the durations of earlier runs"
     console.print(
         f"{count} exposures to compute, {len(found.complete)} complete\n"
         f"To read: {found.pending_nbytes / 1e9:.3f} GB\n"
-        f"Processes: {placed.processes}, {placed.threads} threads each ({placed.reason})\n"
+        f"Processes: {where}\n"
         f"Expected time: {time_text}",
         highlight=False,
     )

@@ -117,6 +117,7 @@ class _Run:
         self._last: deque[BatchTask] = deque()
         self._in_work: dict[int, BatchTask] = {}
         self._losses: Counter[tuple[int, str]] = Counter()
+        self._ended_processes: set[str] = set()
         self._store_retries: Counter[int] = Counter()
         self._claimed_since_s: dict[int, float] = {}
         self._ended_by = ""
@@ -164,7 +165,9 @@ class _Run:
         if lost.kind == "scheduler":
             self._waiting.appendleft(task)
             return
-        self.outcome.counts.lost_processes += 1
+        if not lost.process or lost.process not in self._ended_processes:
+            self._ended_processes.add(lost.process)
+            self.outcome.counts.lost_processes += 1
         self._losses[task.number, lost.kind] += 1
         count = self._losses[task.number, lost.kind]
         limit = OUT_OF_MEMORY_MAX if lost.kind == "out-of-memory" else LOSSES_MAX

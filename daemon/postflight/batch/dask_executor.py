@@ -13,6 +13,10 @@ import pickle
 import queue
 import threading
 import time
+import uuid
+from collections import OrderedDict
+from collections.abc import Callable
+from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any, Final
 
@@ -21,6 +25,7 @@ import distributed
 
 from daemon import DaemonError
 from daemon.postflight.batch.cluster_address import ClusterAddress, is_loopback
+from daemon.postflight.batch.dask_losses import TASK_PREFIX, ReturnLostTasks
 from daemon.postflight.batch.executor import (
     BatchAction,
     BatchTask,
@@ -35,9 +40,13 @@ CONNECT_TIMEOUT_S: Final = 15.0
 WORKERS_TIMEOUT_S: Final = 60.0
 RECONNECT_TIMEOUT_S: Final = 120.0
 """How long a scheduler may be away before the run ends."""
+AWAY_TIMEOUT_S: Final = 120.0
+"""How long no worker may be there before the run ends."""
 RESULT_TIMEOUT_S: Final = 60.0
 QUEUED_FACTOR: Final = 2
 """Tasks submitted for each thread of a worker: one in work, one waiting next to it."""
+WORKS_MAX: Final = 2
+"""Works that a worker has open: one ends while the next begins."""
 CHECKED_PACKAGES: Final = ("dask", "distributed", "msgpack", "cloudpickle")
 """Packages whose versions must be the same, for both sides to understand each other."""
 
@@ -53,7 +62,8 @@ class WorkRefused:
         self.error = error
 
 
-_actions: dict[tuple[str, int], BatchAction] = {}
+_actions: OrderedDict[str, dict[int, BatchAction]] = OrderedDict()
+"""Opened works by hash, the last used one at the end; of each, an action for every thread."""
 _lock = threading.Lock()
 
 
@@ -64,16 +74,21 @@ def run_on_worker(pickled_work: bytes, task: BatchTask | None) -> TaskOutcome | 
         pickled_work: the work.
         task: None opens the work only.
     """
-    key = (hashlib.sha256(pickled_work).hexdigest(), threading.get_ident())
+    work, thread = hashlib.sha256(pickled_work).hexdigest(), threading.get_ident()
     with _lock:
-        action = _actions.get(key)
+        own = _actions.setdefault(work, {})
+        _actions.move_to_end(work)
+        # Calibrations and buffers of works that ended are freed; a worker outlives many commands.
+        while len(_actions) > WORKS_MAX:
+            _actions.popitem(last=False)
+        action = own.get(thread)
         if action is None:
-            first = next((a for (work, _), a in _actions.items() if work == key[0]), None)
+            first = next(iter(own.values()), None)
             try:
                 action = first.clone() if first else pickle.loads(pickled_work).open()
             except Exception as error:  # noqa: BLE001 - the command states it
                 return WorkRefused(error)
-            _actions[key] = action
+            own[thread] = action
     return None if task is None else outcome_of(action, task)
 
 
@@ -95,13 +110,22 @@ class DaskExecutor:
 
     Args:
         address: of the scheduler.
+        announce: takes a sentence once the cluster is ready.
         reconnect_timeout_s: how long it may be away before the run ends.
+        away_timeout_s: how long no worker may be there before the run ends.
     """
 
     def __init__(
-        self, address: ClusterAddress, *, reconnect_timeout_s: float = RECONNECT_TIMEOUT_S
+        self,
+        address: ClusterAddress,
+        *,
+        announce: Callable[[str], None] = lambda _sentence: None,
+        reconnect_timeout_s: float = RECONNECT_TIMEOUT_S,
+        away_timeout_s: float = AWAY_TIMEOUT_S,
     ) -> None:
         self._address, self._reconnect_timeout_s = address, reconnect_timeout_s
+        self._announce, self._away_timeout_s = announce, away_timeout_s
+        self._run = uuid.uuid4().hex[:12]
         self._client: distributed.Client | None = None
         self._work = b""
         self._futures: dict[int, distributed.Future] = {}
@@ -109,6 +133,8 @@ class DaskExecutor:
         self._unsent: list[TaskOutcome] = []
         self._submitted = 0
         self._capacity, self._counted_s = 1, 0.0
+        self._is_registration_due = False
+        self._workers, self._threads, self._workers_seen_s = 0, 0, 0.0
         self.dashboard = ""
 
     @property
@@ -119,7 +145,8 @@ class DaskExecutor:
 
     @property
     def description(self) -> str:
-        return f"cluster at {self._address.url}"
+        count = f", {self._workers} workers" if self._workers else ""
+        return f"cluster at {self._address.url}{count}"
 
     def start(self, work: BatchWork) -> None:
         """Connect, check versions and memory, and open the work on one worker.
@@ -141,6 +168,8 @@ class DaskExecutor:
             ) from error
         _check_versions(client)
         _check_memory(client, work)
+        client.register_plugin(ReturnLostTasks())
+        self._workers_seen_s = time.monotonic()
         # One worker opens the work before all others, so that kernels are compiled once.
         opening: Any = client.submit(run_on_worker, self._work, None, pure=False)
         try:
@@ -154,17 +183,24 @@ class DaskExecutor:
         if isinstance(refused, WorkRefused):
             raise refused.error
         self._count_threads()
+        dashboard = f"dashboard {self.dashboard}" if self.dashboard else "no dashboard"
+        self._announce(f"{self.description}, {self._threads} threads; {dashboard}")
 
     def submit(self, task: BatchTask) -> None:
         if self._client is None or not self._is_connected():
             self._unsent.append(TaskLost(task.number, "scheduler", "the scheduler died"))
             return
+        if self._is_registration_due:
+            with suppress(OSError, TimeoutError):
+                self._client.register_plugin(ReturnLostTasks())
+                self._is_registration_due = False
         self._submitted += 1
         future = self._client.submit(
             run_on_worker,
             self._work,
             task,
-            key=f"exposure-{task.number}-{self._submitted}",
+            # Runs of one scheduler share its names; a task of another run is another task.
+            key=f"{TASK_PREFIX}-{task.number}-{self._run}-{self._submitted}",
             pure=False,
         )
         self._futures[task.number] = future
@@ -176,6 +212,7 @@ class DaskExecutor:
         if self._unsent:
             unsent, self._unsent = self._unsent, []
             return unsent
+        self._refuse_absent_workers()
         limit_s = time.monotonic() + timeout_s
         found: list[TaskOutcome] = []
         while not found and self._is_connected():
@@ -218,9 +255,11 @@ class DaskExecutor:
             outcome: Any = future.result(timeout=RESULT_TIMEOUT_S)
         except distributed.KilledWorker as error:
             del self._futures[number]
-            return [TaskLost(number, "killed", f"its process was killed ({error.last_worker})")]
+            worker = str(getattr(error.last_worker, "address", error.last_worker))
+            return [TaskLost(number, "killed", f"its process was killed ({worker})", worker)]
         except (distributed.CancelledError, TimeoutError, OSError):
             del self._futures[number]
+            self._is_registration_due = True  # it may be another scheduler at the same address
             return [TaskLost(number, "scheduler", "the scheduler lost it")]
         except Exception as error:  # noqa: BLE001 - it is the outcome of this task
             del self._futures[number]
@@ -242,6 +281,8 @@ class DaskExecutor:
                 client = self._connect(min(5.0, self._reconnect_timeout_s))
                 client.wait_for_workers(1, timeout=max(1.0, limit_s - time.monotonic()))
                 _check_versions(client)
+                client.register_plugin(ReturnLostTasks())
+                self._workers_seen_s = time.monotonic()
                 self._count_threads()
             except (ClusterError, TimeoutError, OSError) as error:
                 self._drop_client()
@@ -268,6 +309,11 @@ class DaskExecutor:
                     heartbeat_interval="2s",
                 )
             except (OSError, TimeoutError) as error:
+                if self._address.is_encrypted and "certificate" in _chain(error).lower():
+                    raise ClusterError(
+                        f"{self._address.url} and this command do not accept each other's "
+                        "certificate. Both are signed by the authority of --tls-ca"
+                    ) from error
                 raise ClusterError(
                     f"no scheduler answers at {self._address.url}. "
                     f"Start one: dask scheduler --host 127.0.0.1 --dashboard-address 127.0.0.1:8787"
@@ -287,10 +333,39 @@ class DaskExecutor:
         self._counted_s = time.monotonic()
         if self._client is not None:
             try:
-                threads = sum(self._client.nthreads().values())
+                threads = list(self._client.nthreads().values())
             except (OSError, TimeoutError):
                 return
-            self._capacity = QUEUED_FACTOR * threads
+            self._threads = sum(threads)
+            self._capacity = QUEUED_FACTOR * self._threads
+            if threads:
+                self._workers, self._workers_seen_s = len(threads), time.monotonic()
+
+    def _refuse_absent_workers(self) -> None:
+        """End the run where the scheduler answers and no worker has been there for long.
+
+        Raises:
+            ClusterError: no worker for the time allowed.
+        """
+        if time.monotonic() - self._counted_s > 1.0:
+            self._count_threads()
+        if self._threads or time.monotonic() - self._workers_seen_s < self._away_timeout_s:
+            return
+        raise ClusterError(
+            f"all workers left {self._address.url}; none came back within "
+            f"{self._away_timeout_s:.0f} s, with {len(self._futures)} exposures in work. Run: "
+            f"syntopic worker {self._address.url}, and run the same command again; complete "
+            "exposures are not computed again"
+        )
+
+
+def _chain(error: BaseException | None) -> str:
+    """An error and its causes as text."""
+    found = []
+    while error is not None:
+        found.append(f"{type(error).__name__} {error}")
+        error = error.__cause__ or error.__context__
+    return "; ".join(found)
 
 
 def _dashboard_of(client: distributed.Client, address: ClusterAddress) -> str:

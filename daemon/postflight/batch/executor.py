@@ -70,11 +70,15 @@ LossKind: TypeAlias = Literal["killed", "out-of-memory", "scheduler"]
 
 @dataclass(frozen=True)
 class TaskLost:
-    """A task whose process ended before it returned a result."""
+    """A task whose process ended before it returned a result.
+
+    `process` names the process, so that several tasks it had count one end; empty: its only one.
+    """
 
     number: int
     kind: LossKind
     cause: str
+    process: str = ""
 
 
 TaskOutcome: TypeAlias = TaskDone | TaskFailed | TaskLost

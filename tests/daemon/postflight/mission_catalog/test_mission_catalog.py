@@ -152,6 +152,18 @@ def test_a_selection_is_what_process_takes(season: Path, tmp_path: Path) -> None
     assert lines == [["syntopic", "process", place, "--only", "2"] for place in places]
 
 
+def test_a_mission_in_a_store_is_no_command_but_a_sentence(season: Path) -> None:
+    table = geopandas.read_parquet(season / "exposures.parquet")
+    table.loc[table["mission"] == "b", "place"] = "s3://survey/2026/b"
+    table.to_parquet(season / "exposures.parquet")
+    query = ["catalog", "query", str(season), "--verdict", "refly", "--commands"]
+    done = CliRunner().invoke(app, query)
+    assert [shlex.split(line)[3:] for line in done.stdout.splitlines()] == [["--only", "2"]]
+    assert done.exit_code == 1 and "s3://survey/2026/b: 1 exposures are in" in done.stderr
+    content = run("query", str(season))
+    assert len(content["commands"]) == 1 and len(content["not_processed"]) == 1
+
+
 def test_a_bucket_and_a_folder_give_the_same_rows(
     season: Path, tmp_path: Path, mission: Mission, store
 ) -> None:

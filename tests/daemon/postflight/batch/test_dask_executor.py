@@ -1,0 +1,160 @@
+"""The executor on a cluster: TLS, versions, dead workers, and what it leaves in workers."""
+
+from __future__ import annotations
+
+import pickle
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+from typer.testing import CliRunner
+
+from daemon.cli import app
+from daemon.postflight.batch import dask_executor
+from daemon.postflight.batch.batch_run import LOSSES_MAX, run_batch
+from daemon.postflight.batch.cluster_address import ClusterAddress, cluster_address
+from daemon.postflight.batch.dask_executor import ClusterError, DaskExecutor, run_on_worker
+from daemon.postflight.batch.executor import BatchTask, TaskDone
+from tests.daemon.diverging_camera import ROOT
+from tests.daemon.postflight.batch.test_cluster import free_port
+from tests.daemon.postflight.batch.toy_work import ToyWork, attempts_of
+
+LOCAL = cluster_address("tcp://127.0.0.1:1", None, None, None)
+
+
+def _openssl(folder: Path, *arguments: str) -> None:
+    subprocess.run(["openssl", *arguments], cwd=folder, check=True, capture_output=True)
+
+
+def authority(folder: Path, name: str) -> tuple[Path, Path, Path]:
+    """A certificate authority, and a certificate and key it signed."""
+    folder.mkdir(parents=True, exist_ok=True)
+    key = ["-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes"]
+    of_authority, own = ["-subj", f"/CN={name} authority"], ["-subj", f"/CN={name}"]
+    _openssl(folder, "req", "-x509", *key, *of_authority, "-keyout", "ca.key", "-out", "ca.pem")
+    _openssl(folder, "req", *key, *own, "-keyout", "own.key", "-out", "own.csr")
+    _openssl(
+        folder, "x509", "-req", "-in", "own.csr", "-CA", "ca.pem", "-CAkey", "ca.key",
+        "-CAcreateserial", "-out", "own.pem",
+    )  # fmt: skip
+    return folder / "ca.pem", folder / "own.pem", folder / "own.key"
+
+
+@pytest.fixture(scope="module")
+def encrypted(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ClusterAddress]:
+    """A scheduler with TLS and two workers of `syntopic worker`."""
+    folder = tmp_path_factory.mktemp("tls")
+    ca, certificate, key = authority(folder, "survey")
+    address = cluster_address(f"tls://127.0.0.1:{free_port()}", ca, certificate, key)
+    dask = [
+        str(Path(sys.executable).with_name("dask")), "scheduler", "--host", "127.0.0.1",
+        "--port", address.url.rpartition(":")[2], "--protocol", "tls", "--tls-ca-file", str(ca),
+        "--tls-cert", str(certificate), "--tls-key", str(key),
+        "--dashboard-address", "127.0.0.1:0",
+    ]  # fmt: skip
+    own = [
+        sys.executable, "-m", "daemon", "worker", address.url, "--processes", "2", "--tls-ca",
+        str(ca), "--tls-certificate", str(certificate), "--tls-key", str(key),
+    ]  # fmt: skip
+    with (folder / "cluster.txt").open("wb") as log:
+        parts = [
+            subprocess.Popen(command, cwd=ROOT, stdout=log, stderr=log) for command in (dask, own)
+        ]
+    yield address
+    parts[1].send_signal(signal.SIGINT)
+    parts[1].wait(60)
+    parts[0].kill()
+    parts[0].wait()
+
+
+@pytest.mark.trust
+@pytest.mark.timeout(300)
+def test_over_tls_a_poisonous_exposure_ends_as_many_processes_as_stated(
+    encrypted: ClusterAddress, tmp_path: Path
+) -> None:
+    sentences: list[str] = []
+    executor = DaskExecutor(encrypted, announce=sentences.append)
+    tasks = [BatchTask(n, "killed 99" if n == 3 else "") for n in range(1, 9)]
+    outcome = run_batch(executor, ToyWork(tmp_path), tasks)
+    assert sorted(outcome.results) == [1, 2, 4, 5, 6, 7, 8]
+    (failure,) = outcome.failures
+    assert failure.exposure == 3
+    assert f"quarantined after {LOSSES_MAX} attempts: its process was killed" in failure.cause
+    assert attempts_of(tmp_path, 3) == LOSSES_MAX == outcome.counts.lost_processes
+    (sentence,) = sentences
+    assert sentence.startswith(f"cluster at {encrypted.url}, ") and " threads; " in sentence
+    assert "dashboard" in sentence
+
+
+@pytest.mark.trust
+@pytest.mark.timeout(120)
+def test_a_certificate_of_another_authority_is_refused(
+    encrypted: ClusterAddress, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(dask_executor, "CONNECT_TIMEOUT_S", 3.0)
+    address = cluster_address(encrypted.url, *authority(tmp_path / "other", "stranger"))
+    with pytest.raises(ClusterError, match=r"certificate.*signed by the authority of --tls-ca"):
+        DaskExecutor(address).start(ToyWork(tmp_path))
+
+
+def client_with(**packages: str) -> Any:
+    """A client of a scheduler and one worker, which has other versions."""
+    own = {"dask": "1", "distributed": "2", "msgpack": "3", "cloudpickle": "4", "python": "3.11.7"}
+    sides = {
+        "client": {"packages": own},
+        "scheduler": {"packages": own | {"python": "3.11.2.final.0"}},
+        "workers": {"tcp://a": {"packages": own | packages}},
+    }
+    return SimpleNamespace(
+        run_on_scheduler=lambda function, name: function(name),
+        get_versions=lambda check: sides,
+    )
+
+
+def test_versions_that_do_not_match_are_refused_with_both() -> None:
+    dask_executor._check_versions(client_with())
+    for name, version, text in (
+        ("distributed", "9", "worker tcp://a has distributed 9, this command 2"),
+        ("python", "3.12.1", "worker tcp://a has python 3.12.1, this command 3.11.7"),
+    ):
+        with pytest.raises(ClusterError, match=f"{text}. Install the same versions"):
+            dask_executor._check_versions(client_with(**{name: version}))
+    client = client_with()
+    client.run_on_scheduler = lambda _function, _name: "0.0.1"
+    with pytest.raises(ClusterError, match=r"the scheduler has syntopic 0.0.1"):
+        dask_executor._check_versions(client)
+
+
+def test_a_run_without_workers_ends_with_what_it_waited_for() -> None:
+    client = SimpleNamespace(
+        status="running", nthreads=lambda: {"tcp://a": 1}, close=lambda timeout: None
+    )
+    executor = DaskExecutor(LOCAL, away_timeout_s=0.0)
+    executor._client = cast(Any, client)
+    assert executor.wait(0.0) == [] and executor.capacity == 2
+    client.nthreads = dict
+    executor._counted_s = 0.0
+    with pytest.raises(ClusterError, match=r"all workers left tcp://127.0.0.1:1.*within 0 s"):
+        executor.wait(0.0)
+    assert executor.capacity == 0
+
+
+def test_a_worker_has_only_the_last_works_open(tmp_path: Path) -> None:
+    works = [pickle.dumps(ToyWork(tmp_path, threads=n)) for n in (1, 2, 3)]
+    dask_executor._actions.clear()
+    for work in works:
+        for _ in range(2):
+            assert isinstance(run_on_worker(work, BatchTask(1)), TaskDone)
+    assert len(dask_executor._actions) == dask_executor.WORKS_MAX
+
+
+def test_processes_of_this_machine_do_not_go_with_a_cluster(tmp_path: Path) -> None:
+    command = ["process", str(tmp_path), "--scheduler", "tcp://127.0.0.1:1", "--processes", "999"]
+    done = CliRunner().invoke(app, command)
+    assert done.exit_code != 0
+    assert "Leave it out, and give it to: syntopic worker" in f"{done.output} {done.exception}"
