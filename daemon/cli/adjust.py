@@ -82,7 +82,11 @@ def adjust(
     as_json: AsJson = False,
 ) -> None:
     from daemon.postflight.adjustment.csv_tables import ProjectError
-    from daemon.postflight.adjustment.likely_mistakes import SUSPICIOUS_SIGMA0, likely_mistakes
+    from daemon.postflight.adjustment.likely_mistakes import (
+        SUSPICIOUS_SIGMA0,
+        control_sentences,
+        likely_mistakes,
+    )
     from daemon.postflight.adjustment.project import read_project
     from daemon.postflight.adjustment.project_writer import write_results
     from daemon.postflight.adjustment.summary import print_report, report_of
@@ -132,7 +136,7 @@ def adjust(
     except NetworkError as error:
         problems = error.problems
     except RankDefectError as error:
-        problems = tuple(defect.sentence for defect in error.rank_defects)
+        problems = control_sentences(given.network, error.rank_defects)
     if problems:
         problems = (*problems, *likely_mistakes(given.network, None))
         if as_json:

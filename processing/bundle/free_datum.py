@@ -197,9 +197,9 @@ def in_datum(
     # t = by_columns x + sum of by_point p over the eliminated points of the datum.
     by_columns = np.zeros((d, layout.columns))
     by_columns[:, taken] = inverse @ g_columns.T
-    retained = layout.retained_points[points]
-    by_retained = np.einsum("de,pie->pid", inverse, g_points)[retained >= 0]
-    by_columns[:, retained[retained >= 0]] += by_retained.T
+    of_retained = layout.retained_points[points]
+    by_retained = np.einsum("de,pie->pid", inverse, g_points)[of_retained >= 0]
+    by_columns[:, of_retained[of_retained >= 0]] += by_retained.T
     own = layout.eliminated[points] >= 0
     where = layout.eliminated[points[own]]
     factor = reduced.point_factor

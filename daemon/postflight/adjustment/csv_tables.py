@@ -16,6 +16,9 @@ from daemon.mission.foreign_files import ForeignFileError, read_regular_file
 from daemon.mission.store.durable import new_file
 from processing.rig.problem_sentences import ProblemList
 
+UNUSED = "unused"
+"""In place of a standard deviation: the observation takes no part."""
+
 _MAX_BYTES = 2_000_000_000
 _MAX_PROBLEMS = 30
 
@@ -74,9 +77,21 @@ class CsvTable:
             found.append(value)
         return found
 
+    def sigmas(self, column: str) -> list[float]:
+        """A column of standard deviations; `unused` is infinite, an empty cell is NaN."""
+        if column not in self.columns:
+            return [math.nan] * len(self.rows)
+        at = self.columns.index(column)
+        unused = [row[at] == UNUSED for row in self.rows]
+        bare = [["" if off else row[at]] for off, row in zip(unused, self.rows, strict=True)]
+        found = CsvTable(self.file, (column,), bare, self.lines, problems=self.problems)
+        values = zip(unused, found.numbers(column), strict=True)
+        return [math.inf if off else value for off, value in values]
+
     def add_problem(self, line: int, what: str) -> None:
-        if len(self.problems) < _MAX_PROBLEMS:
-            self.problems.append(f"{self.file}:{line}: {what}")
+        problem = f"{self.file}:{line}: {what}"
+        if len(self.problems) < _MAX_PROBLEMS and problem not in self.problems:
+            self.problems.append(problem)
 
 
 def read_table(path: Path, needed: Sequence[str], known: Sequence[str]) -> CsvTable:
@@ -150,7 +165,7 @@ def _is_row(remark: str, columns: Sequence[str]) -> bool:
 def write_table(
     path: Path, remark: str, columns: Sequence[str], rows: Iterable[Sequence[str | float]]
 ) -> None:
-    """Write a table; numbers in their shortest exact form, others as empty cells."""
+    """Write a table; numbers in their shortest exact form, NaN as empty cells, inf as unused."""
     with new_file(path) as part, part.open("w", encoding="utf-8", newline="") as file:
         for line in remark.splitlines():
             file.write(f"# {line}\n")
@@ -171,4 +186,6 @@ def write_table(
 def _cell(value: str | float) -> str:
     if isinstance(value, str):
         return value
-    return "" if not math.isfinite(value) else repr(float(value))
+    if math.isinf(value):
+        return UNUSED
+    return "" if math.isnan(value) else repr(float(value))

@@ -1,10 +1,11 @@
-"""A mistake that explains a bad adjustment: mirrored image coordinates are adjusted instead.
+"""Mistakes that explain a bad adjustment: control of another unit, mirrored image coordinates.
 
-The trial costs an adjustment and is made only where sigma0 is far off or nothing converged.
+The trials cost an adjustment and are made only where sigma0 is far off or nothing converged.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Final
 
@@ -13,7 +14,8 @@ import numpy as np
 from processing import ProcessingError
 from processing.bundle.adjust import AdjustmentSettings, adjust
 from processing.bundle.initial_values import completed
-from processing.bundle.network import Network
+from processing.bundle.network import Network, NetworkError
+from processing.bundle.rank_diagnosis import RankDefect
 
 SUSPICIOUS_SIGMA0: Final = 20.0
 """Sigma0 beyond which mirrored coordinates are tried."""
@@ -23,9 +25,20 @@ _BETTER: Final = 0.2
 
 _MAX_ITERATIONS: Final = 15
 
+_UNITS: Final = (
+    (1000.0, "millimetres"),
+    (100.0, "centimetres"),
+    (1.0 / 0.3048, "feet"),
+    (1.0 / 1000.0, "kilometres"),
+)
+_UNIT_WITHIN: Final = 0.1
+_SCALE_BEYOND: Final = 1.5
+_MIN_CONTROL: Final = 3
+_MAX_PAIRS_OF: Final = 60
+
 
 def likely_mistakes(network: Network, sigma0: float | None) -> list[str]:
-    """Adjust the mirrored image coordinates.
+    """Compare the scale of the control with that of the exposures, and mirror image coordinates.
 
     A rotation by 180 degrees, such as both signs reversed, is taken by the attitudes and is no
     mistake.
@@ -35,8 +48,85 @@ def likely_mistakes(network: Network, sigma0: float | None) -> list[str]:
         sigma0: of the adjustment as given; None where it failed.
 
     Returns:
-        A sentence if the mirrored coordinates explain the observations; otherwise empty.
+        A sentence for what explains the observations; otherwise empty.
     """
+    return _control_of_another_unit(network) or _mirrored(network, sigma0)
+
+
+def control_sentences(network: Network, defects: Sequence[RankDefect]) -> tuple[str, ...]:
+    """Sentences of a network without datum; one for a block of one or two control points.
+
+    Args:
+        network: as given.
+        defects: directions that nothing determines.
+
+    Returns:
+        One sentence in place of those of the rotations and the scale about the control points.
+    """
+    seen = np.unique(network.image_points.point)
+    known = (np.nan_to_num(network.points.sigma_m, nan=-1.0) >= 0.0).all(axis=1)
+    control = [network.points.names[k] for k in seen if known[k] and not _is_direction(network, k)]
+    about = {1: 4, 2: 1}.get(len(control))
+    sentences = tuple(defect.sentence for defect in defects)
+    others = len(network.gnss.station) or len(network.distances.point_a)
+    held = network.stations.fixed.any() or network.attitudes.fixed.any()
+    attitudes = len(network.measured_attitudes.attitude)
+    if about is None or len(defects) != about or others or held or attitudes:
+        return sentences
+    are = "is the only control point" if len(control) == 1 else "are the only control points"
+    return (
+        f"{' and '.join(control)} {are} with image points, and the block can be turned"
+        + (" and scaled about it" if len(control) == 1 else " about the line through them")
+        + ": three control points that are not on one line, GNSS positions, or --free-network "
+        "are needed",
+    )
+
+
+def _is_direction(network: Network, point: int) -> bool:
+    return bool(network.points.at_infinity[point])
+
+
+def _control_of_another_unit(network: Network) -> list[str]:
+    """Distances between control points against those of their intersections from the exposures."""
+    points = network.points
+    given = np.isfinite(points.xyz_m).all(axis=1) & ~points.at_infinity
+    control = given & (np.nan_to_num(points.sigma_m, nan=-1.0) >= 0.0).all(axis=1)
+    table, images = network.image_points, network.images
+    rays = np.bincount(table.point, minlength=len(points.names))
+    own = np.flatnonzero(control & (rays >= 2))[:_MAX_PAIRS_OF]
+    oriented = np.isfinite(network.stations.position_m[images.station]).all(axis=1)
+    oriented &= np.isfinite(network.attitudes.rotation[images.attitude]).all(axis=(1, 2))
+    if len(own) < _MIN_CONTROL or not oriented[table.image].all():
+        return []
+    unknown = np.where(control[:, None], np.nan, points.xyz_m)
+    try:
+        found = completed(replace(network, points=replace(points, xyz_m=unknown))).points.xyz_m
+    except NetworkError:
+        return []
+    first, second = np.triu_indices(len(own), 1)
+    apart = np.linalg.norm(points.xyz_m[own[first]] - points.xyz_m[own[second]], axis=1)
+    of_rays = np.linalg.norm(found[own[first]] - found[own[second]], axis=1)
+    usable = of_rays > 0.0
+    if not usable.any():
+        return []
+    ratio = float(np.median(apart[usable] / of_rays[usable]))
+    if 1.0 / _SCALE_BEYOND < ratio < _SCALE_BEYOND:
+        return []
+    units = [name for factor, name in _UNITS if abs(np.log(ratio / factor)) < _UNIT_WITHIN]
+    reversed_ = [name for factor, name in _UNITS if abs(np.log(ratio * factor)) < _UNIT_WITHIN]
+    hint = "one of them is of another unit, or the principal distance is wrong"
+    if units:
+        hint = f"the control points may be in {units[0]}"
+    if reversed_:
+        other = f"the positions of the exposures in {reversed_[0]}"
+        hint = f"{hint}, or {other}" if units else other.replace(" in ", " may be in ", 1)
+    return [
+        f"control points are {ratio:.4g} times as far apart as the rays of the given exposures "
+        f"intersect: {hint}"
+    ]
+
+
+def _mirrored(network: Network, sigma0: float | None) -> list[str]:
     limit = SUSPICIOUS_SIGMA0 if sigma0 is None else _BETTER * sigma0
     table = network.image_points
     mirrored = replace(table, xy_mm=table.xy_mm * np.array([1.0, -1.0]))

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.postflight.adjustment.csv_tables import CsvTable
+from daemon.postflight.adjustment.csv_tables import UNUSED, CsvTable
 from processing.bundle.network import CameraModel, ImagePoints, Images
 
 Array = NDArray[np.float64]
@@ -30,9 +30,44 @@ def check_sigmas(table: CsvTable, columns: Sequence[str]) -> None:
         columns: its columns of sigmas; an empty cell is not reported.
     """
     for column in columns:
-        for value, line in zip(table.numbers(column), table.lines, strict=True):
+        for value, line in zip(table.sigmas(column), table.lines, strict=True):
             if value <= 0.0:
                 table.add_problem(line, f"{column} is {value:g}; a sigma is positive")
+
+
+def check_observations(table: CsvTable, columns: Sequence[str], names: Sequence[str]) -> None:
+    """Report a table without rows, sigmas that are missing or not positive, and repeated rows.
+
+    Args:
+        table: of observations; problems are added to it.
+        columns: its columns of sigmas.
+        names: what each row observes.
+    """
+    check_rows(table)
+    check_sigmas(table, columns)
+    for column in columns:
+        for value, line in zip(table.sigmas(column), table.lines, strict=True):
+            if np.isnan(value):
+                table.add_problem(line, f"{column} is empty; a sigma, or {UNUSED}, is right")
+    first: dict[str, int] = {}
+    for name, line in zip(names, table.lines, strict=True):
+        if name in first:
+            table.add_problem(
+                line,
+                f"{name} is observed a second time (line {first[name]}); it would count twice: "
+                "leave one out",
+            )
+        first.setdefault(name, line)
+
+
+def check_rows(table: CsvTable) -> None:
+    """Report a table that has names of columns only.
+
+    Args:
+        table: problems are added to it.
+    """
+    if not table.rows:
+        table.add_problem(table.header, "no rows; remove the table from [files] if it has none")
 
 
 def check_image_points(
@@ -111,7 +146,9 @@ def check_distances(table: CsvTable) -> None:
     Args:
         table: of distances; problems are added to it.
     """
-    check_sigmas(table, ("sigma_m",))
+    pairs = zip(table.text("point_a"), table.text("point_b"), strict=True)
+    names = [f"the distance between {' and '.join(sorted(pair))}" for pair in pairs]
+    check_observations(table, ("sigma_m",), names)
     ends = zip(table.text("point_a"), table.text("point_b"), table.lines, strict=True)
     for a, b, line in ends:
         if a == b:

@@ -20,7 +20,8 @@ from daemon.postflight.adjustment.plausibility import (
     check_control,
     check_distances,
     check_image_points,
-    check_sigmas,
+    check_observations,
+    check_rows,
 )
 from daemon.postflight.adjustment.project_file import (
     AdjustmentHeadSection,
@@ -57,6 +58,7 @@ Array = NDArray[np.float64]
 XYZ = ("x_m", "y_m", "z_m")
 SIGMAS = ("sx_m", "sy_m", "sz_m")
 ANGLES = ("omega_deg", "phi_deg", "kappa_deg")
+AXIS_SIGMAS = ("sx_deg", "sy_deg", "sz_deg")
 
 
 @dataclass(frozen=True)
@@ -102,6 +104,9 @@ def read_project(path: Path) -> Project:
         ("x_mm", "y_mm", "column_px", "row_px", "sx_um", "sy_um"),
     )
     build = _TableIndex(images, exposures, seen, points, problems)
+    for table in (exposures, points):
+        if table is not None:
+            check_rows(table)
     reported = [problem for t in build.tables for problem in t.problems]
     if reported:
         # Names that are not unique fit no index: further mistakes cannot be found yet.
@@ -426,7 +431,7 @@ def _distances(folder: Path, file: ProjectFile, build: _TableIndex) -> Distances
         build.index(table, "point_a", build.point_at, "point"),
         build.index(table, "point_b", build.point_at, "point"),
         np.array(table.numbers("distance_m")),
-        np.array(table.numbers("sigma_m")),
+        np.array(table.sigmas("sigma_m")),
     )
 
 
@@ -438,22 +443,33 @@ def _gnss(folder: Path, file: ProjectFile, build: _TableIndex) -> Gnss:
     if table is None:
         return no_gnss()
     build.tables.append(table)
-    check_sigmas(table, SIGMAS)
-    station = build.index(table, "exposure", build.exposure_at, "exposure")
     levers = np.array([table.numbers(c, 0.0) for c in lever]).T.reshape(-1, 3)
+    # Several antennas of an exposure differ in their lever arms.
+    check_observations(
+        table,
+        SIGMAS,
+        [
+            f"the antenna position of exposure {name}" + f", lever arm {own}" * bool(own.any())
+            for name, own in zip(table.text("exposure"), levers, strict=True)
+        ],
+    )
+    station = build.index(table, "exposure", build.exposure_at, "exposure")
     attitude = np.array([build.attitude_at.get(n, -1) for n in table.text("exposure")])
     for row in np.flatnonzero((attitude < 0) & (levers != 0.0).any(axis=1)):
         table.add_problem(
             table.lines[row],
             "a lever arm needs an attitude of the exposure; here every image has its own",
         )
+    position = np.array([table.numbers(c) for c in XYZ]).T.reshape(-1, 3)
+    for row in np.flatnonzero(~np.isfinite(position).all(axis=1)):
+        table.add_problem(table.lines[row], "an antenna position needs three coordinates")
     lines = tuple(dict.fromkeys(name for name in table.text("line") if name))
     at = {"": -1, **{name: k for k, name in enumerate(lines)}}
     return Gnss(
         station=station,
         attitude=np.clip(attitude, 0, None).astype(np.int64),
-        position_m=np.array([table.numbers(c) for c in XYZ]).T.reshape(-1, 3),
-        sigma_m=np.array([table.numbers(c) for c in SIGMAS]).T.reshape(-1, 3),
+        position_m=position,
+        sigma_m=np.array([table.sigmas(c) for c in SIGMAS]).T.reshape(-1, 3),
         lever_m=levers,
         line=build.index(table, "line", at, "line"),
         time_s=np.array(table.numbers("time_s", 0.0)),
@@ -463,15 +479,20 @@ def _gnss(folder: Path, file: ProjectFile, build: _TableIndex) -> Gnss:
 
 
 def _bearings(folder: Path, file: ProjectFile, build: _TableIndex) -> MeasuredAttitudes:
-    table = _optional(folder, file.files.attitudes, ("exposure", *ANGLES, "sigma_deg"), ())
+    table = _optional(
+        folder, file.files.attitudes, ("exposure", *ANGLES), ("sigma_deg", *AXIS_SIGMAS)
+    )
     if table is None:
         return no_measured_attitudes()
     build.tables.append(table)
-    check_sigmas(table, ("sigma_deg",))
+    own = AXIS_SIGMAS if any(table.has(c) for c in AXIS_SIGMAS) else ("sigma_deg",) * 3
+    if table.has("sigma_deg") and table.has(own[0]) and own is AXIS_SIGMAS:
+        table.add_problem(table.header, "sigma_deg, or sx_deg, sy_deg and sz_deg; not both")
+    names = [f"the attitude of exposure {name}" for name in table.text("exposure")]
+    check_observations(table, tuple(dict.fromkeys(own)), names)
     angles = np.array([table.numbers(c) for c in ANGLES]).T.reshape(-1, 3)
-    sigma = np.radians(np.array(table.numbers("sigma_deg")))
     return MeasuredAttitudes(
         build.index(table, "exposure", build.attitude_at, "attitude of exposure"),
         np.array([_rotation(a) for a in angles]).reshape(-1, 3, 3),
-        np.tile(sigma[:, None], (1, 3)),
+        np.radians(np.array([table.sigmas(c) for c in own]).T.reshape(-1, 3)),
     )

@@ -13,9 +13,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.mission.store.durable import new_files
+from daemon.postflight.adjustment.adjusted_project import (
+    initial_state,
+    used_network,
+    with_settings,
+)
 from daemon.postflight.adjustment.csv_tables import ProjectError, write_table
 from daemon.postflight.adjustment.html_report import report_page
-from daemon.postflight.adjustment.project import ANGLES, SIGMAS, XYZ, CheckPoints, Project
+from daemon.postflight.adjustment.project import (
+    ANGLES,
+    AXIS_SIGMAS,
+    SIGMAS,
+    XYZ,
+    CheckPoints,
+    Project,
+)
 from daemon.postflight.adjustment.project_file import ProjectFile
 from daemon.postflight.adjustment.reliability_report import (
     OBSERVATION_COLUMNS,
@@ -123,12 +135,14 @@ def _write_project(
         tables["attitudes"] = "attitudes.csv"
         b = network.measured_attitudes
         angles = np.degrees(omega_phi_kappa(b.rotation))
+        alike = bool((b.sigma_rad == b.sigma_rad[:, :1]).all())
         write_table(
             folder / "attitudes.csv",
-            "Measured attitudes, R = Rx(omega) Ry(phi) Rz(kappa), object from camera.",
-            ("exposure", *ANGLES, "sigma_deg"),
+            "Measured attitudes, R = Rx(omega) Ry(phi) Rz(kappa), object from camera; sigmas about "
+            "the axes of the camera or rig.",
+            ("exposure", *ANGLES, *(("sigma_deg",) if alike else AXIS_SIGMAS)),
             (
-                (network.attitudes.names[a], *own, math.degrees(sigma[0]))
+                (network.attitudes.names[a], *own, *np.degrees(sigma[: 1 if alike else 3]))
                 for a, own, sigma in zip(b.attitude, angles, b.sigma_rad, strict=True)
             ),
         )
@@ -152,7 +166,8 @@ def fill_results(
 ) -> None:
     """Like `write_results`, into the folder of `new_project`."""
     network = result.network
-    _write_project(folder, project.file, network, project.checks, result.state)
+    adjusted = with_settings(project.file, result.settings)
+    _write_project(folder, adjusted, used_network(result), project.checks, initial_state(result))
     sigma = result.sigma0 * np.sqrt(np.clip(np.einsum("nii->ni", result.point_cofactor), 0.0, None))
     rays = np.bincount(
         network.image_points.point[result.weight > 0.0], minlength=len(network.points.names)

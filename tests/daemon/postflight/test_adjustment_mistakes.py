@@ -244,3 +244,52 @@ def test_options_that_do_not_fit_are_refused(options, sentence, written) -> None
     outcome = CliRunner().invoke(app, ["adjust", str(written), *options])
     assert isinstance(outcome.exception, ConfigurationError)
     assert sentence in str(outcome.exception)
+
+
+@pytest.mark.parametrize(
+    ("factor", "words"),
+    [
+        (1 / 0.3048, "may be in feet"),
+        (1000.0, "in millimetres"),
+        (1e-3, "in kilometres"),
+        (2.0, "one of them is of another unit"),
+    ],
+)
+def test_control_of_another_unit_is_named_with_the_ratio(factor, words, written, tmp_path) -> None:
+    folder = shutil.copytree(written, tmp_path / "block")
+    path = folder / "points.csv"
+    lines = path.read_text().splitlines()
+    for k, line in enumerate(lines):
+        cells = line.split(",")
+        if cells[1:2] == ["control"]:
+            cells[2:5] = [repr(float(v) * factor) for v in cells[2:5]]
+            lines[k] = ",".join(cells)
+    path.write_text("\n".join(lines) + "\n")
+    outcome = CliRunner().invoke(app, ["adjust", str(folder), "--json"])
+    answer = json.loads(outcome.stdout)
+    found = [s for s in [*answer.get("cautions", ()), *answer["problems"]] if "as far apart" in s]
+    assert len(found) == 1, answer
+    assert words in found[0]
+    assert float(found[0].split()[3]) == pytest.approx(factor, rel=0.01)
+
+
+@pytest.mark.parametrize(("count", "words"), [(1, "is the only control"), (2, "are the only")])
+def test_one_or_two_control_points_are_one_sentence(count, words, written, tmp_path) -> None:
+    folder = shutil.copytree(written, tmp_path / "block")
+    project = folder / "project.toml"
+    text = project.read_text().splitlines()
+    project.write_text("\n".join(t for t in text if "gnss =" not in t and "distances =" not in t))
+    path = folder / "points.csv"
+    lines, left = path.read_text().splitlines(), count
+    for k, line in enumerate(lines):
+        cells = line.split(",")
+        if cells[1:2] == ["control"]:
+            if not left:
+                cells[1:2], cells[5:8] = ["tie"], ["", "", ""]
+            left -= bool(left)
+            lines[k] = ",".join(cells)
+    path.write_text("\n".join(lines) + "\n")
+    outcome = CliRunner().invoke(app, ["adjust", str(folder), "--json"])
+    (problem,) = json.loads(outcome.stdout)["problems"]
+    assert problem.startswith("p0 " if count == 1 else "p0 and p1 ")
+    assert words in problem
