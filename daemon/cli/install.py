@@ -47,13 +47,14 @@ def install(
     command = Path(sys.argv[0]).absolute()
     configuration = PurePosixPath(config.absolute())
     rig, missions, mirror = None, None, None
+    copy_to: tuple[Path, ...] = ()
     if config.exists():
         loaded, _ = load(config)
         rig, missions = loaded.mission.rig, loaded.mission.root
-        mirror = loaded.mission.mirror
+        mirror, copy_to = loaded.mission.mirror, loaded.landing.copy_to
     console = Console(stderr=True)
     done = installation.install(
-        installation.contents(command, configuration, missions, mirror),
+        installation.contents(command, configuration, missions, mirror, copy_to),
         installation.steps(command, rig),
         root=root,
         log=lambda line: console.print(line, style="dim", highlight=False),

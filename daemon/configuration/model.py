@@ -356,6 +356,13 @@ class NetworkSection(ConfigurationSection):
     """Whether heads that share a link are paced."""
 
 
+class LandingSection(ConfigurationSection):
+    """What the page may do after landing (docs/how-to/flight/watching.md)."""
+
+    copy_to: Several[FilePath] = Field(default=(), max_length=8)
+    """Folders of other disks that a mission may be copied into from the page."""
+
+
 class Configuration(ConfigurationSection):
     """The complete file."""
 
@@ -373,6 +380,7 @@ class Configuration(ConfigurationSection):
     triangulation: TriangulationSection = TriangulationSection()
     limits: LimitsSection = LimitsSection()
     network: NetworkSection = NetworkSection()
+    landing: LandingSection = LandingSection()
     watch: WatchSection | None = None
 
     @property

@@ -32,6 +32,8 @@ TARGETS = {
         "/etc/systemd/system/syntopic-disk-health.service"
     ),
     "syntopic-disk-health.timer": PurePosixPath("/etc/systemd/system/syntopic-disk-health.timer"),
+    "syntopic-poweroff.service": PurePosixPath("/etc/systemd/system/syntopic-poweroff.service"),
+    "syntopic-poweroff.socket": PurePosixPath("/etc/systemd/system/syntopic-poweroff.socket"),
     "sysusers.conf": PurePosixPath("/etc/sysusers.d/syntopic.conf"),
     "tmpfiles.conf": PurePosixPath("/etc/tmpfiles.d/syntopic.conf"),
     "sysctl.conf": PurePosixPath("/etc/sysctl.d/60-syntopic.conf"),
@@ -97,6 +99,7 @@ def contents(
     configuration: PurePosixPath,
     missions: Path | None,
     mirror: Path | None = None,
+    copy_to: Sequence[Path] = (),
 ) -> dict[str, str]:
     """Text by absolute target path.
 
@@ -105,6 +108,7 @@ def contents(
         configuration: what the service will run with.
         missions: where missions are kept, where that is known.
         mirror: where they are mirrored; it may be missing when the service starts.
+        copy_to: folders that a mission may be copied into after landing; they may be missing, too.
 
     Raises:
         InstallationError: the hardened service could not see the command or the configuration.
@@ -129,6 +133,7 @@ def contents(
         for folder in (missions, mirror)
         if folder is not None and not folder.is_relative_to(STATE_FOLDER)
     ]
+    writable += [f"ReadWritePaths=-{folder}\n" for folder in copy_to]
     if writable:
         texts[str(DROP_IN)] = "".join(("[Service]\n", *writable))
     return texts
@@ -230,6 +235,8 @@ def uninstall(*, root: Path, log: Callable[[str], None]) -> InstallationReport:
         )
         log(stop.purpose)
         done.run(stop)
+        helper = ("systemctl", "disable", "--now", "syntopic-poweroff.socket")
+        done.run(InstallationStep("stop the shutdown helper", helper, 60.0, True))
     try:
         for path, hash_noted in sorted(noted.items()):
             there = _hash_of(_below(root, path))

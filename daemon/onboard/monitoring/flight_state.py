@@ -88,6 +88,7 @@ class FlightState:
         self._track: deque[Json] = deque(maxlen=HISTORY_MAX)
         self._retakes: list[Json] = []
         self._triangulation: Json = {}
+        self._landing: Json = {}
         self.guidance: Mapping[str, Any] = {}
         """The last guidance; it has no sequence, since the next one replaces it."""
         self.guidance_count = 0
@@ -111,6 +112,7 @@ class FlightState:
             "processed",
             "triangulated",
             "triangulation",
+            "landing-action",
         ):
             self._events.append({"sequence": self.sequence, **event})
 
@@ -127,6 +129,7 @@ class FlightState:
             "last_number": max(self._exposures, default=None),
             "verdicts": self._verdict_counts(),
             **({"retakes": len(self._retakes)} if self._retakes else {}),
+            **({"landing": self._landing} if self._landing else {}),
         }
 
     def changed(self, part: str, after: int) -> list[Json]:
@@ -218,6 +221,7 @@ class FlightState:
         self._phase = "idle"
         self._retakes.clear()
         self._triangulation = {}
+        self._landing = {}
 
     def _on_bound(self, event: Mapping[str, Any]) -> None:
         device = self._device(str(event.get("device")))
@@ -353,6 +357,14 @@ class FlightState:
     def _on_not_written(self, event: Mapping[str, Any]) -> None:
         self._exposure(event)["step"] = "not written"
 
+    def _on_landing(self, event: Mapping[str, Any]) -> None:
+        self._landing = {key: event.get(key) for key in ("folders", "poweroff")} | {"actions": {}}
+
+    def _on_landing_action(self, event: Mapping[str, Any]) -> None:
+        known = {key: value for key, value in event.items() if key not in ("event", "mono_ns")}
+        actions = {**self._landing.get("actions", {}), str(known.pop("action", "")): known}
+        self._landing = {**self._landing, "actions": actions}
+
     def _on_ended(self, event: Mapping[str, Any]) -> None:
         self._phase = "landed" if event.get("failure") is None else "fault"
         self._status = {**self._status, "ledger": event.get("ledger")}
@@ -421,5 +433,7 @@ _HANDLERS: Mapping[str, Callable[[FlightState, Mapping[str, Any]], None]] = {
     "retake": FlightState._on_retake,
     "not-written": FlightState._on_not_written,
     "lost": FlightState._on_lost,
+    "landing": FlightState._on_landing,
+    "landing-action": FlightState._on_landing_action,
     "ended": FlightState._on_ended,
 }

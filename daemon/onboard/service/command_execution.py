@@ -5,6 +5,7 @@ Each command returns an answer. Command, author and answer are written to the fl
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol, TypeGuard
@@ -13,7 +14,7 @@ from daemon import DaemonError
 from daemon.mission.log.log_records import AUDIT_TOPIC, Message, lenient_json_bytes
 from daemon.mission.operator_decisions import DecisionKind
 from daemon.onboard.flight.arming import MissingPrerequisite
-from daemon.onboard.service.command_rules import violation
+from daemon.onboard.service.command_rules import LANDED_COMMANDS, violation
 from daemon.onboard.service.message_dispatcher import Handlers
 from daemon.onboard.service.messages import (
     Answer,
@@ -79,6 +80,17 @@ class DecisionCommands(Protocol):
     ) -> str: ...
 
 
+class LandedCommands(Protocol):
+    """Actions after landing; `daemon.onboard.service.landed_stage.LandedStage`."""
+
+    @property
+    def is_entered(self) -> bool: ...
+    @property
+    def running(self) -> str: ...
+    def request(self, action: str, folder: str | None, by: str) -> str | None: ...
+    def audit(self, content: Mapping[str, Any]) -> None: ...
+
+
 class CommandTarget(Protocol):
     """The service commands act on."""
 
@@ -94,6 +106,8 @@ class CommandTarget(Protocol):
     def mirror(self) -> DiskCommands: ...
     @property
     def journal(self) -> DecisionCommands: ...
+    @property
+    def landed(self) -> LandedCommands: ...
     def acknowledge(self, fault: str) -> bool: ...
     def land(self, *, new_mission: bool = False) -> None: ...
 
@@ -147,7 +161,10 @@ class CommandHandlers:
         self._record(invalid_message(invalid), invalid_event(invalid))
 
     def _record(self, message: Message, event: Mapping[str, Any]) -> None:
-        self._send("writer", AppendToLog(message, is_durable=True))
+        if self._target.landed.is_entered:
+            self._target.landed.audit(json.loads(message.payload))
+        else:
+            self._send("writer", AppendToLog(message, is_durable=True))
         self._emit(**event)
 
 
@@ -156,6 +173,8 @@ def execute(command: ServiceCommand, flight: CommandTarget) -> Answer:
     handler = _COMMANDS.get(command.name)
     if handler is None:
         return _rejected(command, f"there is no command {command.name}")
+    if flight.landed.is_entered and command.name not in LANDED_COMMANDS:
+        return _rejected(command, "the flight has ended; new-mission begins the next one")
     return handler(command, flight)
 
 
@@ -287,16 +306,27 @@ def _distance(command: ServiceCommand, flight: CommandTarget) -> Answer:
 
 def _land(command: ServiceCommand, flight: CommandTarget) -> Answer:
     flight.land()
-    return _accepted(command, "no more exposures; open ones are sealed, then the service ends")
+    return _accepted(command, "no more exposures; open ones are sealed, and the mission is closed")
 
 
 def _new_mission(command: ServiceCommand, flight: CommandTarget) -> Answer:
     if flight.line.is_running and not flight.line.is_flown:
         return _rejected(command, "the line runs; stop it first")
+    if action := flight.landed.running:
+        return _rejected(command, f"{action} runs; wait for its end")
     flight.land(new_mission=True)
     return _accepted(
         command, "this mission is closed, and the next one begins with its configuration"
     )
+
+
+def _after_landing(command: ServiceCommand, flight: CommandTarget) -> Answer:
+    folder = command.arguments.get("folder")
+    refusal = flight.landed.request(command.name, folder, command.by)
+    if refusal is not None:
+        return _rejected(command, refusal)
+    sentences = {"shutdown": "the computer shuts down"}
+    return _accepted(command, sentences.get(command.name, f"{command.name} has begun"))
 
 
 def _exposure(command: ServiceCommand, flight: CommandTarget) -> Answer:
@@ -415,6 +445,10 @@ _COMMANDS: Mapping[str, Callable[[ServiceCommand, CommandTarget], Answer]] = {
     "land": _land,
     "acknowledge": _acknowledge,
     "new-mission": _new_mission,
+    "verify": _after_landing,
+    "copy": _after_landing,
+    "report": _after_landing,
+    "shutdown": _after_landing,
     "exposure": _exposure,
     "reject": _reject,
     "accept": _accept,

@@ -31,11 +31,19 @@ COMMAND_ROLES: Final[Mapping[str, Role]] = {
     "accept": "operator",
     "withdraw": "operator",
     "retake": "operator",
+    "verify": "operator",
+    "copy": "operator",
+    "report": "operator",
+    "shutdown": "administrator",
     "new-mission": "administrator",
     "release-disk": "administrator",
     "accept-disk": "administrator",
 }
-"""What flies the camera is the operator's; what changes disks or configuration is not."""
+"""What flies the camera is the operator's; what changes disks, configuration or power is not."""
+LANDED_COMMANDS: Final = frozenset(
+    {"verify", "copy", "report", "shutdown", "new-mission", "acknowledge"}
+)
+"""Commands that are accepted after the flight has ended."""
 
 
 class CommandBody(BaseModel):
@@ -50,6 +58,9 @@ class CommandBody(BaseModel):
     )
     disk: Literal["root", "mirror"] | None = Field(
         default=None, description="for release-disk and accept-disk"
+    )
+    folder: str | None = Field(
+        default=None, max_length=200, description="for copy: one of [landing] copy_to"
     )
     number: int | None = Field(
         default=None, ge=1, lt=10**9, description="exposure, for reject, accept, withdraw, retake"

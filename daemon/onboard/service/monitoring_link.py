@@ -57,8 +57,8 @@ class MonitoringLink:
                 self.emit(event)
 
     def emit(self, event: Mapping[str, Any]) -> None:
-        """Send an event. Persistent events (mission, devices, counters, exposure settings) are sent
-        again to a restarted process."""
+        """Send an event. Persistent events (mission, devices, counters, exposure settings,
+        actions after landing) are sent again to a restarted process."""
         key = _persistent_key(event)
         if key is not None:
             self._persistent[key] = event
@@ -101,8 +101,10 @@ _STATES = DELIVERING | UNAVAILABLE | {SEARCHING, FIXED}
 def _persistent_key(event: Mapping[str, Any]) -> str | None:
     """Key of a persistent event, None for others; a later event of the same key replaces it."""
     kind = event.get("event")
-    if kind in ("mission", "exposure-settings", "counters"):
+    if kind in ("mission", "exposure-settings", "counters", "landing"):
         return str(kind)
+    if kind == "landing-action":
+        return f"{kind} {event.get('action')}"
     if kind == "bound" or (kind == "device" and event.get("name") in _STATES):
         return f"{kind} {event.get('device')}"
     return None

@@ -12,7 +12,7 @@ import signal
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
@@ -25,8 +25,6 @@ from daemon.onboard.capture.device_states import DeviceStates
 from daemon.onboard.capture.devices import bound_problem
 from daemon.onboard.capture.exposure_controller import ExposureController
 from daemon.onboard.capture.link_settings import head_link_problem
-from daemon.onboard.flight.arming import FILE as OVERRIDES
-from daemon.onboard.flight.arming import MissingPrerequisite, override_message, overrides_content
 from daemon.onboard.flight.decisions import Decision
 from daemon.onboard.flight.fault_latches import FILE as UNHANDLED
 from daemon.onboard.flight.fault_latches import (
@@ -48,6 +46,7 @@ from daemon.onboard.service.exposure_sequence import ExposureSequence
 from daemon.onboard.service.flight_line import FlightLine, Order
 from daemon.onboard.service.guidance_feed import PERIOD_S as GUIDANCE_PERIOD_S
 from daemon.onboard.service.guidance_feed import GuidanceFeed
+from daemon.onboard.service.landed_stage import LandedStage
 from daemon.onboard.service.message_dispatcher import MessageDispatcher
 from daemon.onboard.service.messages import (
     AppendToLog,
@@ -60,6 +59,7 @@ from daemon.onboard.service.monitoring_link import NAME as WATCH
 from daemon.onboard.service.monitoring_link import MonitoringLink, status_event
 from daemon.onboard.service.notify import Notifier
 from daemon.onboard.service.operator_journal import OperatorJournal
+from daemon.onboard.service.override_record import OverrideRecord
 from daemon.onboard.service.startup import (
     capture_process,
     frame_rings,
@@ -104,6 +104,8 @@ class Service:
         self.monitoring = MonitoringLink(self.supervisor, watch_process(configuration))
         section = configuration.triangulation
         self.triangulation = TriangulationLink(self.supervisor, section, self._event)
+        folders = configuration.landing.copy_to
+        self.landed = LandedStage(self.supervisor, folders, self._event, self.notifier)
         self.is_ready = False
         self.is_power_failing = False
         self.failure: str | None = None
@@ -115,7 +117,7 @@ class Service:
         self.mission_lock = ExitStack()
         self.preparation = Preparation(configuration, rig, config_path, self._event, self._fail)
         self.dispatcher = MessageDispatcher()
-        self.dispatcher.add(self.preparation.handlers)
+        self.dispatcher.add({**self.preparation.handlers, **self.landed.handlers})
         self.dispatcher.add({ServiceEvent: lambda message: self._event(**message.event)})
 
     async def run(self) -> int:
@@ -128,7 +130,7 @@ class Service:
         loop = asyncio.get_running_loop()
         loop.set_exception_handler(lambda _, context: self._on_internal_error(context))
         for name in (signal.SIGTERM, signal.SIGINT, signal.SIGPWR):
-            loop.add_signal_handler(name, self.stopping.set)
+            loop.add_signal_handler(name, self._end)
         mission = await self._prepare()
         if mission is None:
             await self.supervisor.end(("worker",))
@@ -146,7 +148,8 @@ class Service:
             for task in tasks:
                 task.add_done_callback(self._task_ended)
             await self.stopping.wait()
-            notify = self.notifier.status if self.continues else self.notifier.stopping
+            goes_on = self.continues or self.landed.is_wanted
+            notify = self.notifier.status if goes_on else self.notifier.stopping
             notify("landing: sealing what is open")
             await self._land(tasks)
             await self._save_unhandled()
@@ -156,6 +159,8 @@ class Service:
         if self.failure is None and not self.mirror.is_on:
             mission.close()
         self._event("ended", failure=self.failure, ledger=self.flight.ledger.sheet().as_json())
+        if self.landed.is_wanted and self.failure is None:
+            await self.landed.stay(self.mission.path, self._status, self.monitoring.emit)
         await self.supervisor.end((WATCH,))
         return 0 if self.failure is None else 1
 
@@ -231,7 +236,8 @@ class Service:
         self.preflight = Preflight(
             self.configuration, self.rig, self.flight, self.line, self.devices, self.pipeline
         )
-        self.preflight.on_override = self._record_override
+        record = OverrideRecord(lambda: self.mission.path, send, self.mirror.save_now, self._event)
+        self.preflight.on_override = record.record
         self._emit_previous_faults(mission)
         commands = CommandHandlers(self, self.monitoring.answer, send, self._event)
         for part in (self.devices, self.sequence, self.mirror, self.triangulation, commands):
@@ -267,23 +273,12 @@ class Service:
             self._event(**event)
         self.monitoring.faults = lambda: previous_faults(self.latches.unhandled())
 
-    def _record_override(
-        self, by: str, missing: Sequence[MissingPrerequisite], reason: str
-    ) -> None:
-        self.supervisor.send("writer", AppendToLog(override_message(by, missing, reason)))
-        message = "; ".join(map(str, missing)) + (f". Reason: {reason}" if reason else "")
-        self._event("override", by=by, sentence=f"{by} overrides: {message}")
-        try:
-            note = overrides_content(self.mission.path, by, missing, reason=reason)
-            self.mirror.save_now(f"{self.mission.id}/{OVERRIDES}", note)
-        except OSError as error:
-            # The log has it too.
-            self._event("disk", fault=True, sentence=f"the override is not noted: {error}")
-
     def _child_died(self, name: str) -> None:
         if name == WATCH:
-            if not self.stopping.is_set():
+            if not self.stopping.is_set() or self.landed.is_entered:
                 self.monitoring.died()
+        elif name == LandedStage.name:
+            self.landed.died()
         elif name == TriangulationLink.name:
             self.triangulation.died()
         elif not self.stopping.is_set():
@@ -366,8 +361,12 @@ class Service:
         return self.latches.acknowledge(fault)
 
     def land(self, *, new_mission: bool = False) -> None:
-        """End the flight: open exposures are sealed first. `new_mission`: another one follows."""
-        self.continues = new_mission
+        """End the flight and seal what is open; then the service stays, or begins a new mission."""
+        self._end()
+        self.continues, self.landed.is_wanted = new_mission, not new_mission
+
+    def _end(self) -> None:
+        self.landed.leave()
         self.stopping.set()
 
     def _status(self) -> dict[str, Any]:
@@ -461,7 +460,7 @@ class Service:
             f"power fails; what is open is stored and sealed within {limits.power_fail_s:g} s"
         )
         self._event("power", fault=True, sentence=sentence)
-        self.stopping.set()
+        self._end()
 
     def _expire_timeouts(self) -> None:
         self.sequence.expire_timeouts()
@@ -494,7 +493,7 @@ class Service:
         self.triangulation.note(message)
 
     def _fail(self, sentence: str) -> None:
-        self.stopping.set()
+        self._end()
         if self.failure is None:
             self.failure = sentence
             self._event("fault", sentence=sentence)

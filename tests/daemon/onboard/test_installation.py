@@ -92,6 +92,30 @@ def test_the_helper_that_asks_the_disks_is_valid_and_closed_to_all_else(tmp_path
     assert float(found.group(1)) <= EXPOSURE_MAX
 
 
+def test_the_shutdown_helper_is_valid_answers_the_service_only_and_is_not_enabled(
+    tmp_path: Path,
+) -> None:
+    program = systemd_analyze()
+    texts = contents(COMMAND, CONFIGURATION, None, copy_to=[Path("/media/shuttle")])
+    assert texts[str(DROP_IN)] == "[Service]\nReadWritePaths=-/media/shuttle\n"
+    names = ("syntopic-poweroff.service", "syntopic-poweroff.socket")
+    for name in names:
+        (tmp_path / name).write_text(texts[str(TARGETS[name])])
+    lines = texts[str(TARGETS["syntopic-poweroff.socket"])].splitlines()
+    assert {"SocketUser=syntopic", "SocketMode=0600"} <= set(lines)
+    completed = subprocess.run(
+        [program, "security", "--offline=true", str(tmp_path / names[0])],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    found = re.search(rf"exposure level for {re.escape(names[0])}: ([0-9.]+)", completed.stdout)
+    assert found, completed.stdout + completed.stderr
+    assert float(found.group(1)) <= EXPOSURE_MAX
+    assert not any("poweroff" in " ".join(step.command) for step in steps(COMMAND, "rig"))
+
+
 @pytest.mark.parametrize("path", ["/home/pilot/venv/bin/syntopic", "/root/syn/bin/syntopic"])
 def test_a_command_the_service_could_not_see_is_refused(path: str) -> None:
     with pytest.raises(InstallationError, match="python3 -m venv /opt/syntopic"):

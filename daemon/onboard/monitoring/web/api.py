@@ -112,6 +112,10 @@ CommandName = Literal[
     "retake",
     "acknowledge",
     "new-mission",
+    "verify",
+    "copy",
+    "report",
+    "shutdown",
     "exposure",
     "release-disk",
     "accept-disk",
@@ -283,6 +287,23 @@ def _add_state(app: FastAPI, state: FlightState, access: _AccessControl) -> None
         except OSError as error:
             raise HTTPException(404, "the mission has no service.toml") from error
 
+    @app.get(
+        "/api/v1/report",
+        dependencies=[watcher],
+        tags=["state"],
+        response_class=FileResponse,
+        responses={200: {"content": {"text/html": {}}}},
+    )
+    async def mission_report() -> FileResponse:
+        """The mission report, as written by the command report."""
+        if state.mission_path is None:
+            raise HTTPException(404, "no mission yet")
+        path = Path(state.mission_path) / "export" / "report.html"
+        if not path.is_file():
+            raise HTTPException(404, "the mission has no report (yet)")
+        policy = {"Content-Security-Policy": PRODUCT_POLICY}
+        return FileResponse(path, media_type="text/html", headers=policy)
+
     @app.get("/metrics", tags=["state"], dependencies=[watcher], response_class=PlainTextResponse)
     async def metrics() -> Response:
         """Prometheus exposition."""
@@ -337,8 +358,11 @@ def _add_commands(
     ) -> CommandResponse:
         """arm, start or stop the line, trigger, land, acknowledge, expose otherwise.
 
-        Needs a token of the role operator; new-mission, release-disk and accept-disk need the
-        role administrator. Every command is answered by the service and recorded in the audit log.
+        After landing: verify, copy, report and shutdown.
+
+        Needs a token of the role operator; new-mission, release-disk, accept-disk and shutdown
+        need the role administrator. Every command is answered by the service and recorded in the
+        audit log.
         """
         try:
             given = await command_body(request)

@@ -142,7 +142,7 @@ def test_each_command_is_executed_from_its_role_upwards(
         client.post(f"/api/v1/commands/{name}", headers=bearer(token), json=body).status_code == 200
         for token in by_role
     ]
-    needs_administrator = name in ("new-mission", "release-disk", "accept-disk")
+    needs_administrator = name in ("new-mission", "release-disk", "accept-disk", "shutdown")
     assert obeyed == [False, not needs_administrator, True]
     assert len(camera.commands) == sum(obeyed)
     assert len(camera.refused) == 3 - sum(obeyed)

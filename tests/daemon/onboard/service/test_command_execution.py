@@ -36,16 +36,32 @@ class FakeLine:
 
 
 @dataclass
+class FakeLanded:
+    is_entered: bool = False
+    running: str = ""
+    requests: list[tuple[str, str | None, str]] = field(default_factory=list)
+    audited: list[Mapping[str, Any]] = field(default_factory=list)
+
+    def request(self, action: str, folder: str | None, by: str) -> str | None:
+        self.requests.append((action, folder, by))
+        return None if self.is_entered else "the flight has not ended; land first"
+
+    def audit(self, content: Mapping[str, Any]) -> None:
+        self.audited.append(content)
+
+
+@dataclass
 class FakeService:
     line: FakeLine = field(default_factory=FakeLine)
     is_ready: bool = True
     missing: list[MissingPrerequisite] = field(default_factory=list)
-    landed: bool = False
+    has_landed: bool = False
     overrides: list[tuple[str, list[str], str]] = field(default_factory=list)
     armed: int = 0
     faults: set[str] = field(default_factory=set)
     exposed: list[tuple[str, dict[str, Any]]] = field(default_factory=list)
     continues: bool = False
+    landed: FakeLanded = field(default_factory=FakeLanded)
 
     @property
     def preflight(self) -> FakeService:
@@ -86,7 +102,7 @@ class FakeService:
         return None
 
     def land(self, *, new_mission: bool = False) -> None:
-        self.landed, self.continues = True, new_mission
+        self.has_landed, self.continues = True, new_mission
 
 
 KERNELS = MissingPrerequisite(
@@ -179,10 +195,10 @@ def test_a_new_mission_closes_this_one_unless_its_line_still_runs() -> None:
     service = FakeService()
     service.line.is_running = True
     assert send(service, "new-mission") == (False, "the line runs; stop it first")
-    assert not service.landed
+    assert not service.has_landed
     service.line.is_running = False
     assert send(service, "new-mission")[0]
-    assert (service.landed, service.continues) == (True, True)
+    assert (service.has_landed, service.continues) == (True, True)
     service = FakeService()
     assert send(service, "land")[0]
     assert not service.continues
@@ -198,7 +214,7 @@ def test_exposure_settings_are_handed_on_with_who_wants_them() -> None:
 def test_landing_is_never_refused() -> None:
     service = FakeService(is_ready=False, missing=[KERNELS])
     assert send(service, "land")[0]
-    assert service.landed
+    assert service.has_landed
 
 
 def test_each_command_is_written_down_with_who_gave_it() -> None:

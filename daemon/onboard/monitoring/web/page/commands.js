@@ -5,7 +5,7 @@ import { serverText, t } from "./i18n.js";
 
 const answer = document.getElementById("answer");
 const ANSWER_MS = 15000;
-const CONFIRMED = new Set(["land", "new-mission", "release-disk", "accept-disk"]);
+const CONFIRMED = new Set(["land", "new-mission", "release-disk", "accept-disk", "shutdown"]);
 let clearing = null;
 
 // The value with which a dialog is closed: the text of its field, "use" without one, empty if it is cancelled.

@@ -2,7 +2,7 @@
 
 export const LANGUAGES = { en: "English", de: "Deutsch", fr: "Français", es: "Español", zh: "中文" };
 const PSEUDO = "qps";
-const CATALOGS = ["page", "map", "alarm"];
+const CATALOGS = ["page", "map", "alarm", "landing"];
 const PSEUDO_LETTERS = { a: "å", e: "é", i: "î", o: "ö", u: "ü", A: "Å", E: "É", I: "Î", O: "Ö", U: "Ü", n: "ñ", c: "ç" };
 
 function preferred() {

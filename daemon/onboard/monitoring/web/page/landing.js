@@ -11,24 +11,32 @@ const REFRESH_MS = 5000;
 const GPS_EPOCH_UNIX_S = 315964800;
 
 // The last advice and its files, since the service may have ended when they are wanted.
-const kept = { advice: null, files: new Map(), atMs: 0 };
+const kept = { mission: null, advice: null, files: new Map(), atMs: 0 };
 let temperatureRange = null;
+
+// Forget what was kept of another mission. A reconnection to the same mission keeps it.
+function followMission(id) {
+  if (id === kept.mission) return;
+  Object.assign(kept, { mission: id, advice: null, files: new Map(), atMs: 0 });
+  temperatureRange = null;
+}
 
 async function keep() {
   if (Date.now() - kept.atMs < REFRESH_MS) return;
   kept.atMs = Date.now();
+  const { mission } = kept;
   const advice = await fetchJson("/api/v1/advice");
-  if (advice?.segments) {
-    kept.advice = advice;
-    for (const name of Object.keys(FILES)) {
-      const blob = await (await fetchOk(`/api/v1/advice/${name}`))?.blob();
-      if (blob) kept.files.set(name, blob);
-    }
+  if (mission !== kept.mission || !advice?.segments) return;
+  kept.advice = advice;
+  for (const name of Object.keys(FILES)) {
+    const blob = await (await fetchOk(`/api/v1/advice/${name}`))?.blob();
+    if (mission !== kept.mission) return;
+    if (blob) kept.files.set(name, blob);
   }
 }
 
-function noteTemperatures(status) {
-  for (const value of Object.values(status.temperatures_c || {})) {
+function noteTemperatures(record) {
+  for (const value of Object.values(record.temperatures_c || {})) {
     if (value == null) continue;
     temperatureRange = temperatureRange ? [Math.min(temperatureRange[0], value), Math.max(temperatureRange[1], value)] : [value, value];
   }
@@ -53,7 +61,7 @@ function summary(flight) {
   const unflown = (kept.advice?.segments || []).filter((one) => one.kind !== "hole");
   const rows = [
     ["exposures", number(triggers.triggers ?? all), ""],
-    ["lost", number(triggers.lost ?? 0), triggers.lost ? "warning" : "good"],
+    ["lost", number(triggers.lost), triggers.lost == null ? "" : triggers.lost ? "warning" : "good"],
     ["quality", `● ${number(good)}  ▲ ${number(usable)}  ■ ${number(refly)}`, refly ? "caution" : "good"],
   ];
   if (kept.advice) {
@@ -78,14 +86,50 @@ function download(name) {
   setTimeout(() => URL.revokeObjectURL(link.href), 60000);
 }
 
-// The command of each next step. Nobody but the owner of the computer may run it, so the page runs none.
+// The command of each next step, for a person at the computer. The buttons are there while the service runs.
 const commandOf = (name, path) => ({ verify: `syntopic verify ${path}`, copy: `syntopic transfer ${path} DISK`,
   report: `syntopic report ${path}`, shutdown: "systemctl poweroff" })[name];
+const STATE_MARKS = { running: "▲", done: "●", failed: "■" };
 
-function nextSteps(flight) {
-  const path = flight.brief.mission.path || "MISSION";
-  return element("ul", { className: "next-steps" }, ...ACTIONS.map((name) => element("li", {},
-    element("strong", { textContent: t(`landing.${name}`) }), element("code", { textContent: commandOf(name, path) }))));
+function stateOf({ state, done_bytes: done, total_bytes: total, sentence }) {
+  const share = state === "running" && total ? percent(done / total) : "";
+  return [element("strong", { className: state === "failed" ? "warning" : "", textContent: `${STATE_MARKS[state]} ${t(`landing.state.${state}`, { share })}` }),
+    sentence && element("span", { lang: "en", textContent: sentence })];
+}
+
+async function saveReport() {
+  const blob = await (await fetchOk("/api/v1/report"))?.blob();
+  if (!blob) return;
+  kept.files.set("report.html", blob);
+  download("report.html");
+}
+
+// Buttons of an action: one for each folder that a mission may be copied into, none where it is not possible.
+function buttonsOf(name, { folders, poweroff }, isBusy, feed) {
+  const one = (label, body) => button(label, (event) => {
+    event.target.disabled = true;
+    feed.command(name, body).finally(() => { event.target.disabled = isBusy; });
+  }, { disabled: isBusy, dataset: { action: name } });
+  if (name === "copy") return folders.length ? folders.map((folder) => one(t("landing.copy_to", { folder }), { folder }))
+    : [element("span", { className: "note", textContent: t("landing.no_folder") })];
+  if (name === "shutdown" && poweroff) return [element("span", { className: "note", lang: "en", textContent: poweroff })];
+  return [one(t(`landing.${name}`), {})];
+}
+
+function nextSteps(feed) {
+  const { mission, landing } = feed.flight.brief;
+  const byHand = element("ul", { className: "next-steps" }, ...ACTIONS.map((name) => element("li", {},
+    element("strong", { textContent: t(`landing.${name}`) }), element("code", { textContent: commandOf(name, mission.path || "MISSION") }))));
+  if (!landing || !feed.isLinked) return [byHand];
+  const isBusy = Object.values(landing.actions).some((one) => one.state === "running");
+  const steps = ACTIONS.map((name) => {
+    const action = landing.actions[name];
+    const save = name === "report" && action && action.state !== "running" && button(t("landing.save_report"), saveReport, { dataset: { action: "save" } });
+    return element("li", { dataset: { step: name } }, ...buttonsOf(name, landing, isBusy, feed), ...(action ? stateOf(action) : []).filter(Boolean), save || null);
+  });
+  const next = button(t("landing.next_mission"), () => feed.command("new-mission"), { disabled: isBusy, dataset: { action: "new-mission" } });
+  return [element("ul", { className: "next-steps" }, ...steps, element("li", {}, next)),
+    element("details", {}, element("summary", { textContent: t("landing.by_hand") }), byHand)];
 }
 
 export function start(root, feed) {
@@ -95,19 +139,21 @@ export function start(root, feed) {
     root.hidden = brief.phase !== "landed";
     if (root.hidden) return;
     const rows = summary(feed.flight);
-    redraw(root, JSON.stringify([rows, [...kept.files.keys()]]), () => [
+    redraw(root, JSON.stringify([rows, [...kept.files.keys()], brief.landing, feed.isLinked]), () => [
       element("h2", { textContent: t("landing.title", { mission: brief.mission.id || "" }) }),
       element("dl", { className: "figures wide summary" }, ...rows.map(([name, value, state]) => element("div", { className: state, dataset: { summary: name } },
         element("dt", { textContent: t(`landing.${name}`) }), element("dd", { textContent: value })))),
       element("h2", { textContent: t("landing.fly_again") }),
-      kept.files.size ? element("div", { className: "tools" }, ...[...kept.files.keys()].map((name) => button(FILES[name], () => download(name),
+      kept.files.size ? element("div", { className: "tools" }, ...Object.keys(FILES).filter((name) => kept.files.has(name)).map((name) => button(FILES[name], () => download(name),
         { dataset: { file: name } }))) : element("p", { className: "note", textContent: t("lines.no_plan") }),
-      element("h2", { textContent: t("landing.next") }), nextSteps(feed.flight),
+      element("h2", { textContent: t("landing.next") }), ...nextSteps(feed),
     ]);
   };
-  feed.subscribe(async (record, isFirstRecord) => {
-    if (isFirstRecord) temperatureRange = null;
+  feed.subscribe(async (record) => {
+    followMission(feed.flight.brief.mission?.id || null);
     noteTemperatures(feed.flight.brief.status || {});
+    // The first record has the temperatures of all exposures, also of those before this page was opened.
+    for (const one of record?.history || []) noteTemperatures(one);
     const hasLanded = feed.flight.brief.phase === "landed";
     if (hasLanded && root.hidden) {
       kept.atMs = 0;
