@@ -147,8 +147,14 @@ class Coverage:
             else []
         )
 
-    def _remaining(self, context: _PlanContext) -> dict[str, tuple[float, float]]:
-        """Remaining segment of each line: all of it, or the part ahead on the current line."""
+    def _remaining(
+        self, context: _PlanContext, *, of_left_lines: bool = False
+    ) -> dict[str, tuple[float, float]]:
+        """Remaining segment of each line: all of it, or the part ahead on the current line.
+
+        With `of_left_lines` also the rest of a line that was broken off before another one began;
+        for re-flights that rest is a hole.
+        """
         flown: dict[str, list[ExposureFootprint]] = {}
         latest = ""
         for latest, taken in (self._taken[number] for number in sorted(self._taken)):
@@ -172,6 +178,13 @@ class Coverage:
                 ahead = (at_m[-1] + margin_m, length_m)
                 back = (0.0, at_m[-1] - margin_m)
                 unflown[line.id] = ahead if at_m[-1] >= at_m[0] else back
+            elif of_left_lines and at_m:
+                ahead = (max(at_m) + margin_m, length_m)
+                back = (0.0, min(at_m) - margin_m)
+                rest = ahead if at_m[-1] >= at_m[0] else back
+                places = places_m(line, length_m, context.base_m)
+                if any(rest[0] < place < rest[1] for place in places):
+                    unflown[line.id] = rest
         return {line: (a, b) for line, (a, b) in unflown.items() if a < b}
 
     @property
@@ -188,12 +201,15 @@ class Coverage:
         return start.latitude_deg, start.longitude_deg
 
     def lines_left(self) -> dict[str, Any] | None:
-        """Lines and metres that are still to be flown for the first time; None without a plan."""
+        """Lines and metres still to be flown for the first time; None without a plan.
+
+        The rest of a line that was broken off counts.
+        """
         self.update()
         context = self._context
         if context is None:
             return None
-        remaining = self._remaining(context)
+        remaining = self._remaining(context, of_left_lines=True)
         lengths_m = [
             math.hypot(*LocalPlane(line.start).flat(line.end)) for line in context.plan.lines
         ]

@@ -62,6 +62,19 @@ def test_lines_are_left_until_they_are_flown(planned: FlightState) -> None:
     assert lines["left_m"] == pytest.approx(2 * LENGTH_M - 230.0, abs=30.0)
     for event in flight_events.exposure(4, "good", line="A2"):
         planned.apply(event)
+    lines = remaining_json(planned, coverage, NOON_UNIX_S)["lines"]
+    # The line that was broken off is left, too.
+    assert (lines["left"], lines["current"]) == (2, "A2")
+    assert lines["left_m"] == pytest.approx(2 * LENGTH_M - 260.0, abs=50.0)
+
+
+def test_a_line_flown_to_its_end_is_not_left_when_the_next_one_begins(planned: FlightState) -> None:
+    coverage = Coverage(planned)
+    for number, north_m in enumerate(range(0, 1113, 60), start=1):
+        for event in flight_events.exposure(number, "good", line="A1", north_m=north_m):
+            planned.apply(event)
+    for event in flight_events.exposure(30, "good", line="A2"):
+        planned.apply(event)
     assert remaining_json(planned, coverage, NOON_UNIX_S)["lines"]["left"] == 1
 
 
