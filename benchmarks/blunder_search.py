@@ -2,7 +2,10 @@
 
 Three blocks: aerial lines with control, images around a building, and the network of the published
 camera calibration in tests/processing/bundle/data. Observations are computed from the adjusted
-values and disturbed with normal errors; 2 % of the image points are displaced by 50 px.
+values and disturbed with normal errors; 2 % of the image points are displaced by 50 px. `--large`
+takes a building of 180,000 image coordinates alone. `--others` adds GNSS positions, attitudes and
+distances, and a blunder of 20 standard deviations to one of 12 control points, GNSS positions,
+attitudes and distances.
 """
 
 from __future__ import annotations
@@ -10,6 +13,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,20 +26,24 @@ from scipy import stats
 from daemon.cli.benchmark.measurement import machine
 from daemon.postflight.importers.dbat import import_dbat
 from processing.bundle.adjust import Adjustment, AdjustmentSettings, adjust
+from processing.bundle.data_snooping import Excluded, nothing_excluded
 from processing.bundle.equations import equations
 from processing.bundle.initial_values import completed
 from processing.bundle.network import (
     Attitudes,
     CameraModel,
+    Distances,
+    Gnss,
     ImagePoints,
     Images,
+    MeasuredAttitudes,
     Network,
     Points,
     Stations,
 )
 from processing.bundle.reliability import reliability_of
 from processing.bundle.robust_weights import WeightFunction
-from processing.geometry.rotation import rotation_matrix
+from processing.geometry.rotation import rotation_matrix, rotations_from_vectors
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -47,6 +55,10 @@ BLUNDER_PX: Final = 50.0
 SHARE: Final = 0.02
 ABOVE_DETECTABLE: Final = 1.5
 MIN_RAYS: Final = 3
+OTHER_SIGMAS: Final = 20.0
+ONE_OF: Final = 12
+KINDS: Final = (("control", (2, 3)), ("gnss", (4, 5)), ("attitude", (6,)), ("distance", (7,)))
+LARGE: Final = 26_000
 
 
 @dataclass(frozen=True)
@@ -194,6 +206,89 @@ def at_adjusted_values(result: Adjustment) -> Network:
     return network
 
 
+def with_others(block: Block, seed: int = 5) -> Block:
+    """The block with GNSS positions, attitudes and distances, without errors."""
+    random = np.random.default_rng(seed)
+    network = block.network
+    n, own = len(network.stations.names), np.arange(len(network.stations.names))
+    rays = np.bincount(network.image_points.point, minlength=len(network.points.names))
+    ends = random.choice(np.flatnonzero(rays >= MIN_RAYS), (24, 2), replace=False)
+    xyz, zero = network.points.xyz_m, np.zeros((n, 3))
+    length = np.linalg.norm(xyz[ends[:, 0]] - xyz[ends[:, 1]], axis=1)
+    scale = float(np.median(np.linalg.norm(network.stations.position_m - xyz.mean(axis=0), axis=1)))
+    gnss = Gnss(
+        own, own, network.stations.position_m, np.full((n, 3), 5e-5 * scale), zero,
+        np.full(n, -1), np.zeros(n),
+    )  # fmt: skip
+    return replace(
+        block,
+        network=replace(
+            network,
+            gnss=gnss,
+            measured_attitudes=MeasuredAttitudes(
+                own, network.attitudes.rotation, np.full((n, 3), 5e-5)
+            ),
+            distances=Distances(ends[:, 0], ends[:, 1], length, np.full(24, 5e-5 * scale)),
+        ),
+    )
+
+
+def others_disturbed(network: Network, seed: int, share: float) -> tuple[Network, Excluded]:
+    """Normal errors in GNSS positions, attitudes and distances; blunders where `share` is not 0."""
+    random = np.random.default_rng(seed + 50_000)
+    wrong = nothing_excluded(network)
+    gnss, attitudes, distances = network.gnss, network.measured_attitudes, network.distances
+    known = np.flatnonzero((np.nan_to_num(network.points.sigma_m) > 0.0).any(axis=1))
+    if share:
+        for flags, rows in (
+            (wrong.control, known),
+            (wrong.gnss, np.arange(len(gnss.station))),
+            (wrong.attitude, np.arange(len(attitudes.attitude))),
+            (wrong.distance, np.arange(len(distances.point_a))),
+        ):
+            chosen = random.choice(rows, len(rows) // ONE_OF, replace=False)
+            flags[chosen, random.integers(0, flags.shape[1], len(chosen))] = True
+
+    def error(sigma: Array, flags: Flags) -> Array:
+        sign = random.choice((-1.0, 1.0), flags.shape)
+        return sigma * (random.normal(0.0, 1.0, flags.shape) + OTHER_SIGMAS * sign * flags)
+
+    turned = rotations_from_vectors(error(attitudes.sigma_rad, wrong.attitude))
+    shifted = np.nan_to_num(network.points.sigma_m) * OTHER_SIGMAS * wrong.control
+    return replace(
+        network,
+        points=replace(network.points, xyz_m=network.points.xyz_m + shifted),
+        gnss=replace(gnss, position_m=gnss.position_m + error(gnss.sigma_m, wrong.gnss)),
+        measured_attitudes=replace(attitudes, rotation=attitudes.rotation @ turned),
+        distances=replace(
+            distances,
+            distance_m=distances.distance_m
+            + error(distances.sigma_m[:, None], wrong.distance)[:, 0],
+        ),
+    ), wrong
+
+
+def of_kinds(clean: Adjustment, wrong: Excluded, found: Excluded) -> dict[str, dict[str, int]]:
+    """Blunders in other observations: planted, controllable, found, and innocent ones left out."""
+    rows, detectable, report = clean.equations, reliability_of(clean).detectable, {}
+    for name, groups in KINDS:
+        planted, out = getattr(wrong, name), getattr(found, name)
+        size = np.zeros(planted.shape)
+        own = np.isin(rows.group, groups)
+        with np.errstate(invalid="ignore"):
+            over = OTHER_SIGMAS * rows.sigma[own] / (ABOVE_DETECTABLE * detectable[own])
+        size[rows.source[own], rows.axis[own]] = over
+        wanted = planted & (size > 1.0)
+        report[name] = {
+            "planted": int(planted.sum()),
+            "controllable": int(wanted.sum()),
+            "found": int((out & wanted).sum()),
+            "uncontrollable_found": int((out & planted & ~wanted).sum()),
+            "innocent_left_out": int((out & ~planted).sum()),
+        }
+    return report
+
+
 def disturbed(block: Block, seed: int, share: float) -> tuple[Network, Array]:
     """Normal errors in all observations, and displacements of a share of the image points."""
     random = np.random.default_rng(seed)
@@ -236,9 +331,14 @@ def search(block: Block, settings: AdjustmentSettings, seeds: int) -> dict[str, 
     """Blunders of several runs: planted, above the limit, found; innocent points left out."""
     counts = dict.fromkeys(("planted", "controllable", "found", "uncontrollable_found"), 0)
     innocent, rounds, seconds, problems = 0, 0, 0.0, 0
+    kinds: dict[str, Counter[str]] = {name: Counter() for name, _ in KINDS}
     for seed in range(seeds):
         undisturbed, _ = disturbed(block, seed, 0.0)
         network, error = disturbed(block, seed, SHARE)
+        wrong_others = nothing_excluded(network)
+        if len(network.distances.point_a):
+            undisturbed, _ = others_disturbed(undisturbed, seed, 0.0)
+            network, wrong_others = others_disturbed(network, seed, SHARE)
         clean = adjust(undisturbed, replace(settings, robust=False))
         wrong = (error != 0.0).any(axis=1)
         wanted = controllable(clean, error)
@@ -252,6 +352,8 @@ def search(block: Block, settings: AdjustmentSettings, seeds: int) -> dict[str, 
         counts["found"] += int((out & wanted).sum())
         counts["uncontrollable_found"] += int((out & wrong & ~wanted).sum())
         innocent += int((result.rejected & ~wrong).sum())
+        for name, own in of_kinds(clean, wrong_others, result.excluded).items():
+            kinds[name].update(own)
         rounds = max(rounds, result.rounds)
         problems += len(result.problems)
     return counts | {
@@ -260,6 +362,7 @@ def search(block: Block, settings: AdjustmentSettings, seeds: int) -> dict[str, 
         "rounds_max": rounds,
         "cpu_s_per_run": round(seconds / seeds, 2),
         "problems": problems,
+        "others": {name: dict(own) for name, own in kinds.items()},
     }
 
 
@@ -291,6 +394,8 @@ def main() -> None:
     parser.add_argument(
         "--weight-function", choices=("none", "huber", "cauchy", "tukey", "danish"), default="none"
     )
+    parser.add_argument("--large", action="store_true", help="The block of 180,000 coordinates.")
+    parser.add_argument("--others", action="store_true", help="Blunders in other observations.")
     options = parser.parse_args()
     robust: WeightFunction = (
         "huber" if options.weight_function == "none" else options.weight_function
@@ -302,7 +407,15 @@ def main() -> None:
         weight_function=robust,
     )
     report: dict[str, Any] = {"machine": machine(), "options": vars(options)}
-    for block in (aerial_lines(), around_building(), calibration()):
+    blocks = (
+        [around_building(points=LARGE)]
+        if options.large
+        else [aerial_lines(), around_building(), calibration()]
+    )
+    for plain_block in blocks:
+        # Object coordinates of the calibration's network are in no unit of length.
+        is_other = options.others and plain_block.name != "calibration"
+        block = with_others(plain_block) if is_other else plain_block
         table = block.network.image_points
         report[block.name] = {
             "image_points": len(table.image),

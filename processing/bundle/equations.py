@@ -384,9 +384,12 @@ def _distance_rows(
     separation = state.points[distances.point_b] - state.points[distances.point_a]
     length = np.linalg.norm(separation, axis=1)
     direction = separation / length[:, None]
+    # A distance has no row where an object point that it ends at is left out.
+    there = np.asarray((layout.retained_points >= 0).any(axis=1) | layout.locked.all(axis=1))
+    usable = there[distances.point_a] & there[distances.point_b]
     build.add(
         distances.distance_m - length,
-        distances.sigma_m,
+        np.where(usable, distances.sigma_m, np.inf),
         np.full(n, 7),
         np.arange(n),
         [

@@ -15,6 +15,7 @@ from processing.bundle.unknowns import ParameterLayout, ParameterValues, layout_
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
+Indices = NDArray[np.int64]
 
 _MIN_POINT_INFORMATION: Final = 1e-10
 _MAX_BEHIND_FRACTION: Final = 0.05
@@ -53,11 +54,43 @@ def undetermined_points(
             rows, layout = _bare_equations(network, found, state, weight)
         except BehindCameraError:
             return found
-    values = np.linalg.eigvalsh(point_normals(rows, layout))
+    while True:
+        eliminated, tied = layout.eliminated_points, _tied_points(layout)
+        weak = eliminated[_is_weak(point_normals(rows, layout), layout.locked[eliminated])]
+        weak_tied = tied[_is_weak(_tied_normals(rows, layout, tied), layout.locked[tied])]
+        found[weak] = found[weak_tied] = True
+        if not len(weak_tied):
+            return found
+        # Distances to these points have no rows any more.
+        rows, layout = _bare_equations(network, found, state, weight)
+
+
+def _is_weak(normals: Array, locked: Flags) -> Flags:
+    values = np.linalg.eigvalsh(normals)
     weak = ~(values[:, 0] > _MIN_POINT_INFORMATION * np.maximum(values[:, 2], 1e-300))
-    free = ~layout.locked[layout.eliminated_points].all(axis=1)
-    found[layout.eliminated_points[weak & free]] = True
-    return found
+    return np.asarray(weak & ~locked.all(axis=1))
+
+
+def _tied_points(layout: ParameterLayout) -> Indices:
+    """Object points with columns of their own, which distances end at."""
+    return np.flatnonzero((layout.retained_points >= 0).any(axis=1))
+
+
+def _tied_normals(rows: Equations, layout: ParameterLayout, tied: Indices) -> Array:
+    """Normal matrices of tied points, the other ends of their distances held, (tied, 3, 3)."""
+    result = np.zeros((len(tied), 3, 3))
+    if not len(tied):
+        return result
+    at = layout.retained_points[tied]
+    own = rows.reduced[:, at.ravel().clip(0)].tocsc()
+    for i in range(3):
+        for j in range(i, 3):
+            products = own[:, i::3].multiply(own[:, j::3]).sum(axis=0)
+            result[:, i, j] = result[:, j, i] = np.asarray(products).ravel()
+    held = at < 0
+    result[held[:, :, None] | held[:, None, :]] = 0.0
+    result[:, range(3), range(3)] += np.where(held, 1.0, 0.0)
+    return result
 
 
 def _bare_equations(

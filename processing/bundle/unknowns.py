@@ -170,7 +170,8 @@ def layout_of(network: Network, left_out: NDArray[np.bool_]) -> ParameterLayout:
     drift = [take(network.gnss.drift == "linear", "GNSS drift", line, xyz) for line in lines]
     locked = network.points.sigma_m == 0.0
     retained_points = np.full((len(network.points.names), 3), -1, dtype=np.int64)
-    tied = np.union1d(network.distances.point_a, network.distances.point_b)
+    ends = np.stack([network.distances.point_a, network.distances.point_b], axis=1)
+    tied = np.unique(ends[~left_out[ends].any(axis=1)])
     for point in tied:
         for axis in range(3):
             if not locked[point, axis]:

@@ -64,7 +64,7 @@ def control_sentences(network: Network, defects: Sequence[RankDefect]) -> tuple[
         One sentence in place of those of the rotations and the scale about the control points.
     """
     seen = np.unique(network.image_points.point)
-    known = (np.nan_to_num(network.points.sigma_m, nan=-1.0) >= 0.0).all(axis=1)
+    known = np.asarray((np.nan_to_num(network.points.sigma_m, nan=-1.0) >= 0.0).all(axis=1))
     control = [network.points.names[k] for k in seen if known[k] and not _is_direction(network, k)]
     about = {1: 4, 2: 1}.get(len(control))
     sentences = tuple(defect.sentence for defect in defects)
@@ -89,13 +89,15 @@ def _is_direction(network: Network, point: int) -> bool:
 def _control_of_another_unit(network: Network) -> list[str]:
     """Distances between control points against those of their intersections from the exposures."""
     points = network.points
-    given = np.isfinite(points.xyz_m).all(axis=1) & ~points.at_infinity
-    control = given & (np.nan_to_num(points.sigma_m, nan=-1.0) >= 0.0).all(axis=1)
+    given = np.asarray(np.isfinite(points.xyz_m).all(axis=1) & ~points.at_infinity)
+    weighted = np.asarray((np.nan_to_num(points.sigma_m, nan=-1.0) >= 0.0).all(axis=1))
+    control = given & weighted
     table, images = network.image_points, network.images
     rays = np.bincount(table.point, minlength=len(points.names))
     own = np.flatnonzero(control & (rays >= 2))[:_MAX_PAIRS_OF]
-    oriented = np.isfinite(network.stations.position_m[images.station]).all(axis=1)
-    oriented &= np.isfinite(network.attitudes.rotation[images.attitude]).all(axis=(1, 2))
+    rotation = network.attitudes.rotation[images.attitude].reshape(-1, 9)
+    placed = np.column_stack([network.stations.position_m[images.station], rotation])
+    oriented = np.asarray(np.isfinite(placed).all(axis=1))
     if len(own) < _MIN_CONTROL or not oriented[table.image].all():
         return []
     unknown = np.where(control[:, None], np.nan, points.xyz_m)

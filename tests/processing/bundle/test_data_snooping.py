@@ -13,7 +13,7 @@ from daemon.postflight.importers.dbat import import_dbat
 from processing.bundle.adjust import Adjustment, AdjustmentSettings, adjust
 from processing.bundle.data_snooping import names_of
 from processing.bundle.initial_values import completed
-from processing.bundle.network import Distances, Network
+from processing.bundle.network import Distances, ImagePoints, Network
 from tests.processing.bundle.simulated_networks import aerial, with_everything
 
 CAMCAL = Path(__file__).parent / "data" / "dbat-camcal" / "camcaldemo.xml"
@@ -138,3 +138,36 @@ def test_a_gnss_position_an_attitude_and_a_distance_are_named(noisy) -> None:
     measured = replace(noisy.measured_attitudes, rotation=rotation)
     found = adjust(replace(noisy, measured_attitudes=measured), settings).excluded
     assert names_of(noisy, found) == ("attitude of e6 about z",)
+
+
+@pytest.mark.parametrize("robust", [False, True])
+def test_ends_of_distances_without_rays_left_do_not_stop_the_block(robust) -> None:
+    block = aerial(seed=4, sigma_mm=1e-3, points=80, control=10)
+    network, table = block.network, block.network.image_points
+    rays = np.bincount(table.point, minlength=80)
+    seen_twice = int(np.flatnonzero((rays == 2) & (np.arange(80) >= 10))[0])
+    once = int(np.flatnonzero((rays >= 3) & (np.arange(80) >= 10))[0])
+    others = np.flatnonzero((rays >= 4) & (np.arange(80) >= 10))[-2:]
+    ends = np.array([[seen_twice, others[0]], [once, others[1]], [others[0], others[1]]])
+    length = np.linalg.norm(block.points[ends[:, 0]] - block.points[ends[:, 1]], axis=1)
+    xy = table.xy_mm.copy()
+    # A parallax across the base: no place fits both rays, and it cannot be decided which is wrong.
+    xy[np.flatnonzero(table.point == seen_twice)[0], 1] += 1.0
+    taken = (table.point != once) | (np.cumsum(table.point == once) == 1)
+    network = replace(
+        network,
+        image_points=ImagePoints(
+            table.image[taken], table.point[taken], xy[taken], table.sigma_mm[taken]
+        ),
+        distances=Distances(ends[:, 0], ends[:, 1], length, np.full(3, 0.02)),
+    )
+    # One ray and one distance intersect: with the distance left out the point has no place.
+    unused = replace(network.distances, sigma_m=np.array([0.02, np.inf, 0.02]))
+    alone = replace(network, distances=unused)
+    result = adjust(alone, AdjustmentSettings(reject_beyond=4.5, robust=robust))
+    assert result.sigma0 == pytest.approx(1.0, abs=0.3)
+    assert set(np.flatnonzero(result.left_out)) >= {seen_twice, once}
+    assert not result.left_out[others].any()
+    kept = next(g for g in result.groups if g.name == "distance")
+    assert kept.count == 1
+    assert adjust(network, AdjustmentSettings(reject_beyond=4.5, robust=robust)).redundancy > 0
