@@ -6,7 +6,7 @@ import asyncio
 from pathlib import Path as FilePath
 from typing import Annotated, Any, Literal
 
-from fastapi import FastAPI, HTTPException, Path, Response
+from fastapi import FastAPI, HTTPException, Path, Query, Response
 from fastapi.params import Depends
 
 from daemon.mission.layout import exposure_name
@@ -17,6 +17,9 @@ TILES_AT_ONCE = 2
 
 Number = Annotated[int, Path(ge=1, lt=10**9, description="of the exposure")]
 Layer = Annotated[str, Path(pattern=r"^[A-Za-z0-9_-]{1,40}$", description="from /images/NUMBER")]
+Source = Annotated[
+    str | None, Query(pattern=r"^[A-Za-z0-9_-]{1,40}$", description="layer; default: the first")
+]
 Index = Annotated[int, Path(ge=0, lt=1000)]
 Reduction = Literal["1", "2", "4", "8", "16"]
 
@@ -49,13 +52,21 @@ def add_images(app: FastAPI, state: FlightState, watcher: Depends) -> None:
         responses={200: {"content": {"image/jpeg": {}, "image/png": {}}}},
     )
     async def tile(
-        number: Number, layer: Layer, reduction: Reduction, x: Index, y: Index
+        number: Number,
+        layer: Layer,
+        reduction: Reduction,
+        x: Index,
+        y: Index,
+        of: Source = None,
     ) -> Response:
-        """A tile of 256 pixels; `reduction` pixels along a side become one."""
+        """A tile of 256 pixels; `reduction` pixels along a side become one.
+
+        A derived layer (saturation, sharpness) is that of the layer `of`.
+        """
         folder = folder_of(number)
         async with reading:
             try:
-                found = await asyncio.to_thread(tiles.tile, folder, layer, int(reduction), x, y)
+                found = await asyncio.to_thread(tiles.tile, folder, layer, int(reduction), x, y, of)
             except ImageTileError as error:
                 raise HTTPException(404, f"exposure {number}: {error}") from error
         if found is None:

@@ -6,6 +6,7 @@ below a few megabytes whatever the size of the image. Nothing is read without a 
 
 from __future__ import annotations
 
+import math
 import os
 import re
 from collections import OrderedDict
@@ -95,7 +96,9 @@ class ImageTiles:
             "sharpness": {"low": SHARP_LIMITS[0], "high": SHARP_LIMITS[1]},
         }
 
-    def tile(self, folder: Path, layer: str, reduction: int, x: int, y: int) -> Tile | None:
+    def tile(
+        self, folder: Path, layer: str, reduction: int, x: int, y: int, of: str | None = None
+    ) -> Tile | None:
         """A tile in the pixel grid of the first layer, counted from its upper left corner.
 
         Args:
@@ -104,6 +107,7 @@ class ImageTiles:
             reduction: side of the square of pixels that becomes one.
             x: column of the tile.
             y: row of the tile.
+            of: the layer that a derived one is computed from (default: the first one).
 
         Returns:
             The tile; None beyond the image.
@@ -112,9 +116,9 @@ class ImageTiles:
             ImageTileError: no such layer, or a damaged file.
         """
         names = _names(folder)
-        wanted = names[0] if layer in DERIVED and names else layer
+        wanted = (of or names[0]) if layer in DERIVED and names else layer
         if wanted not in names or reduction not in REDUCTIONS:
-            raise ImageTileError(f"there is no layer {layer!r}; there are {', '.join(names)}")
+            raise ImageTileError(f"there is no layer {wanted!r}; there are {', '.join(names)}")
         base = self._raster(folder / f"{names[0]}.tif")
         side_px = TILE_PX * reduction
         x0, y0 = x * side_px, y * side_px
@@ -127,9 +131,9 @@ class ImageTiles:
             raise ImageTileError(f"{raster.path.name}: {error.strerror}") from error
         try:
             if layer == "saturation":
-                return _saturation(descriptor, raster, reduction, x0, y0)
+                return _saturation(descriptor, raster, base, reduction, x0, y0)
             if layer == "sharpness":
-                return _sharpness(descriptor, raster, reduction, x0, y0)
+                return _sharpness(descriptor, raster, base, reduction, x0, y0)
             if (raster.height, raster.width) != (base.height, base.width):
                 return _scaled(descriptor, raster, base, reduction, x0, y0)
             return _plain(descriptor, raster, reduction, x0, y0)
@@ -233,11 +237,21 @@ def _rows(
 
 
 def _blocks(
-    descriptor: int, raster: RasterLayout, plane: int, reduction: int, x0: int, y0: int
+    descriptor: int,
+    raster: RasterLayout,
+    plane: int,
+    reduction: int,
+    x0: int,
+    y0: int,
+    *,
+    side: int = TILE_PX,
 ) -> Iterator[tuple[int, Words]]:
-    """Row of the tile and pixels (rows, r, columns, r) of a few rows of it; whole squares only."""
-    columns = min(TILE_PX, -(-(raster.width - x0) // reduction))
-    rows = min(TILE_PX, -(-(raster.height - y0) // reduction))
+    """Row of the tile and pixels (rows, r, columns, r) of a few rows of it; whole squares only.
+
+    The tile has `side` squares a side, fewer at the end of the image.
+    """
+    columns = min(side, -(-(raster.width - x0) // reduction))
+    rows = min(side, -(-(raster.height - y0) // reduction))
     width = min(columns * reduction, raster.width - x0)
     for first in range(0, rows, OUTPUT_ROWS):
         count = min(OUTPUT_ROWS, rows - first)
@@ -250,11 +264,18 @@ def _blocks(
 
 
 def _mean(
-    descriptor: int, raster: RasterLayout, plane: int, reduction: int, x0: int, y0: int
+    descriptor: int,
+    raster: RasterLayout,
+    plane: int,
+    reduction: int,
+    x0: int,
+    y0: int,
+    *,
+    side: int = TILE_PX,
 ) -> Any:
-    """Mean of the known pixels of each square, 0 where none is known, shape (256, 256)."""
-    tile = np.zeros((TILE_PX, TILE_PX), np.float32)
-    for first, block in _blocks(descriptor, raster, plane, reduction, x0, y0):
+    """Mean of the known pixels of each square, 0 where none is known, shape (side, side)."""
+    tile = np.zeros((side, side), np.float32)
+    for first, block in _blocks(descriptor, raster, plane, reduction, x0, y0, side=side):
         known = (block > 0).sum(axis=(1, 3))
         total = block.sum(axis=(1, 3), dtype=np.float32)
         tile[first : first + len(block), : block.shape[2]] = total / np.maximum(known, 1)
@@ -273,23 +294,54 @@ def _plain(descriptor: int, raster: RasterLayout, reduction: int, x0: int, y0: i
     return _encoded(values, raster)
 
 
+@dataclass(frozen=True)
+class _Window:
+    """Squares of a layer that a tile of the grid of the first layer covers.
+
+    `matrix` maps pixels of the tile to squares; there are `side` squares a side from (left, top).
+    """
+
+    reduction: int
+    left: int
+    top: int
+    side: int
+    matrix: NDArray[np.float64]
+
+
+def _window(
+    raster: RasterLayout, base: RasterLayout, reduction: int, x0: int, y0: int, square: int = 0
+) -> _Window:
+    """The window of a tile; `square` is the side of the squares in pixels, 0 for those that fit."""
+    scale = base.width / raster.width
+    ratio = reduction / scale
+    fitting = next((one for one in REDUCTIONS if one >= ratio), REDUCTIONS[-1])
+    size = square or fitting
+    left = max(0, int(x0 / scale / size) - 1) * size
+    top = max(0, int(y0 / scale / size) - 1) * size
+    step = ratio / size
+    begin = np.array([x0, y0]) / scale / size - np.array([left, top]) / size + step / 2 - 0.5
+    matrix = np.array([[step, 0.0, begin[0]], [0.0, step, begin[1]]])
+    return _Window(size, left, top, math.ceil(TILE_PX * step) + 4, matrix)
+
+
+def _warped(values: NDArray[Any], window: _Window, flags: int) -> Any:
+    import cv2
+
+    size = (TILE_PX, TILE_PX)
+    return cv2.warpAffine(values, window.matrix, size, flags=flags | cv2.WARP_INVERSE_MAP)
+
+
 def _scaled(
     descriptor: int, raster: RasterLayout, base: RasterLayout, reduction: int, x0: int, y0: int
 ) -> Tile:
     """A layer of another resolution, brought to the grid of the first one."""
     import cv2
 
-    scale = base.width / raster.width
-    coarse = max(one for one in REDUCTIONS if one <= max(1.0, reduction / scale))
-    left = max(0, int(x0 / scale / coarse) - 1) * coarse
-    top = max(0, int(y0 / scale / coarse) - 1) * coarse
+    window = _window(raster, base, reduction, x0, y0)
+    at = (window.reduction, window.left, window.top)
     planes = range(3) if raster.planes >= 3 else range(1)
-    window = np.dstack([_mean(descriptor, raster, p, coarse, left, top) for p in planes])
-    step = reduction / scale / coarse
-    begin = np.array([x0, y0]) / scale / coarse - np.array([left, top]) / coarse + step / 2 - 0.5
-    matrix = np.array([[step, 0.0, begin[0]], [0.0, step, begin[1]]])
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    values = cv2.warpAffine(window, matrix, (TILE_PX, TILE_PX), flags=flags)
+    squares = np.dstack([_mean(descriptor, raster, p, *at, side=window.side) for p in planes])
+    values = _warped(squares, window, cv2.INTER_LINEAR)
     return _encoded(values if values.ndim == 3 else values[..., None], raster)
 
 
@@ -298,45 +350,49 @@ def _encoded(values: NDArray[np.float32], raster: RasterLayout) -> Tile:
     return encode(_shown(values, raster), alpha)
 
 
-def _saturation(descriptor: int, raster: RasterLayout, reduction: int, x0: int, y0: int) -> Tile:
-    """Red where a pixel of the square is near the full scale of the converter."""
-    alpha = np.zeros((TILE_PX, TILE_PX), np.uint8)
-    for first, block in _blocks(descriptor, raster, 0, reduction, x0, y0):
-        full = block.max(axis=(1, 3)) >= NEAR_FULL * FULL_SCALE
-        alpha[first : first + len(block), : block.shape[2]] = full * 254
+def _saturation(
+    descriptor: int, raster: RasterLayout, base: RasterLayout, reduction: int, x0: int, y0: int
+) -> Tile:
+    """Red where a pixel of the square is near the full scale of the converter, in any plane."""
+    import cv2
+
+    window = _window(raster, base, reduction, x0, y0)
+    at = (window.reduction, window.left, window.top)
+    is_full = np.zeros((window.side, window.side), np.uint8)
+    for plane in range(raster.planes):
+        for first, block in _blocks(descriptor, raster, plane, *at, side=window.side):
+            full = block.max(axis=(1, 3)) >= NEAR_FULL * FULL_SCALE
+            is_full[first : first + len(block), : block.shape[2]] |= full
+    alpha = _warped(is_full * np.uint8(254), window, cv2.INTER_NEAREST)
     red = np.zeros((TILE_PX, TILE_PX, 3), np.uint8)
     red[..., 0] = 255
     return encode(red, alpha, lossless=True)
 
 
-def _sharpness(descriptor: int, raster: RasterLayout, reduction: int, x0: int, y0: int) -> Tile:
+def _sharpness(
+    descriptor: int, raster: RasterLayout, base: RasterLayout, reduction: int, x0: int, y0: int
+) -> Tile:
     """Ratio of differences one and two pixels apart, by blocks of 32 pixels; blank without texture.
 
     White noise and the sharpest edges give 0.7 to 1, a blur over two pixels and more gives 0.5.
     """
-    side_px = TILE_PX * reduction
-    width, height = min(side_px, raster.width - x0), min(side_px, raster.height - y0)
-    columns, rows = width // SHARP_BLOCK_PX, height // SHARP_BLOCK_PX
-    red_green = np.zeros((max(rows, 1), max(columns, 1), 3), np.uint8)
-    alpha = np.zeros(red_green.shape[:2], np.uint8)
-    for row in range(rows):
-        begin = y0 + row * SHARP_BLOCK_PX
-        pixels = _rows(descriptor, raster, 0, begin, SHARP_BLOCK_PX, x0, columns * SHARP_BLOCK_PX)
+    import cv2
+
+    window = _window(raster, base, reduction, x0, y0, SHARP_BLOCK_PX)
+    columns = min(window.side, (raster.width - window.left) // SHARP_BLOCK_PX)
+    rows = min(window.side, (raster.height - window.top) // SHARP_BLOCK_PX)
+    over = np.zeros((window.side, window.side, 4), np.uint8)
+    for row in range(max(rows, 0) if columns > 0 else 0):
+        begin = window.top + row * SHARP_BLOCK_PX
+        width = columns * SHARP_BLOCK_PX
+        pixels = _rows(descriptor, raster, 0, begin, SHARP_BLOCK_PX, window.left, width)
         ratio = sharpness_of(pixels)
         share = (ratio - SHARP_LIMITS[0]) / (SHARP_LIMITS[1] - SHARP_LIMITS[0])
         share = np.clip(np.nan_to_num(share), 0.0, 1.0)
-        red_green[row, :, 0] = 255 * np.minimum(1.0, 2 - 2 * share)
-        red_green[row, :, 1] = 200 * np.minimum(1.0, 2 * share)
-        alpha[row] = np.where(np.isfinite(ratio), 110, 0)
-    size = SHARP_BLOCK_PX
-    over = np.zeros((side_px // size, side_px // size, 4), np.uint8)
-    over[: len(alpha), : alpha.shape[1], :3], over[: len(alpha), : alpha.shape[1], 3] = (
-        red_green,
-        alpha,
-    )
-    import cv2
-
-    full = cv2.resize(over, (TILE_PX, TILE_PX), interpolation=cv2.INTER_NEAREST)
+        over[row, :columns, 0] = 255 * np.minimum(1.0, 2 - 2 * share)
+        over[row, :columns, 1] = 200 * np.minimum(1.0, 2 * share)
+        over[row, :columns, 3] = np.where(np.isfinite(ratio), 110, 0)
+    full = _warped(over, window, cv2.INTER_NEAREST)
     return encode(full[..., :3], full[..., 3], lossless=True)
 
 

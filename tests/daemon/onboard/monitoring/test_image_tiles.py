@@ -161,3 +161,42 @@ def test_memory_is_that_of_a_tile_and_not_of_the_image(tmp_path: Path) -> None:
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 25_000_000
+
+
+@pytest.mark.parametrize("reduction", [4, 8, 16])
+def test_colour_fills_the_tile_at_each_reduction(tmp_path: Path, reduction: int) -> None:
+    side = 256 * reduction
+    write(tmp_path / "pan.tif", np.full((side, side), 9000, np.uint16))
+    grey = np.full((side // 3 + 1, side // 3 + 1), 9000, np.uint16)
+    write(tmp_path / "rgbn.tif", grey, grey, grey, grey)
+    colour = picture(ImageTiles(), tmp_path, "rgbn", reduction, 0, 0)
+    assert colour.shape[:2] == (256, 256)
+    # Where there is no data the tile is transparent; without transparency it is complete.
+    assert colour.shape[2] == 3 or colour[:254, :254, 3].min() == 255
+
+
+def test_saturation_and_sharpness_are_those_of_the_layer_that_is_shown(tmp_path: Path) -> None:
+    random, tiles = np.random.default_rng(3), ImageTiles()
+    first = random.integers(2000, 20000, (512, 512), dtype=np.uint16)
+    second = cv2.GaussianBlur(first, (0, 0), 4.0)
+    first[64:128, 64:128] = FULL_SCALE
+    second[320:384, 64:128] = FULL_SCALE
+    third = cv2.resize(second, (128, 128), interpolation=cv2.INTER_NEAREST)
+    for name, plane in (("aft", first), ("fore", second), ("thermal", third)):
+        write(tmp_path / f"{name}.tif", plane)
+
+    def overlay(layer: str, of: str | None) -> np.ndarray:
+        found = tiles.tile(tmp_path, layer, 2, 0, 0, of)
+        assert found is not None
+        return cv2.imdecode(np.frombuffer(found.data, np.uint8), cv2.IMREAD_UNCHANGED)
+
+    for of, row in ((None, 48), ("aft", 48), ("fore", 176), ("thermal", 176)):
+        alpha = overlay("saturation", of)[..., 3]
+        assert alpha[row, 48] == 254, of
+        assert alpha[224 - row, 48] == 0, of
+    # Blue, green, red: the first one is sharp and green, the second one is blurred and red.
+    sharp, blurred = overlay("sharpness", "aft")[8, 200], overlay("sharpness", "fore")[8, 200]
+    assert sharp[1] > sharp[2]
+    assert blurred[2] > blurred[1]
+    with pytest.raises(ImageTileError, match="no layer 'side'"):
+        tiles.tile(tmp_path, "sharpness", 2, 0, 0, "side")
