@@ -135,6 +135,13 @@ def monitor(
     serve: Annotated[
         str, typer.Option(help="HOST:PORT or PORT of a page that shows several aircraft.")
     ] = "",
+    serve_without_token: Annotated[
+        bool,
+        typer.Option(
+            "--serve-without-token",
+            help="Permission to serve other machines what requires --token, without token and TLS.",
+        ),
+    ] = False,
 ) -> None:
     from daemon.onboard.monitoring.client.telemetry_client import (
         AccessOptions,
@@ -149,7 +156,8 @@ def monitor(
         from daemon.cli.monitor_fleet import serve_fleet
 
         named = given or _announced_services(token)
-        serve_fleet(serve, [parse_service_address(one, tls=tls) for one in named], access)
+        members = [parse_service_address(one, tls=tls) for one in named]
+        serve_fleet(serve, members, access, is_open=serve_without_token)
         return
     if len(given) > 1:
         raise MonitorError("one service is monitored in a terminal; for several add --serve 8480")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ipaddress
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -16,16 +17,24 @@ class FleetError(DaemonError):
     """The page of several aircraft cannot be served; the message contains the reason."""
 
 
-def serve_fleet(listen_at: str, services: Sequence[ServiceAddress], access: AccessOptions) -> None:
+def serve_fleet(
+    listen_at: str,
+    services: Sequence[ServiceAddress],
+    access: AccessOptions,
+    *,
+    is_open: bool = False,
+) -> None:
     """Serve the page until it is interrupted.
 
     Args:
         listen_at: HOST:PORT of the page; PORT alone listens on this machine only.
         services: the services of the aircraft.
         access: token and authority for all of them.
+        is_open: the page may show beyond this machine what the services show to a token only.
 
     Raises:
-        FleetError: the address of the page is none, or too many services are given.
+        FleetError: the address of the page is none, too many services are given, or the page would
+            be open to other machines although a token is needed to read.
     """
     import uvicorn
 
@@ -35,6 +44,12 @@ def serve_fleet(listen_at: str, services: Sequence[ServiceAddress], access: Acce
     from daemon.onboard.monitoring.web.request_filter import RequestFilter
 
     host, port = _parse(listen_at)
+    if access.token and not _is_loopback(host) and not is_open:
+        raise FleetError(
+            f"the page at {listen_at} has neither TLS nor tokens; each machine that reaches it "
+            "would read what the services show to holders of a token. Serve on 127.0.0.1, behind a "
+            "reverse proxy with TLS, or accept that with --serve-without-token"
+        )
     if len(services) > MEMBERS_MAX:
         raise FleetError(f"{len(services)} services are given; {MEMBERS_MAX} are possible")
     for service in services:
@@ -55,3 +70,10 @@ def _parse(listen_at: str) -> tuple[str, int]:
     if not port.isdecimal() or not 0 < int(port) < 65536:
         raise FleetError(f"{listen_at} is no address; write HOST:PORT or PORT, for example 8480")
     return host.strip("[]") or "127.0.0.1", int(port)
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"

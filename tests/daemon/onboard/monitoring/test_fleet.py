@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+import socket
+import threading
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
+import uvicorn
 from fastapi.testclient import TestClient
 
 from daemon.cli.monitor_fleet import FleetError, serve_fleet
-from daemon.onboard.monitoring.client.telemetry_client import AccessOptions, parse_service_address
+from daemon.onboard.monitoring.client.telemetry_client import (
+    AccessOptions,
+    ClientError,
+    parse_service_address,
+)
 from daemon.onboard.monitoring.fleet import OLD_S, FleetMember, create_fleet_app, fleet_json
 from daemon.onboard.monitoring.flight_state import FlightState
 from tests.daemon.onboard.monitoring import flight_events
+from tests.support.browser import Browser, chromium
 
 
 def member(
@@ -75,3 +85,49 @@ def test_the_page_and_its_state_are_served_with_the_policy_of_the_page() -> None
 def test_an_address_of_the_page_that_is_none_is_refused() -> None:
     with pytest.raises(FleetError, match="write HOST:PORT"):
         serve_fleet("here", [parse_service_address("a:1")], AccessOptions())
+
+
+@pytest.mark.trust
+@pytest.mark.parametrize("listen_at", ["0.0.0.0:8480", "[::]:8480", "10.0.0.5:8480", "tower:8480"])
+def test_what_needs_a_token_is_not_served_to_other_machines_without_one(
+    listen_at: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    served: list[str] = []
+    monkeypatch.setattr("uvicorn.run", lambda *_, host, **__: served.append(host))
+    monkeypatch.setattr(FleetMember, "start", lambda _member: None)
+    service = parse_service_address("127.0.0.1:1")
+    access = AccessOptions("syn_" + "a" * 43)
+    with pytest.raises(FleetError, match="--serve-without-token"):
+        serve_fleet(listen_at, [service], access)
+    assert served == []
+    for at, given, is_open in (
+        (listen_at, AccessOptions(), False),
+        (listen_at, access, True),
+        ("127.0.0.1:8480", access, False),
+        ("8480", access, False),
+    ):
+        serve_fleet(at, [service], given, is_open=is_open)
+    assert len(served) == 4
+
+
+def test_the_reason_of_a_lost_connection_is_shown(tmp_path: Path) -> None:
+    chromium()
+    broken = FleetMember(parse_service_address("127.0.0.1:1"), AccessOptions(), _refused)
+    broken.start()
+    config = uvicorn.Config(create_fleet_app([broken]), port=0, log_level="error", lifespan="off")
+    server = uvicorn.Server(config)
+    with socket.socket() as listening:
+        listening.bind(("127.0.0.1", 0))
+        thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]}, daemon=True)
+        thread.start()
+        with Browser(tmp_path / "profile") as browser:
+            browser.open(f"http://127.0.0.1:{listening.getsockname()[1]}/")
+            browser.wait_for(
+                "document.querySelector('#aircraft .problem')?.innerText === 'token rejected'", 30
+            )
+        server.should_exit = True
+        thread.join(30)
+
+
+def _refused(*_: Any) -> Iterator[dict[str, Any] | None]:
+    raise ClientError("token rejected")

@@ -27,7 +27,8 @@ function row(aircraft, alarms) {
     element("span", { textContent: `${aircraft.simulated ? `${t("page.simulated")} · ` : ""}${phase}` }),
     element("span", { textContent: `● ${number(good)} ▲ ${number(usable)} ■ ${number(refly)} ✖ ${number(aircraft.lost ?? 0)}` }),
     element("span", { textContent: aircraft.exposures_left == null ? "–" : t("fleet.exposures", { n: number(aircraft.exposures_left) }) }),
-    element("span", { className: "age", textContent: aircraft.is_linked ? t("fleet.age", { s: number(aircraft.age_s) }) : `✖ ${t("fleet.no_link")}` }));
+    element("span", { className: "age", textContent: aircraft.is_linked ? t("fleet.age", { s: number(aircraft.age_s) }) : `✖ ${t("fleet.no_link")}` }),
+    aircraft.problem ? element("span", { className: "problem", lang: "en", textContent: aircraft.problem }) : null);
 }
 
 function alarm(one) {
