@@ -123,8 +123,8 @@ class FaultLatches:
                 self.clear_fault(fault)
         elif kind in ("disk-joined", "disk-released"):
             self.clear_fault(f"disk {event.get('disk')}")
-        elif kind == "deviation" and not event.get("fault"):
-            self.clear_fault("deviation")
+        elif kind in ("deviation", "decisions") and not event.get("fault", kind == "decisions"):
+            self.clear_fault(str(kind))
         elif kind in _FAULT_OF_EVENT:
             fault, device = _FAULT_OF_EVENT[kind]
             self.raise_fault(fault, sentence, device, sequence=sequence)
@@ -164,10 +164,13 @@ class FaultLatches:
                     self.clear_fault(fault)
 
     def _clear_mirror(self, event: Mapping[str, Any]) -> None:
-        """Clear the fault of the mirror once both disks are in use."""
+        """Clear the faults of the mirror once both disks are in use, and of a disk that is."""
         disks = event.get("disks")
         if not isinstance(disks, list) or len(disks) < 2:
             return
+        for one in disks:
+            if isinstance(one, Mapping) and one.get("state") == "in use":
+                self.clear_fault_if_active(f"prerequisite disk {one.get('disk')}")
         if all(isinstance(one, Mapping) and one.get("state") == "in use" for one in disks):
             self.clear_fault_if_active("mirror")
 

@@ -59,6 +59,7 @@ class OperatorJournal:
         self._emit = emit
         self._last_number = last_number
         self._computed: dict[int, str] = {}
+        self._was_refused = False
         self.problem = ""
         """Why no decision is accepted; empty if they are."""
         try:
@@ -167,8 +168,12 @@ class OperatorJournal:
         try:
             self._save(decisions_content([*self._decisions, decision]))
         except OSError as error:
+            self._was_refused = True
             return f"the disk refused {DECISIONS_FILE} ({error.strerror}); repeat the command"
         self._decisions.append(decision)
+        if self._was_refused:
+            self._was_refused = False
+            self._emit("decisions", fault=False, sentence="Decisions are recorded again.")
         return None
 
     def _resume(self, one: OperatorDecision) -> None:

@@ -15,6 +15,7 @@ from daemon.mission.operator_decisions import (
     manual_verdicts,
     read_decisions,
 )
+from daemon.onboard.flight.fault_latches import FaultLatches
 from daemon.onboard.service.operator_journal import OperatorJournal
 from daemon.planning.model import Plan, PlannedLine
 from daemon.planning.retakes import RetakeError, retake_line
@@ -135,3 +136,18 @@ def test_the_file_is_canonical_and_omits_what_is_empty() -> None:
         b'{"decisions":[{"by":"anna","kind":"reject","number":7,"role":"operator",'
         b'"utc":"2026-05-01T10:00:00Z"}],"format":1}\n'
     )
+
+
+def test_a_disk_that_takes_decisions_again_clears_their_fault(tmp_path: Path) -> None:
+    bench, latches = Bench(tmp_path), FaultLatches()
+    bench.is_full = True
+    bench.retake(100.0)
+    bench.is_full = False
+    bench.retake(300.0)
+    bench.retake(500.0)
+    reports = [event for event in bench.events if event["event"] == "decisions"]
+    assert [event["fault"] for event in reports] == [True, False]
+    latches.apply(reports[0])
+    assert latches.listed()[0]["stands"]
+    latches.apply(reports[1])
+    assert not latches.listed()[0]["stands"]

@@ -196,3 +196,28 @@ def test_a_low_disk_is_cleared_only_when_it_is_no_longer_low(
     latches.apply({"event": "status", "exposures_left": 40} | status)
     (fault,) = latches.listed()
     assert fault["stands"] is stands
+
+
+def test_faults_whose_cause_is_gone_are_cleared_and_say_since_when() -> None:
+    disks = [{"disk": "root", "state": "in use"}, {"disk": "mirror", "state": "rejoining"}]
+    latches = latches_of(
+        {"event": "decisions", "fault": True, "sentence": "the disk refused"},
+        {"event": "prerequisite", "item": "disk mirror", "fault": True, "sentence": "not writable"},
+        {"event": "prerequisite", "item": "calibration rig", "fault": True, "sentence": "old"},
+        {"event": "status", "mono_ns": "5", "disks": disks},
+    )
+    assert all(one["stands"] for one in latches.listed())
+    disks[1]["state"] = "in use"
+    latches.apply({"event": "status", "mono_ns": "6", "disks": disks})
+    latches.apply({"event": "decisions", "mono_ns": "7", "fault": False, "sentence": "again"})
+    cleared = {one["id"]: one["cleared_mono_ns"] for one in latches.listed() if not one["stands"]}
+    assert cleared == {"prerequisite disk mirror": "6", "decisions": "7"}
+    # What was configured at the start holds until the next one.
+    assert "prerequisite calibration rig" in latches
+
+
+@pytest.mark.parametrize("event", ["ledger", "power", "fault"])
+def test_a_fault_that_ended_the_service_no_longer_stands_after_its_restart(event: str) -> None:
+    before = latches_of({"event": event, "fault": True, "sentence": "the service ends"})
+    (fault,) = latches_of(*previous_faults(before.unhandled())).listed()
+    assert (fault["stands"], fault["previous"]) == (False, True)
