@@ -19,7 +19,7 @@
   }
 
   function outside() {
-    const primary = seen("#phase-button, #phase-second, #open-commands, .lamp, #alarm-bar button, #tabs button, #verdict, #left div, #open-settings");
+    const primary = seen("#phase-button, #phase-second, #open-commands, .lamp, #alarm-bar button, #tabs button, #verdict, #left div, #open-settings, .g-cell, .g-bar, #guidance .age, #map-tools > *, #map-legend, .leaflet-control");
     return primary.filter((one) => {
       const { left, top, right, bottom } = box(one);
       return left < -0.5 || top < -0.5 || right > innerWidth + 0.5 || bottom > innerHeight + 0.5;
@@ -29,7 +29,8 @@
   function overlapping() {
     const regions = seen("header, #alarm-bar, #connection-lost, #map-panel, #verdict-panel, .page, #tabs, #action-bar")
       .filter((one) => !(one.id === "verdict-panel" && document.querySelector("#pages").contains(one)));
-    const controls = seen("button, input, select, summary, .files a").filter((one) => !one.closest(".leaflet-container") && shown(one));
+    const controls = seen("button, input, select, summary, .files a, .leaflet-bar a, .leaflet-control-scale-line, #map-attribution, #map-measured, .g-cell")
+      .filter((one) => shown(one));
     const found = [];
     for (const [many, area] of [[regions, box], [controls, shown]]) {
       many.forEach((one, k) => many.slice(k + 1).forEach((other) => {
@@ -45,8 +46,16 @@
   const smallTargets = () => seen("button, select, input, summary, .files a, #map-tools *, .leaflet-bar a").filter((one) => one.matches("button, select, input, summary, a"))
     .filter((one) => box(one).width < 47.5 || box(one).height < 47.5).map((one) => `${name(one)} ${box(one).width}x${box(one).height}`);
 
-  const clipped = () => seen("#phase-button, #phase-second, #alarm-bar button:not(.what), .verdict .word, #tabs .label, .lamp .name")
+  const clipped = () => seen("#phase-button, #phase-second, #alarm-bar button:not(.what), .verdict .word, #tabs .label, .lamp .name, .g-label, .g-value, .g-cell, .thumb .t-mark")
     .filter((one) => one.scrollWidth > one.clientWidth + 1).map((one) => `${name(one)}: ${one.textContent}`);
+
+  // What a scrolling or clipping ancestor hides, of what has to be whole.
+  const cut = () => seen(".g-cell, .g-value, .g-bar, #guidance .age, #map-tools > *, #map-legend, #verdict *, .leaflet-control, .thumb .t-mark").filter((one) => {
+    const [whole, part] = [box(one), shown(one)];
+    const isCut = !part || part.bottom - part.top < whole.height - 1 || part.right - part.left < whole.width - 1;
+    // The strip scrolls; what it shows of a thumbnail's height is whole.
+    return isCut && !(one.matches("#strip *") && (!part || part.bottom - part.top >= whole.height - 1));
+  }).map((one) => `${name(one)}: ${one.textContent.trim().slice(0, 30)}`);
 
   const channel = (value) => value / 255 <= 0.04045 ? value / 255 / 12.92 : ((value / 255 + 0.055) / 1.055) ** 2.4;
   const rgb = (text) => text.match(/[\d.]+/g).map(Number);
@@ -62,12 +71,12 @@
     const [a, b] = [luminance(rgb(getComputedStyle(one).color)), luminance(ground(one))].sort((x, y) => y - x);
     return (a + 0.05) / (b + 0.05);
   }
-  const contrasts = () => Object.fromEntries(seen(".verdict .word, .verdict .which, #alarm-bar .what *, .faults li *, .lamp .name, .lamp .value, #phase-button, #left dd, #left dt")
+  const contrasts = () => Object.fromEntries(seen(".verdict .word, .verdict .which, #alarm-bar .what *, .faults li *, .lamp .name, .lamp .value, .g-label, .g-value, #guidance .age, #phase-button, #left dd, #left dt")
     .filter((one) => one.textContent.trim()).map((one) => [`${name(one)} ${one.textContent.slice(0, 20)}`, contrast(one)]).sort((a, b) => b[1] - a[1]));
 
   const scrolls = () => document.documentElement.scrollHeight > innerHeight || document.documentElement.scrollWidth > innerWidth || scrollY !== 0;
 
-  window.measures = () => ({ outside: outside(), overlapping: overlapping(), smallTexts: smallTexts(), smallTargets: smallTargets(), clipped: clipped(),
+  window.measures = () => ({ outside: outside(), overlapping: overlapping(), smallTexts: smallTexts(), smallTargets: smallTargets(), clipped: clipped(), cut: cut(),
     weakest: Object.entries(contrasts()).at(-1), scrolls: scrolls() });
   window.centre = (selector) => {
     const one = seen(selector)[0];

@@ -22,6 +22,7 @@ import pytest
 from daemon.onboard.service.messages import ServiceEvent
 from processing.rig import shipped_rigs
 from tests.daemon.onboard.monitoring import flight_events
+from tests.daemon.onboard.monitoring.guidance_frames import aerial_map, guidance_frame, vector_map
 from tests.daemon.onboard.monitoring.test_page import WITHIN_S, Service
 from tests.support.browser import Browser, chromium
 from tests.support.npm import npm_package
@@ -66,7 +67,19 @@ class Cockpit:
         disk: dict[str, Any] = {"gps_ns": str(NOON_GPS_NS + int(self.mono_s * 1e9))}
         disk |= {"disk_free_bytes": left * 150_000_000, "exposure_bytes": 150_000_000}
         disk |= {"disk_seconds": left * 2.4 if triggers else None, "is_disk_low": left < 100}
+        lines = {"flown": [], "current": "A0" if phase == "flying" else None, "next": "A1"}
+        disk |= {"lines": lines, "deviations": 0}
         self.emit(status | {"position": position, "missing": []} | disk | further)
+
+    def guide(self, east_deg: float | None) -> None:
+        """Send guidance and wait until it is shown; without `east_deg` there is none."""
+        if east_deg is None:
+            return
+        sent = guidance_frame(LINES, 0.4, east_deg=east_deg)
+        while not self.service.child.try_send(ServiceEvent(sent)):
+            time.sleep(0.02)
+        self.until("document.querySelector('#guidance [data-key=line]') !== null")
+        self.until("!document.querySelector('#guidance').classList.contains('stale')")
 
     def resize(self, width: int, height: int, theme: str = "") -> None:
         metrics = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 500}
@@ -88,17 +101,20 @@ class Cockpit:
             self.browser.call("Input.dispatchMouseEvent", type=kind, **about)
 
 
+LINES = {
+    f"A{k}": [[15.43 + 0.004 * k, 47.07], [15.43 + 0.004 * k, 47.082]][:: -1 if k % 2 else 1]
+    for k in range(5)
+}
+
+
 def lines() -> dict[str, Any]:
     features = [
         {
             "type": "Feature",
-            "properties": {"id": f"A{k}", "strip": f"S{k}"},
-            "geometry": {
-                "type": "LineString",
-                "coordinates": [[15.43 + 0.004 * k, 47.07], [15.43 + 0.004 * k, 47.082]],
-            },
+            "properties": {"id": name, "strip": f"S{name[1:]}"},
+            "geometry": {"type": "LineString", "coordinates": ends},
         }
-        for k in range(5)
+        for name, ends in LINES.items()
     ]
     return {"type": "FeatureCollection", "features": features, "specification": {"sun_deg": 20.0}}
 
@@ -125,10 +141,11 @@ def cockpit(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cockpit]:
         product = mission / f"L2/{number:06d}"
         product.mkdir(parents=True)
         cv2.imwrite(str(product / "quicklook.jpg"), picture_of(number))
+        cv2.imwrite(str(product / "thumbnail.jpg"), cv2.resize(picture_of(number), (200, 133)))
         (product / "histogram.json").write_text(
-            json.dumps({"SU00": [0] * 8 + [50] * 24 + [0] * 32})
+            json.dumps({"SU00": [0] * 8 + [50] * 24 + [0] * 32, "R": [0] * 63 + [500]})
         )
-    service = Service(folder)
+    service = Service(folder, maps=(aerial_map(folder), vector_map(folder)))
     try:
         with Browser(folder / "profile", width=1280, height=800) as browser:
             cockpit = Cockpit(service, browser)
@@ -158,23 +175,31 @@ def opened(*devices: str) -> list[dict[str, Any]]:
 HEADS = [f"SU{k:02d}" for k in range(13)]
 
 
-def check(cockpit: Cockpit, state: str) -> None:
-    """Measure the page at each size and in each theme, and picture it."""
+FAULTS = ("outside", "overlapping", "smallTexts", "smallTargets", "clipped", "cut")
+"""What no state of the page may have, by the names of `cockpit_measures.js`."""
+
+
+def check(cockpit: Cockpit, state: str, *, east_deg: float | None = None) -> None:
+    """Measure the page at each size and in each theme, and picture it.
+
+    `east_deg` is the place of the aircraft on the line, for states with guidance.
+    """
     browser = cockpit.browser
     browser.evaluate(MEASURES.read_text())
-    for turn, (width, height) in enumerate(SIZES):
+    for width, height in SIZES:
         for theme in THEMES:
             cockpit.resize(width, height, theme)
+            cockpit.guide(east_deg)
             found = browser.evaluate("measures()")
             where = f"{state} at {width}x{height} {theme or 'light'}"
-            for fault in ("outside", "overlapping", "smallTexts", "smallTargets", "clipped"):
+            for fault in FAULTS:
                 assert found[fault] == [], f"{where}: {fault} {found[fault]}"
             assert not found["scrolls"], where
             assert found["weakest"][1] >= CONTRAST, f"{where}: {found['weakest']}"
-            if theme == THEMES[turn % 2]:
-                findings = axe(browser)
-                assert findings == [], f"{where}: {findings}"
+            findings = axe(browser)
+            assert findings == [], f"{where}: {findings}"
         cockpit.resize(width, height, "dark" if state in ("between-lines", "link-lost") else "")
+        cockpit.guide(east_deg)
         save_picture(browser, f"{state}-{width}")
     cockpit.resize(1280, 800)
 
@@ -204,7 +229,8 @@ def save_picture(browser: Browser, name: str) -> None:
 
 def test_before_arming(cockpit: Cockpit) -> None:
     cockpit.emit(*opened(*HEADS, "probes"), {"event": "device", "device": "gnss", "name": "fixed"})
-    settings = {"pan": {"exposure_time_us": 4000.0, "gain_db": 0.0, "tdi_shifts": 0}}
+    one = {"exposure_time_us": 4000.0, "gain_db": 0.0, "tdi_shifts": 0}
+    settings = {"pan": one, "R": one}
     cockpit.emit(
         {"event": "exposure-settings", "by": "service", "control": "manual", "settings": settings}
     )
@@ -214,8 +240,9 @@ def test_before_arming(cockpit: Cockpit) -> None:
     for event in flight_events.exposure(1, "good"):
         cockpit.emit(event)
     cockpit.status("ready", triggers=1, missing=["no position (check the antenna of the receiver)"])
-    # Counts end at half of full scale: the test exposure asks for half as much time again.
+    # PAN ends at half of full scale and asks for half as much time again. Red is saturated.
     cockpit.until("document.querySelector('#exposure-suggestion').innerText.includes('6000 µs')")
+    assert "R: 2000 µs" in cockpit.browser.text("#exposure-suggestion [data-group=R]")
     cockpit.until("document.querySelector('[data-check=test].good') !== null")
     assert cockpit.browser.text("#phase-button") == "Arm"
     check(cockpit, "before-arming")
@@ -234,7 +261,10 @@ def test_on_a_line(cockpit: Cockpit) -> None:
     assert "min" in cockpit.browser.text("#left-disk") or " h " in cockpit.browser.text(
         "#left-disk"
     )
-    check(cockpit, "on-a-line")
+    cockpit.until("document.querySelectorAll('#strip .thumb img[src]').length === 6")
+    cockpit.until("document.querySelectorAll('#map canvas[data-map]').length > 0")
+    cockpit.until("document.querySelectorAll('#map .placed').length === 6")
+    check(cockpit, "on-a-line", east_deg=0.00005)
 
 
 def test_between_lines(cockpit: Cockpit) -> None:
@@ -244,7 +274,7 @@ def test_between_lines(cockpit: Cockpit) -> None:
     cockpit.status("armed", triggers=9)
     cockpit.until("document.querySelector('#phase-button').innerText === 'Start line'")
     assert cockpit.browser.text("#phase-second") == "Land"
-    check(cockpit, "between-lines")
+    check(cockpit, "between-lines", east_deg=0.00005)
 
 
 def test_degraded_with_many_faults(cockpit: Cockpit) -> None:
@@ -266,7 +296,8 @@ def test_degraded_with_many_faults(cockpit: Cockpit) -> None:
     ):
         cockpit.until(f"document.querySelector('#lamp-{lamp}').classList.contains('{state}')")
     assert cockpit.browser.evaluate("document.body.dataset.sounding") == "warning"
-    check(cockpit, "degraded")
+    # 38 m to the right of a line with a limit of 25 m.
+    check(cockpit, "degraded", east_deg=0.0005)
 
 
 def test_no_text_is_missing_from_the_catalogs_and_none_is_clipped(cockpit: Cockpit) -> None:
@@ -391,7 +422,7 @@ def test_the_tasks_of_an_operator_take_three_touches_at_most(cockpit: Cockpit) -
             else:
                 cockpit.until(done[outcome])
         # A new fault sounds again, although the others are silenced.
-        cockpit.emit(flight_events.lost(f"SU{width // 100:02d}"))
+        cockpit.emit(flight_events.lost(f"SU{5 + width // 1000:02d}"))
         cockpit.until("document.body.dataset.sounding === 'warning'")
         browser.evaluate("sessionStorage.removeItem('shelved')")
         cockpit.touch("#tab-flight")

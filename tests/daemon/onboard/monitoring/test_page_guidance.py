@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,18 +13,14 @@ import numpy as np
 import pytest
 
 from daemon.mission.store.level0 import tiff_parts
-from daemon.planning.guidance import GuidanceLimits, guide
-from daemon.planning.model import PlannedLine, Point
 from processing.rig import shipped_rigs
-from tests.daemon.onboard.flight.test_flight import nav as any_sample
 from tests.daemon.onboard.monitoring import flight_events
-from tests.daemon.onboard.monitoring.test_base_maps import geotiff, mbtiles, tile_of
+from tests.daemon.onboard.monitoring.guidance_frames import guidance_frame, vector_map
+from tests.daemon.onboard.monitoring.test_base_maps import geotiff
 from tests.daemon.onboard.monitoring.test_page import WITHIN_S, Service
-from tests.daemon.onboard.monitoring.vector_tiles import vector_tile
 from tests.support.browser import Browser, chromium
 
 LINES = {"A1": [[15.43, 47.07], [15.43, 47.08]], "A2": [[15.434, 47.08], [15.434, 47.07]]}
-LIMITS = GuidanceLimits(25.0, 40.0, None)
 MARKED_RED = (
     "(() => { const c = [...document.querySelectorAll('#deep canvas')]; return c.some((one) => {"
     " const d = one.getContext('2d').getImageData(0, 0, 256, 256).data;"
@@ -36,24 +31,7 @@ MARKED_RED = (
 
 
 def frame(along_share: float, east_deg: float = 0.0, height_m: float = 1395.0) -> dict[str, Any]:
-    """Guidance on A1, flown to the north at 55 m/s, as the service sends it."""
-    lines = [PlannedLine(name, Point(*a[::-1]), Point(*b[::-1])) for name, (a, b) in LINES.items()]
-    sample = replace(
-        any_sample(0.0), latitude_deg=47.07 + 0.01 * along_share, longitude_deg=15.43 + east_deg,
-        height_m=height_m, velocity_ned_mps=(55.0, 0.0, 0.0), heading_rad=0.05,
-    )  # fmt: skip
-    found = guide(
-        lines[0], sample, is_reversed=False, places_m=tuple(range(0, 1200, 68)),
-        planned_height_m=1395.0, limits=LIMITS, next_line=(lines[1], False),
-    )  # fmt: skip
-    assert found is not None
-    return {
-        "event": "guidance", "sample_mono_ns": str(time.monotonic_ns() - 40_000_000),
-        "receiver": "gnss", "fix": "3d", "latitude_deg": sample.latitude_deg,
-        "longitude_deg": sample.longitude_deg, "height_m": height_m, "is_captured": True,
-        "is_deviating": bool(found.exceeded),
-        "limits": {"across_m": 25.0, "below_m": 40.0, "above_m": None}, **found.as_json(),
-    }  # fmt: skip
+    return guidance_frame(LINES, along_share, east_deg=east_deg, height_m=height_m)
 
 
 def status(triggers: int) -> dict[str, Any]:
@@ -98,13 +76,7 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
     plan = {"type": "FeatureCollection", "features": features}
     (mission / "plan.geojson").write_text(json.dumps(plan))
     (mission / "service.toml").write_text("[plan]\nground_height_m = 395.0\n")
-    _, x, y = tile_of(15.432, 47.075, 14)
-    south = (1 << 14) - 1 - y
-    tiles = {(14, x + i, south + k): vector_tile() for i in range(-3, 4) for k in range(-3, 4)}
-    roads = mbtiles(
-        folder / "roads.mbtiles", tiles, format="pbf", minzoom="14", maxzoom="14", name="roads",
-        attribution="<b>made</b> up", bounds="15,46.5,16,47.5",
-    )  # fmt: skip
+    roads = vector_map(folder)
     ground = np.tile(np.linspace(40, 220, 400).astype(np.uint8), (400, 1))
     ortho = geotiff(folder / "ortho.tif", ground)
     service = Service(folder, maps=(roads, ortho))
@@ -193,6 +165,8 @@ def test_a_way_is_measured(browser: Browser) -> None:
     browser.wait_for(
         "document.querySelector('#map-measured').textContent.includes('90°')", WITHIN_S
     )
+    # The clicks lie on footprints; measuring selects none of them.
+    assert browser.evaluate("import('/feed.js').then(({feed}) => feed.isFollowing)")
     browser.click("#map-measure")
 
 
@@ -212,8 +186,37 @@ def test_full_resolution_is_read_on_request_only(browser: Browser) -> None:
     assert asked
 
 
+def test_full_resolution_is_that_of_the_selected_exposure(
+    service: Service, browser: Browser
+) -> None:
+    """Neither tiles of the one before remain, nor does a late answer bring them back."""
+    for event in flight_events.exposure(7, line="A1", north_m=476.0):
+        service.emit(event)
+    browser.wait_for("document.querySelectorAll('#strip .thumb').length === 7", WITHIN_S)
+    browser.click("#strip .thumb:first-child")
+    browser.click("#full-resolution")
+    browser.wait_for(
+        "document.querySelector('#deep-tools').innerText.includes('no image of full')", WITHIN_S
+    )
+    assert browser.evaluate("document.querySelectorAll('#deep canvas, #deep path').length") == 0
+    browser.evaluate(
+        "const real = window.fetch; window.fetch = async (address, options) => {"
+        " const answer = await real(address, options);"
+        " if (String(address).endsWith('/images/5')) await new Promise((r) => setTimeout(r, 600));"
+        " return answer; }; true"
+    )
+    for child in (3, 5):
+        browser.click(f"#strip .thumb:nth-child({child})")
+        browser.click("#full-resolution")
+    browser.wait_for("document.querySelectorAll('#deep canvas').length > 0", WITHIN_S)
+    time.sleep(1.0)  # the answer for exposure 5 has come meanwhile
+    assert any("/images/3/pan/" in one for one in browser.requested)
+    assert not any("/images/5/pan/" in one for one in browser.requested)
+    browser.click("#full-resolution")
+
+
 def test_manual_verdict_and_retake_are_two_touches(service: Service, browser: Browser) -> None:
-    browser.click("#strip .thumb:nth-child(3)")
+    browser.click("#strip .thumb:nth-child(4)")
     browser.wait_for("document.querySelector('#manual-state').textContent.includes('4')", WITHIN_S)
     assert pressed(service, browser, "#manual-reject", "reject")["number"] == 4
     manual = {"kind": "reject", "by": "anna", "role": "operator", "reason": ""}

@@ -13,7 +13,8 @@ const STORE = "shelved";
 
 // Id of a shelved alarm, and until when, in ms of the wall clock. Kept over a reload of the page.
 const shelved = new Map(readShelved());
-const silenced = new Set();
+// Id of each silenced alarm, and its severity then. An alarm whose cause is gone is forgotten.
+const silenced = new Map();
 
 function readShelved() {
   try {
@@ -57,9 +58,10 @@ export function listAlarms(feed) {
   const brief = feed.flight.brief;
   const nowNs = brief?.status?.mono_ns;
   const all = [...(brief?.faults || []).map((one) => ofFault(one, nowNs)), ...[...feed.pageAlarms.values()].map(ofPage)];
-  const rank = (one) => [one.untilMs ? 1 : 0, one.isActive ? 0 : 1, one.isAcknowledged ? 1 : 0, RANK[one.severity] ?? 0];
+  // An alarm of the page says that all others may be old.
+  const rank = (one) => [one.untilMs ? 1 : 0, one.isService ? 1 : 0, one.isActive ? 0 : 1, one.isAcknowledged ? 1 : 0, RANK[one.severity] ?? 0];
   return all.map((one) => [rank(one), one])
-    .sort(([a], [b]) => a[0] - b[0] || a[1] - b[1] || a[2] - b[2] || a[3] - b[3]).map(([, one]) => one);
+    .sort(([a], [b]) => a[0] - b[0] || a[1] - b[1] || a[2] - b[2] || a[3] - b[3] || a[4] - b[4]).map(([, one]) => one);
 }
 
 const titleOf = (alarm) => {
@@ -161,12 +163,13 @@ function drawBar(alarms, feed) {
 
 function soundingOf(alarms) {
   return alarms.filter((one) => one.isActive && !one.isAcknowledged && !one.untilMs && one.severity !== "info"
-    && !silenced.has(`${one.id} ${one.count}`));
+    && silenced.get(one.id) !== one.severity);
 }
 
-// Silence what sounds now. A new or repeated alarm sounds again.
+// Silence what sounds now. Reports of the same cause stay silent; a new alarm sounds, as does one that becomes more
+// severe or comes back after its cause was gone.
 function silenceAll(feed) {
-  for (const one of listAlarms(feed)) silenced.add(`${one.id} ${one.count}`);
+  for (const one of listAlarms(feed)) if (one.isActive) silenced.set(one.id, one.severity);
   feed.refresh();
   draw(feed);
 }
@@ -174,6 +177,8 @@ function silenceAll(feed) {
 function draw(feed) {
   dropExpired();
   const alarms = listAlarms(feed);
+  const active = new Set(alarms.filter((one) => one.isActive).map((one) => one.id));
+  for (const id of silenced.keys()) if (!active.has(id)) silenced.delete(id);
   drawList(alarms, feed);
   drawBar(alarms, feed);
   setBadge("alarms", alarms.filter((one) => one.isActive && !one.untilMs).length);

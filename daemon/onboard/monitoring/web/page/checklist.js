@@ -29,7 +29,19 @@ function quantile(counts, share) {
   return 1;
 }
 
-// The factor by which the exposure time should change, from raw counts of the test exposure.
+const PAN = "pan";
+
+// Counts of the sensors of each group of settings. A sensor outside PAN has a group of its own name.
+export function countsOfGroups(groups, countsOfSensor) {
+  const found = Object.fromEntries(groups.map((group) => [group, {}]));
+  for (const [sensor, counts] of Object.entries(countsOfSensor || {})) {
+    const group = groups.includes(sensor) ? sensor : PAN;
+    if (group in found) found[group][sensor] = counts;
+  }
+  return found;
+}
+
+// The factor by which the exposure time of a group should change, from raw counts of its sensors.
 export function suggestedFactor(countsOfSensor) {
   const all = Object.values(countsOfSensor || {}).filter((counts) => counts.some(Boolean));
   if (!all.length) return null;
@@ -72,22 +84,25 @@ function items(feed) {
   return listed;
 }
 
-// After the verdict of a test exposure: the exposure time that its histogram suggests.
+// After the verdict of a test exposure: the exposure time that its histograms suggest, for each group of heads.
 async function readTest(feed) {
   const one = lastWhere((each) => each.step === "processed" && !each.line);
   if (!one || one.number === test?.number) return;
-  test = { number: one.number, factor: null };
+  const current = test = { number: one.number };
   const counts = await fetchJson(`/api/v1/exposures/${one.number}/histogram.json`);
-  test.factor = suggestedFactor(counts);
-  const used = Object.entries(feed.flight.settings?.settings || {});
-  const pan = used.find(([group]) => group === "pan") || used[0];
-  const suggestion = by("exposure-suggestion");
-  if (test.factor == null || !pan) return;
-  const microseconds = Math.round(pan[1].exposure_time_us * test.factor);
-  if (test.factor === 1) suggestion.replaceChildren(t("check.exposure_fits", { number: one.number }));
-  else {
-    suggestion.replaceChildren(t("check.suggestion", { group: pan[0], us: number(microseconds), change: `${test.factor > 1 ? "+" : ""}${percent(test.factor - 1)}` }), " ",
-      button(t("check.use"), () => feed.command("exposure", { of: pan[0], exposure_time_us: microseconds }), { id: "use-suggestion" }));
+  if (test !== current) return;
+  const settings = feed.flight.settings?.settings || {};
+  const groups = countsOfGroups(Object.keys(settings), counts);
+  const judged = Object.entries(groups).map(([group, own]) => [group, suggestedFactor(own)]).filter(([, factor]) => factor != null);
+  const rows = judged.filter(([, factor]) => factor !== 1).map(([group, factor]) => {
+    const microseconds = Math.round(settings[group].exposure_time_us * factor);
+    return element("li", { dataset: { group } },
+      t("check.suggestion", { group, us: number(microseconds), change: `${factor > 1 ? "+" : ""}${percent(factor - 1)}` }), " ",
+      button(t("check.use"), () => feed.command("exposure", { of: group, exposure_time_us: microseconds })));
+  });
+  if (judged.length) {
+    by("exposure-suggestion").replaceChildren(...(rows.length ? rows
+      : [element("li", { textContent: t("check.exposure_fits", { number: one.number }) })]));
   }
 }
 

@@ -25,7 +25,8 @@ const ImageLayer = L.GridLayer.extend({
   },
   async fill(tile, { x, y, z }) {
     if (x < 0 || y < 0) return;
-    const answer = await fetchOk(`/api/v1/images/${this.number}/${this.name}/${2 ** -z}/${x}/${y}`);
+    const of = this.options.of ? `?of=${this.options.of}` : "";
+    const answer = await fetchOk(`/api/v1/images/${this.number}/${this.name}/${2 ** -z}/${x}/${y}${of}`);
     if (!answer || answer.status === 204) return;
     const picture = await createImageBitmap(await answer.blob());
     tile.getContext("2d").drawImage(picture, 0, 0);
@@ -35,6 +36,7 @@ const ImageLayer = L.GridLayer.extend({
 
 let map = null;
 let shownNumber = null;
+let requestedNumber = null;
 let base = null;
 const overlays = new Map();
 const wanted = new Set();
@@ -63,8 +65,8 @@ async function addOverlay(name, about) {
   if (name === "residuals") {
     const residuals = await fetchJson(`/api/v1/exposures/${number}/residuals.json`);
     if (residuals?.vectors?.length) layer = vectorsLayer(residuals, about.layers[0].width_px);
-  } else layer = new ImageLayer(number, name, { pane: "overlayPane", bounds: base.options.bounds });
-  if (layer && number === shownNumber && wanted.has(name)) overlays.set(name, layer.addTo(map));
+  } else layer = new ImageLayer(number, name, { pane: "overlayPane", bounds: base.options.bounds, of: layerName });
+  if (layer && number === shownNumber && wanted.has(name) && !overlays.has(name)) overlays.set(name, layer.addTo(map));
 }
 
 function drawControls(controls, about) {
@@ -93,22 +95,37 @@ function drawControls(controls, about) {
   controls.replaceChildren(...buttons, ...toggles);
 }
 
+// Remove every tile and layer, so that none of another exposure remains.
+function clear() {
+  base?.remove();
+  base = null;
+  for (const one of overlays.values()) one.remove();
+  overlays.clear();
+  shownNumber = null;
+}
+
 async function show(number, controls) {
+  requestedNumber = number;
+  const isNew = shownNumber !== number;
+  if (isNew) {
+    clear();
+    controls.replaceChildren();
+  }
   const about = await fetchJson(`/api/v1/images/${number}`);
-  if (!about || box.hidden) {
+  // Another exposure was selected, or the view was closed, before the answer came.
+  if (requestedNumber !== number || box.hidden) return;
+  if (!about) {
+    clear();
     controls.replaceChildren(element("p", { className: "note", textContent: t("image.no_full") }));
     return;
   }
-  const isNew = shownNumber !== number;
   const { width_px: width, height_px: height } = about.layers[0];
   const bounds = L.latLngBounds([[-height, 0], [0, width]]);
   if (!map) {
     map = L.map(box, { crs: L.CRS.Simple, attributionControl: false, zoomSnap: 0.5, minZoom: ZOOM_MIN, maxZoom: ZOOM_MAX });
     new ResizeObserver(() => map.invalidateSize()).observe(box);
   }
-  base?.remove();
-  for (const one of overlays.values()) one.remove();
-  overlays.clear();
+  clear();
   if (!about.layers.some((one) => one.name === layerName)) layerName = about.layers[0].name;
   shownNumber = number;
   if (isNew) map.fitBounds(bounds, { animate: false });
@@ -143,7 +160,8 @@ export function start(root, feed) {
     box.setAttribute("aria-label", t("image.full"));
     toggle.textContent = t("image.full");
     if (isFirstRecord) {
-      shownNumber = null;
+      requestedNumber = null;
+      clear();
       set(false);
     }
   });

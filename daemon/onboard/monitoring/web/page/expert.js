@@ -7,7 +7,7 @@ import { lastWhere } from "./feed.js";
 import { presentPosition } from "./lamps.js";
 import { drawCharts, fitCharts } from "./charts.js";
 
-const MARKS = { good: "●", caution: "▲", warning: "■" };
+const MARKS = { good: "●", caution: "▲", warning: "■", absent: "○" };
 const RANK = { refly: "warning", usable: "caution" };
 
 // Colour of a value from the finding of the last exposure that judges it.
@@ -23,14 +23,14 @@ function values({ brief }) {
   const latest = lastWhere((one) => one.figures);
   const f = latest?.figures || {};
   const known = (value, shown) => value == null ? "–" : shown(value);
-  return [
+  const listed = [
     ["clock_sigma", known(status.clock_sigma_ns, sigma), status.in_holdover ? { state: "caution", limit: "" } : judged(latest, "TIME_SIGMA", "TIME_HOLDOVER"), "sigma"],
     ["time_sigma", known(latest?.mark_sigma_ns, sigma), judged(latest, "TIME_SIGMA")],
     ["sigma0", known(f.sigma0_px, (value) => `${number(value, 3)} px`), judged(latest, "SIGMA0")],
     ["dc", known(f.dc_k, (value) => `${number(value, 1)} K`), judged(latest, "DC_DISAGREEMENT", "TEMPERATURE_RANGE")],
     ["tie_points", known(f.tie_points_pp, (value) => `${number(value)} + ${number(f.tie_points_pc ?? 0)}`), judged(latest, "TIE_POINTS")],
     ["accuracy", known(f.stitched_sigma_px, (value) => `${number(value, 3)} px`), judged(latest, "DISPLACED_SENSOR")],
-    ["displaced", f.displaced_sensor || "–", judged(latest, "DISPLACED_SENSOR")],
+    ["displaced", f.displaced_sensor || (latest && "displaced_sensor" in f ? t("expert.none") : "–"), judged(latest, "DISPLACED_SENSOR")],
     ["saturated", known(f.saturated_fraction, (value) => percent(value, 2)), judged(latest, "OVEREXPOSED")],
     ["tilt", known(f.tilt_deg, (value) => angle(value, 1)), judged(latest, "TILT")],
     ["crab", known(f.crab_deg, (value) => angle(value, 1)), judged(latest, "DRIFT")],
@@ -39,6 +39,8 @@ function values({ brief }) {
     ["sun", known(f.sun_deg, angle), judged(latest, "SUN")],
     ["queue", known(status.queue, number), { state: status.queue > 5 ? "caution" : "good", limit: "" }],
   ];
+  // What is absent has no state, whatever else was judged good.
+  return listed.map(([code, shown, state, id]) => [code, shown, shown === "–" ? { state: "absent", limit: state.limit } : state, id]);
 }
 
 export function start(_root, feed) {

@@ -1,14 +1,14 @@
 // Guidance frames of the service: one WebSocket, each frame answered, so that a slow link loses rate and not age.
 
-import { headers } from "./http.js";
+import { headers, isRefused } from "./http.js";
 
 const RETRY_MIN_MS = 500;
 const RETRY_MAX_MS = 8000;
 const SILENCE_MS = 6000;
 
 // Call `onFrame(frame)` for each frame, and `onLink(isLinked)` when the connection opens or closes.
-// Each frame gets `receivedMs`, for its age.
-export function followGuidance(onFrame, onLink = () => {}) {
+// Each frame gets `receivedMs`, for its age. `requestToken()` is called if reading requires another token.
+export function followGuidance(onFrame, onLink = () => {}, requestToken = null) {
   const scheme = location.protocol === "https:" ? "wss" : "ws";
   let waitMs = RETRY_MIN_MS;
   const open = () => {
@@ -16,11 +16,15 @@ export function followGuidance(onFrame, onLink = () => {}) {
     const protocols = token ? ["syntopic.v1", `bearer.${token}`] : ["syntopic.v1"];
     const socket = new WebSocket(`${scheme}://${location.host}/api/v1/guidance`, protocols);
     let silence = null;
+    let isAdmitted = false;
     const restart = () => {
       clearTimeout(silence);
       silence = setTimeout(() => socket.close(), SILENCE_MS);
     };
-    socket.onopen = () => onLink(true);
+    socket.onopen = () => {
+      isAdmitted = true;
+      onLink(true);
+    };
     socket.onmessage = (message) => {
       waitMs = RETRY_MIN_MS;
       restart();
@@ -29,9 +33,13 @@ export function followGuidance(onFrame, onLink = () => {}) {
       frame.receivedMs = performance.now();
       onFrame(frame);
     };
-    socket.onclose = () => {
+    socket.onclose = async () => {
       clearTimeout(silence);
       onLink(false);
+      if (requestToken && !isAdmitted && await isRefused()) {
+        await requestToken();
+        waitMs = RETRY_MIN_MS;
+      }
       setTimeout(open, waitMs);
       waitMs = Math.min(waitMs * 2, RETRY_MAX_MS);
     };

@@ -50,6 +50,10 @@ export function cellsOf(frame) {
   return cells;
 }
 
+// The parts of a value, between which the pilot's view may break the line.
+const partsOf = (value) => value.split(" · ").flatMap((part, k) =>
+  [...(k ? [" · "] : []), element("span", { className: "g-part", textContent: part })]);
+
 // Update or create the cells in `container`. Elements are reused: this runs at the rate of the receiver.
 export function drawCells(container, frame) {
   const wanted = cellsOf(frame);
@@ -64,7 +68,7 @@ export function drawCells(container, frame) {
     }
     const [label, value] = box.children;
     if (label.textContent !== cell.label) label.textContent = cell.label;
-    if (value.textContent !== cell.value) value.textContent = cell.value;
+    if (value.textContent !== cell.value) value.replaceChildren(...partsOf(cell.value));
     if (cell.describe) value.title = cell.describe;
     box.classList.toggle("exceeded", cell.state === "exceeded");
   }

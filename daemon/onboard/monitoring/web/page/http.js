@@ -5,6 +5,17 @@ export function headers() {
   return token ? { Authorization: `Bearer ${token}` } : {};
 }
 
+const REFUSAL_TIMEOUT_MS = 5000;
+
+// Whether reading requires another token than the present one.
+export async function isRefused() {
+  try {
+    return (await fetch("/api/v1/brief", { headers: headers(), signal: AbortSignal.timeout(REFUSAL_TIMEOUT_MS) })).status === 401;
+  } catch {
+    return false;
+  }
+}
+
 // The response; null if the request fails or is refused.
 export async function fetchOk(address) {
   try {

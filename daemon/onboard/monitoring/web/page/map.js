@@ -3,7 +3,7 @@
 import { flight } from "./telemetry.js";
 import { onGuidance } from "./guidance.js";
 import { startLayers } from "./map_layers.js";
-import { startMeasuring } from "./map_measure.js";
+import { isMeasuring, startMeasuring } from "./map_measure.js";
 
 const COLOURS = { good: "--good", usable: "--caution", refly: "--warning", lost: "--warning" };
 const DASHES = { good: null, usable: "6 3", refly: "2 4", lost: "1 7" };
@@ -137,7 +137,7 @@ function drawMap(choose) {
     let drawn = footprints.get(one.number);
     if (!drawn) {
       drawn = L.polygon(one.footprint, { interactive: true }).addTo(map);
-      drawn.on("click", () => choose(one.number));
+      drawn.on("click", () => { if (!isMeasuring()) choose(one.number); });
       drawn.bindTooltip(() => label(`${one.number}: ${flight.exposures.get(one.number)?.verdict || one.step}`));
       // Footprints take no keyboard focus; the table of exposures serves the keyboard.
       drawn.getElement().setAttribute("tabindex", "-1");

@@ -148,6 +148,9 @@ export function startLayers(map, feed) {
     placeThumbnails(map, feed.flight);
   });
   tools.append(button);
+  // On a phone the tools cover the map only while they are wanted.
+  const more = document.getElementById("map-more");
+  more.addEventListener("click", () => more.setAttribute("aria-expanded", String(tools.classList.toggle("opened"))));
   let isNightShown = isNight();
   let isAsked = false;
   feed.subscribe(async (record, isFirstRecord) => {

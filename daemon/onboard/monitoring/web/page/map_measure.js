@@ -5,13 +5,16 @@ import { angle, distance, length } from "./format.js";
 import { element } from "./dom.js";
 
 const FAR_M = 2000;
+let isOn = false;
+
+// Whether clicks on the map measure; then they select nothing.
+export const isMeasuring = () => isOn;
 
 export function startMeasuring(map) {
   const button = element("button", { type: "button", id: "map-measure", textContent: t("map.measure"), ariaPressed: "false" });
   const result = element("output", { id: "map-measured", hidden: true });
   const path = L.polyline([], { color: "#d400aa", weight: 3, dashArray: "2 6", interactive: false });
   const dots = L.layerGroup();
-  let isOn = false;
   const draw = () => {
     const places = path.getLatLngs();
     let totalM = 0;

@@ -72,6 +72,10 @@ function showLink(isLinked) {
   }
   document.body.classList.toggle("connection-lost", !isLinked && !state.isEnded);
   document.body.classList.toggle("flight-ended", !isLinked && Boolean(state.isEnded));
+  if (isLinked) feed.clearAlarm("page.link");
+  else if (isLive && !state.isEnded) {
+    feed.raiseAlarm({ code: "page.link", severity: "warning", params: { time: clock(new Date()) } });
+  }
   if (!isLinked && isLive) {
     by("connection-lost").textContent = t(state.sentence, { time: clock(new Date()) });
     by("connection-lost").classList.toggle("ended", state.isEnded);

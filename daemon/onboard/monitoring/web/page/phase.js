@@ -4,28 +4,32 @@ import { by, element } from "./dom.js";
 import { t } from "./i18n.js";
 
 const PHASE_CLASS = { flying: "good", armed: "good", fault: "warning", idle: "caution" };
+const ALARMS = "alarms";
 const NEXT = { ready: "arm", armed: "start", flying: "stop" };
 
-// The next command, and a second one where the phase has two ways on.
+// What the large button does in a phase: a command, "alarms" to open their page, or nothing.
 function commandsOf(brief) {
   const hasFlown = (brief.status?.ledger?.triggers?.triggers ?? 0) > 0;
-  return { next: NEXT[brief.phase] ?? null, second: brief.phase === "armed" && hasFlown ? "land" : null };
+  return { next: brief.phase === "fault" ? ALARMS : NEXT[brief.phase] ?? null, second: brief.phase === "armed" && hasFlown ? "land" : null };
 }
 
 function setButton(button, name) {
   button.hidden = !name && button.id === "phase-second";
   button.disabled = !name;
-  button.classList.toggle("stop", name === "stop");
+  button.classList.toggle("stop", name === "stop" || name === ALARMS);
   button.classList.toggle("destructive", name === "land");
   if (button.dataset.next === (name ?? "")) return;
   button.dataset.next = name ?? "";
-  if (name) button.textContent = t(`command.${name}`);
+  if (name) button.textContent = name === ALARMS ? t("phase.see_alarms") : t(`command.${name}`);
 }
 
 export function start(_root, feed) {
   const [next, second] = [by("phase-button"), by("phase-second")];
   for (const one of [next, second]) {
-    one.addEventListener("click", () => one.dataset.next && feed.command(one.dataset.next));
+    one.addEventListener("click", () => {
+      if (one.dataset.next === ALARMS) feed.showTab("alarms");
+      else if (one.dataset.next) feed.command(one.dataset.next);
+    });
   }
   for (const one of document.querySelectorAll("[data-command]")) {
     one.addEventListener("click", () => {

@@ -1,6 +1,6 @@
 // State of the flight, merged from telemetry records. Notifies listeners of each record.
 
-import { headers } from "./http.js";
+import { isRefused } from "./http.js";
 
 export const flight = {
   brief: null,
@@ -12,7 +12,6 @@ export const flight = {
 };
 
 const SILENCE_MS = 5000;
-const REFUSAL_TIMEOUT_MS = 5000;
 const listeners = new Set();
 
 export function onChange(listener) {
@@ -36,14 +35,6 @@ function merge(record, isFirstRecord) {
   flight.track.push(...track);
   flight.history.push(...history);
   for (const listener of listeners) listener(record, isFirstRecord);
-}
-
-async function isRefused() {
-  try {
-    return (await fetch("/api/v1/brief", { headers: headers(), signal: AbortSignal.timeout(REFUSAL_TIMEOUT_MS) })).status === 401;
-  } catch {
-    return false;
-  }
 }
 
 // Receive telemetry and reconnect for ever. `onLinkChange(isLinked)` is called when the connection

@@ -5,14 +5,17 @@ import { t } from "./i18n.js";
 
 const AWAKE = new Set(["armed", "flying"]);
 let lock = null;
+let isRequested = false;
 
 async function request() {
+  isRequested = true;
   try {
     lock = await navigator.wakeLock.request("screen");
     lock.addEventListener("release", () => { lock = null; show(); });
   } catch {
     lock = null;
   }
+  isRequested = false;
   show();
 }
 
@@ -22,14 +25,20 @@ function show() {
   by("wake").textContent = t(code);
 }
 
-export function start(_root, feed) {
-  const isWanted = () => AWAKE.has(feed.flight.brief?.phase) && document.visibilityState === "visible";
+// Keep the screen on while `isWanted()`. The returned function is called when that may have changed.
+export function keepAwake(isWanted) {
   const update = () => {
     if (!("wakeLock" in navigator) || !isSecureContext) return;
-    if (isWanted() && !lock) request();
-    else if (!AWAKE.has(feed.flight.brief?.phase)) lock?.release();
+    const isDue = isWanted();
+    if (isDue && !lock && !isRequested && document.visibilityState === "visible") request();
+    else if (!isDue) lock?.release();
   };
   show();
-  feed.subscribe(update);
+  // A browser releases the lock of a page that is not seen.
   document.addEventListener("visibilitychange", update);
+  return update;
+}
+
+export function start(_root, feed) {
+  feed.subscribe(keepAwake(() => AWAKE.has(feed.flight.brief?.phase)));
 }

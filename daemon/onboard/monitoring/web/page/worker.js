@@ -1,27 +1,82 @@
 // Service worker: the page's own files, from the network if it answers, else as they were last. Never data of a flight.
+// A page that was opened from the network has all of its files from there, and one that was opened from the store from
+// the store, so that versions are not mixed after an update.
 
 const CACHE = "syntopic-page";
-const TIMEOUT_MS = 4000;
+// To the begin of the answer to an opened page; then the stored page opens.
+const OPEN_TIMEOUT_MS = 4000;
+// Without a byte. A file may take longer: 150 kB take 6 s at 27 kB/s.
+const STALL_MS = 15000;
+const ATTEMPTS = 3;
+
+// Whether a page was opened from the store, by the id of its client.
+const isStored = new Map();
 
 const isOfPage = (address) => address.origin === location.origin && !address.pathname.startsWith("/api/")
   && !/^\/(metrics|docs|openapi)/.test(address.pathname);
 
-async function fromNetwork(request) {
-  const response = await fetch(request, { signal: AbortSignal.timeout(TIMEOUT_MS) });
+const stored = (request) => caches.match(request, { ignoreSearch: true });
+
+// The answer with its whole body. Silence of `timeoutMs` before the answer, or of STALL_MS within it, is a failure.
+async function fetchWhole(request, timeoutMs) {
+  const control = new AbortController();
+  let timer = setTimeout(() => control.abort(), timeoutMs);
+  try {
+    const response = await fetch(request, { signal: control.signal });
+    if (!response.body) return response;
+    const parts = [];
+    const reader = response.body.getReader();
+    for (;;) {
+      clearTimeout(timer);
+      timer = setTimeout(() => control.abort(), STALL_MS);
+      const { done, value } = await reader.read();
+      if (done) break;
+      parts.push(value);
+    }
+    const { status, statusText, headers } = response;
+    return new Response(new Blob(parts, { type: headers.get("Content-Type") || "" }), { status, statusText, headers });
+  } finally {
+    clearTimeout(timer);
+  }
+}
+
+async function fromNetwork(request, timeoutMs) {
+  const response = await fetchWhole(request, timeoutMs);
   if (response.ok) (await caches.open(CACHE)).put(request, response.clone());
   return response;
 }
 
-async function answer(request) {
+async function answerOpened(request, client) {
   try {
-    return await fromNetwork(request);
+    const response = await fromNetwork(request, OPEN_TIMEOUT_MS);
+    isStored.set(client, false);
+    return response;
   } catch {
-    return await caches.match(request, { ignoreSearch: true }) ?? Response.error();
+    isStored.set(client, true);
+    return await stored(request) ?? Response.error();
   }
+}
+
+async function answerFile(request, client) {
+  if (isStored.get(client)) {
+    const found = await stored(request);
+    if (found) return found;
+  }
+  for (let attempt = 1; attempt <= ATTEMPTS; attempt += 1) {
+    try {
+      return await fromNetwork(request, STALL_MS);
+    } catch {
+      // Tried again; after the last attempt the stored file is better than none.
+    }
+  }
+  return await stored(request) ?? Response.error();
 }
 
 self.addEventListener("install", () => self.skipWaiting());
 self.addEventListener("activate", (event) => event.waitUntil(self.clients.claim()));
 self.addEventListener("fetch", (event) => {
-  if (event.request.method === "GET" && isOfPage(new URL(event.request.url))) event.respondWith(answer(event.request));
+  const { request } = event;
+  if (request.method !== "GET" || !isOfPage(new URL(request.url))) return;
+  event.respondWith(request.mode === "navigate" ? answerOpened(request, event.resultingClientId)
+    : answerFile(request, event.clientId));
 });

@@ -1,0 +1,84 @@
+"""Guidance as the service sends it, and base maps below it, for the tests of the page."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from daemon.planning.guidance import GuidanceLimits, guide
+from daemon.planning.model import PlannedLine, Point
+from tests.daemon.onboard.flight.test_flight import nav as any_sample
+from tests.daemon.onboard.monitoring.test_base_maps import geotiff, mbtiles, tile_of
+from tests.daemon.onboard.monitoring.vector_tiles import vector_tile
+
+LIMITS = GuidanceLimits(25.0, 40.0, None)
+
+Ends = Sequence[Sequence[float]]
+"""Longitude and latitude of both ends of a line, degrees."""
+
+
+def guidance_frame(
+    lines: dict[str, Ends],
+    along_share: float,
+    *,
+    east_deg: float = 0.0,
+    height_m: float = 1395.0,
+) -> dict[str, Any]:
+    """Guidance on the first of the lines, flown at 55 m/s; the second one is next."""
+    first, second = (
+        PlannedLine(name, Point(a[1], a[0]), Point(b[1], b[0]))
+        for name, (a, b) in list(lines.items())[:2]
+    )
+    start, end = first.start, first.end
+    sample = replace(
+        any_sample(0.0),
+        latitude_deg=start.latitude_deg + along_share * (end.latitude_deg - start.latitude_deg),
+        longitude_deg=start.longitude_deg + east_deg,
+        height_m=height_m, velocity_ned_mps=(55.0, 0.0, 0.0), heading_rad=0.05,
+    )  # fmt: skip
+    found = guide(
+        first, sample, is_reversed=False, places_m=tuple(range(0, 1200, 68)),
+        planned_height_m=1395.0, limits=LIMITS, next_line=(second, False),
+    )  # fmt: skip
+    assert found is not None
+    return {
+        "event": "guidance", "sample_mono_ns": str(time.monotonic_ns() - 40_000_000),
+        "receiver": "gnss", "fix": "3d", "latitude_deg": sample.latitude_deg,
+        "longitude_deg": sample.longitude_deg, "height_m": height_m, "is_captured": True,
+        "is_deviating": bool(found.exceeded),
+        "limits": {"across_m": 25.0, "below_m": 40.0, "above_m": None}, **found.as_json(),
+    }  # fmt: skip
+
+
+def vector_map(folder: Path) -> Path:
+    """A map of vector tiles about the lines of the tests, with markup in its attribution."""
+    _, x, y = tile_of(15.432, 47.075, 14)
+    south = (1 << 14) - 1 - y
+    tiles = {(14, x + i, south + k): vector_tile() for i in range(-3, 4) for k in range(-3, 4)}
+    return mbtiles(
+        folder / "roads.mbtiles", tiles, format="pbf", minzoom="14", maxzoom="14", name="roads",
+        attribution="<b>made</b> up", bounds="15,46.5,16,47.5",
+    )  # fmt: skip
+
+
+def aerial_map(folder: Path) -> Path:
+    """Fields and roads as a GeoTIFF, about 4 km x 5 km about the lines of the tests."""
+    random = np.random.default_rng(7)
+    fields = random.integers((70, 100, 60), (130, 150, 100), (26, 21, 3)).astype(np.uint8)
+    ground = cv2.resize(fields, (1050, 1300), interpolation=cv2.INTER_NEAREST)
+    for k in range(0, 1300, 200):
+        cv2.line(ground, (0, k + 60), (1050, k), (170, 165, 150), 4)
+    cv2.line(ground, (300, 0), (620, 1300), (190, 185, 170), 7)
+    from rasterio.transform import from_origin
+
+    return geotiff(
+        folder / "fields.tif",
+        np.moveaxis(ground, 2, 0).copy(),
+        transform=from_origin(531_500.0, 5_216_500.0, 4.0, 4.0),
+    )
