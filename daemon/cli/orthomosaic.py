@@ -17,11 +17,12 @@ from daemon.configuration.model import ConfigurationError
 from daemon.mission.layout import Mission
 from daemon.terminal.console import Console
 
-HELP = """Compute the orthomosaic of the stitched images of a mission.
+HELP = """Compute the orthomosaic of the stitched images or photographs of a mission.
 
 Images are resampled to a map grid over a height model or a plane, each ground pixel from the image
 whose nadir is nearest, and levelled over the block. Orientations are those of `syntopic
-triangulate`, else those delivered with the mission. Writes Cloud Optimized GeoTIFFs (PAN, RGB and
+triangulate`, else those delivered with the mission. Imported photographs need a triangulation and
+are undistorted by its interior orientation. Writes Cloud Optimized GeoTIFFs (PAN, RGB and
 CIR, 16 and 8 bits), seams as GeoPackage and orthomosaic.json.
 
 An interrupted run continues when it is repeated. The same inputs give the same bytes.
@@ -33,7 +34,7 @@ Examples: `syntopic orthomosaic MISSION --elevation dtm.tif`,
 
 
 def orthomosaic(
-    mission: Annotated[Path, typer.Argument(help="Mission folder with Level-2.")],
+    mission: Annotated[Path, typer.Argument(help="Mission folder with Level-2, or of photographs.")],
     triangulation: Annotated[
         Path | None,
         typer.Option(help="Folder of a triangulation (default: the only one in the export)."),

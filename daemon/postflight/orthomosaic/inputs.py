@@ -34,13 +34,21 @@ from daemon.postflight.orthomosaic.ground_reach import (
     corner_slope,
     ground_reach_m,
 )
+from daemon.postflight.orthomosaic.photographs import (
+    BANDS,
+    adjusted_head,
+    check_photograph,
+    is_of_photographs,
+    source_of,
+)
 from daemon.postflight.triangulation.triangulation import block_of
 from processing.geometry.orientation import grid_from_enu
 from processing.geometry.rotation import rotation_matrix
 from processing.geometry.terrain_rays import HeightModel
 from processing.image.orthoimage.ground_grid import GroundGrid, GroundSurface, ground_surface
 from processing.image.orthoimage.ground_resampling import ImagePose
-from processing.rig import VirtualImage, load_rig
+from processing.pipelines.perspective import perspective_of
+from processing.rig import Cone, VirtualImage, load_rig
 
 Array = NDArray[np.float64]
 
@@ -66,7 +74,7 @@ class OrthoImage:
     """A stitched image with its pose in the local frame.
 
     `colour` are the bands of its colour raster; `marks` what its description marks it as, such as
-    simulated or uncalibrated.
+    simulated or uncalibrated; `sources` are the files of its pixels.
     """
 
     name: str
@@ -76,6 +84,7 @@ class OrthoImage:
     height_m: float
     colour: tuple[str, ...]
     marks: tuple[str, ...]
+    sources: tuple[Path, ...]
 
 
 @dataclass(frozen=True)
@@ -92,7 +101,8 @@ class OrthoBlock:
     """Everything that an orthomosaic is computed from.
 
     `orientation` is the sentence that states where orientations come from; `failures` are images
-    that cannot be read and are not in the block.
+    that cannot be read and are not in the block; `head` is the one that took the images where they
+    are photographs, None where they are stitched.
     """
 
     mission: Mission
@@ -104,6 +114,7 @@ class OrthoBlock:
     grid: GroundGrid
     orientation: str
     failures: tuple[ExposureFailure, ...]
+    head: Cone | None = None
 
     @property
     def marks(self) -> tuple[str, ...]:
@@ -125,10 +136,10 @@ class OrthoBlock:
         """Hash of all inputs and of the code; the pixels of Level-2 by size and time of their
         files."""
         files = [
-            [image.name, file, status.st_size, str(status.st_mtime_ns)]
+            [image.name, file.name, status.st_size, str(status.st_mtime_ns)]
             for image in self.images
-            for file in ("pan.tif", *(("rgbn.tif",) if image.colour else ()))
-            for status in [(self.mission.level2(image.exposure) / file).stat()]
+            for file in image.sources
+            for status in [file.stat()]
         ]
         poses = [
             [
@@ -146,6 +157,7 @@ class OrthoBlock:
             "poses": [[v if isinstance(v, str) else float(v).hex() for v in p] for p in poses],
             "crs": self.georeference.name,
             "ground": self.ground.sha256,
+            "head": repr(self.head),
             "grid": [grid.east_m, grid.north_m, grid.gsd_m, grid.width_px, grid.height_px],
         }
         return sha256_hex(canonical_bytes(facts))
@@ -166,20 +178,16 @@ def block_for_orthomosaic(
 
     Args:
         triangulation: folder of `syntopic triangulate`; None: the mission's only one, else the
-            delivered orientations.
+            delivered orientations. Photographs have none delivered.
         elevation: height model; None: that of the flight, else a plane.
         plane_height_m: height of a plane in the height system of the grid, in place of a model.
         gsd_m: of the grid; None: the mean of the images.
 
     Raises:
-        OrthomosaicError: no stitched images, no orientations, or a ground that does not fit.
+        OrthomosaicError: no usable images, no orientations, or a ground that does not fit.
     """
-    rig = load_rig(mission.rig_path)
-    if rig.virtual_image is None:
-        raise OrthomosaicError(
-            f"rig {rig.name} stitches no PAN image; an orthomosaic is made of stitched images"
-        )
     folder = triangulation or _only_triangulation(mission)
+    image, head = _geometry(mission, folder)
     if folder is not None:
         georeference, names, place, angles = _triangulated(folder, crs)
         orientation = f"adjusted orientations of {folder.name}"
@@ -197,7 +205,7 @@ def block_for_orthomosaic(
     geodetic = georeference.geodetic(place)
     frame = LocalFrame(float(geodetic[:, 0].mean()), float(geodetic[:, 1].mean()))
     images, unread = _images(
-        mission, rig.virtual_image, georeference, frame, names, place, geodetic, angles
+        mission, image, head, georeference, frame, names, place, geodetic, angles
     )
     offset_m = float(np.median(place[:, 2] - geodetic[:, 2]))
     ground = _ground(mission, georeference, elevation, plane_height_m)
@@ -206,11 +214,29 @@ def block_for_orthomosaic(
     if ground is None:
         _, plan = mount_of(mission)
         ground = _plane(plan.ground_height_m + offset_m, None)
-    grid = _grid(images, rig.virtual_image, ground, gsd_m)
+    grid = _grid(images, image, ground, gsd_m)
     return OrthoBlock(
-        mission, rig.virtual_image, images, georeference, frame, ground, grid, orientation,
-        (*failures, *unread),
+        mission, image, images, georeference, frame, ground, grid, orientation,
+        (*failures, *unread), head,
     )  # fmt: skip
+
+
+def _geometry(mission: Mission, folder: Path | None) -> tuple[VirtualImage, Cone | None]:
+    """Size and interior orientation of the images, and the head of photographs."""
+    rig = load_rig(mission.rig_path)
+    if rig.virtual_image is not None:
+        return rig.virtual_image, None
+    if not is_of_photographs(rig):
+        raise OrthomosaicError(
+            f"rig {rig.name} stitches no PAN image; an orthomosaic is made of stitched images or "
+            "of photographs (syntopic import photographs)"
+        )
+    if folder is None:
+        raise OrthomosaicError(
+            f"{mission.path}: photographs have no orientation; run syntopic triangulate first"
+        )
+    head = adjusted_head(folder)
+    return perspective_of(head), head
 
 
 def _only_triangulation(mission: Mission) -> Path | None:
@@ -249,6 +275,7 @@ def _triangulated(
 def _images(
     mission: Mission,
     image: VirtualImage,
+    head: Cone | None,
     georeference: Georeference,
     frame: LocalFrame,
     names: Sequence[str],
@@ -256,7 +283,10 @@ def _images(
     geodetic: Array,
     angles_deg: Array,
 ) -> tuple[tuple[OrthoImage, ...], tuple[ExposureFailure, ...]]:
-    at = {int(name): k for k, name in enumerate(names) if name.isdecimal()}
+    # The image of a head has the head's name behind the number.
+    suffix = "" if head is None else f"_{head.name}"
+    own = [name.removesuffix(suffix) if name.endswith(suffix) else "" for name in names]
+    at = {int(name): k for k, name in enumerate(own) if name.isdecimal()}
     if not at:
         raise OrthomosaicError(
             "no orientation is that of a stitched image; an orthomosaic is made of stitched images"
@@ -265,8 +295,10 @@ def _images(
 
     def oriented(number: int) -> OrthoImage:
         k = at[number]
-        check_tiff(
-            mission.level2(number) / "pan.tif", width_px=image.width_px, height_px=image.height_px
+        sources, bands, marks = (
+            _stitched(mission, number, image)
+            if head is None
+            else _photograph(mission, number, head)
         )
         latitude, longitude, height = (float(v) for v in geodetic[k])
         azimuth = georeference.place(latitude, longitude, height).azimuth_of_north_rad
@@ -281,16 +313,30 @@ def _images(
                 "orthomosaic is made of images that look down"
             )
         east, north, up = (float(v) for v in place[k])
-        described = read_description(mission.level2(number) / "pan.tif")
-        marks = tuple(mark for mark in MARKS if described.get(mark) is True)
-        bands = _bands(mission, number)
-        return OrthoImage(names[k], number, pose, (east, north), up, bands, marks)
+        return OrthoImage(names[k], number, pose, (east, north), up, bands, marks, sources)
 
     read = for_each_exposure(sorted(at), oriented)
     if not read.results:
         causes = "; ".join(f"exposure {one.exposure}: {one.cause}" for one in read.failures)
         raise OrthomosaicError(f"{mission.path}: no stitched image can be read; {causes}")
     return tuple(read.results.values()), read.failures
+
+
+Source = tuple[tuple[Path, ...], tuple[str, ...], tuple[str, ...]]
+"""Files of an image, bands of its colour, and its marks."""
+
+
+def _stitched(mission: Mission, number: int, image: VirtualImage) -> Source:
+    pan = mission.level2(number) / "pan.tif"
+    check_tiff(pan, width_px=image.width_px, height_px=image.height_px)
+    described, bands = read_description(pan), _bands(mission, number)
+    marks = tuple(mark for mark in MARKS if described.get(mark) is True)
+    return (pan, *([pan.with_name("rgbn.tif")] if bands else [])), bands, marks
+
+
+def _photograph(mission: Mission, number: int, head: Cone) -> Source:
+    check_photograph(mission, number, head)
+    return (source_of(mission, number),), BANDS, ("uncalibrated",)
 
 
 def _bands(mission: Mission, number: int) -> tuple[str, ...]:

@@ -121,7 +121,9 @@ def _bands(block: OrthoBlock, images: Sequence[str]) -> tuple[tuple[str, ...], l
     bands, left_out = ["pan"], []
     for band in wanted:
         absent = [image.name for image in block.images if band not in image.colour]
-        if absent:
+        if absent and block.head is not None:
+            left_out.append(f"{band}: photographs have none")
+        elif absent:
             left_out.append(
                 f"{band}: {len(absent)} of {len(block.images)} images have none at Level-2, "
                 f"{absent[0]} the first; process them again"

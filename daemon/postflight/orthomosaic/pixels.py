@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from daemon.mission.store.level0 import read_description, read_tiff_rows
 from daemon.postflight.orthomosaic.inputs import OrthoBlock, OrthoImage
+from daemon.postflight.orthomosaic.photographs import photograph_pixels
 from processing.image.pansharpening import pansharpened
 
 Array = NDArray[Any]
@@ -41,6 +42,10 @@ def image_pixels(
     """
     size = block.image
     c, r, width, height = window or (0, 0, size.width_px, size.height_px)
+    if block.head is not None:
+        return photograph_pixels(
+            block.mission, image.exposure, block.head, tuple(bands), (c, r, width, height)
+        )
     folder = block.mission.level2(image.exposure)
 
     def pan_rows(first: int, count: int) -> Array:

@@ -6,15 +6,19 @@ larger original.
 
 from __future__ import annotations
 
+import csv
 import json
+import math
 import struct
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+import rasterio
 from typer.testing import CliRunner
 
+from benchmarks.orthomosaic import owners
 from daemon.cli import app
 from daemon.orientation.local_frame import LocalFrame
 from daemon.postflight.importers.exif_tags import (
@@ -26,6 +30,9 @@ from daemon.postflight.importers.exif_tags import (
 )
 from daemon.postflight.triangulation.ground_control import read_gcp_list
 from daemon.postflight.triangulation.triangulation import TriangulationError
+from processing.geometry.rotation import rotation_matrix
+from processing.pipelines.perspective import raw_of_perspective
+from processing.rig import load_rig
 
 RUN = CliRunner()
 SENECA = Path(__file__).parents[4] / "shared" / "data" / "aerial" / "seneca"
@@ -146,6 +153,61 @@ def test_photographs_are_triangulated_without_attitudes(triangulated) -> None:
     assert len([row for row in rows if row.startswith("0000")]) == len(USED)
     again = RUN.invoke(app, ["adjust", str(folder), "--json"])
     assert json.loads(again.stdout)["sigma0"] == pytest.approx(report["sigma0"], rel=0.1)
+
+
+def test_an_orthomosaic_of_photographs_shows_their_pixels_where_they_are(triangulated) -> None:
+    """Random pixels are projected into their photograph, and its file is read there."""
+    mission, _ = triangulated
+    options = ["--no-level", "--bits", "16", "--threads", "1", "--json"]
+    done = RUN.invoke(app, ["orthomosaic", str(mission), *options])
+    assert done.exit_code == 0, f"{done.output} {done.exception}"
+    report = json.loads(done.stdout)
+    assert report["images_used"] == len(USED) and report["uncalibrated"]
+    assert set(report["files"]) == {"pan-16.tif", "rgb-16.tif"}
+    assert report["left_out"] == ["nir: photographs have none"]
+    out = Path(report["folder"])
+    with rasterio.open(out / "rgb-16.tif") as raster:
+        mosaic = raster.read() / 256.0
+    owner = owners(out, report)
+    head = load_rig(mission / "export/triangulation/photographs/adjusted-rig.toml").cones[0]
+    lines = (mission / "export/triangulation/photographs/exterior.csv").read_text().splitlines()
+    rows = list(csv.DictReader(line for line in lines if line[0] != "#"))
+    random = np.random.default_rng(2)
+    seen, there = [], []
+    for row in rows:
+        number = int(row["image"][:6])
+        at = np.argwhere((owner == number) & (mosaic[0] > 0))
+        at = at[random.integers(0, len(at), 300)]
+        first = np.array(report["first_pixel_m"])
+        ground = np.column_stack([
+            first + at[:, ::-1] * [report["gsd_m"], -report["gsd_m"]],
+            np.full(len(at), report["ground"]["height_m"]),
+        ])  # fmt: skip
+        angles = (math.radians(float(row[f"{a}_deg"])) for a in ("omega", "phi", "kappa"))
+        centre = np.array([float(row[f"{a}_m"]) for a in ("east", "north", "height")])
+        u, v, w = rotation_matrix(*angles).T @ (ground - centre).T
+        f_px = head.lens.f_mm / (head.sensors[0].pitch_um * 1e-3)
+        height, width = WIDTH * 3 // 4, WIDTH
+        ideal = np.column_stack([
+            (width - 1) / 2 - f_px * u / w, (height - 1) / 2 + f_px * v / w,
+        ])  # fmt: skip
+        raw = raw_of_perspective(head, {}, ideal).astype(np.float32)
+        file = next((mission / f"L0/{number:06d}").glob("*.jpg"))
+        pixels = cv2.imread(str(file))[..., ::-1].astype(np.float32)
+        there.append(cv2.remap(pixels, raw[None], None, cv2.INTER_LINEAR)[0])
+        seen.append(mosaic[:, at[:, 0], at[:, 1]].T)
+    seen, there = np.concatenate(seen), np.concatenate(there)
+    for band in range(3):
+        assert np.corrcoef(seen[:, band], there[:, band])[0, 1] > 0.97
+    assert np.abs(np.median(seen - there, axis=0)).max() < 1.0
+
+
+def test_photographs_without_a_triangulation_have_no_orthomosaic(photographs, tmp_path) -> None:
+    mission = tmp_path / "mission"
+    RUN.invoke(app, ["import", "photographs", str(photographs), "--out", str(mission)])
+    done = RUN.invoke(app, ["orthomosaic", str(mission)])
+    assert done.exit_code != 0
+    assert "run syntopic triangulate first" in f"{done.output} {done.exception}"
 
 
 def test_unrelated_photographs_are_reported(photographs, tmp_path) -> None:
