@@ -1,6 +1,7 @@
-"""Level-2 whose attempts are noted, with a store that fails some of its calls.
+"""Level-2 whose attempts and commits are noted, with a store that fails some of its calls.
 
-Used by `benchmarks.killed_workers`; worker processes import it by name.
+A read fails before the computation, a write after it, before the manifest. Used by
+`benchmarks.killed_workers`; worker processes import it by name.
 """
 
 from __future__ import annotations
@@ -8,6 +9,7 @@ from __future__ import annotations
 import errno
 import os
 import random
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -35,6 +37,7 @@ class CountedWork:
         return self.work.memory_nbytes
 
     def open(self) -> CountedAction:
+        _count_commits(self)
         return CountedAction(self, self.work.open())
 
 
@@ -51,10 +54,7 @@ class CountedAction:
 
     def __call__(self, task: BatchTask) -> Any:
         mission = self._counted.work.mission
-        for call in ("read", "write"):
-            if random.random() < self._counted.failure_share:
-                os.write(self._attempts, f"{task.number} {call} failed\n".encode())
-                raise OSError(errno.ETIMEDOUT, os.strerror(errno.ETIMEDOUT), str(mission))
+        _fail_sometimes(self._attempts, task.number, "read", self._counted)
         is_there = product_manifests.is_complete(
             Mission(mission, mission.name), task.number, task.payload.key
         )
@@ -62,3 +62,31 @@ class CountedAction:
         os.write(self._attempts, f"{task.number} {line}\n".encode())
         result = self._action(task)
         return {"exposure": result["exposure"]}
+
+
+def _fail_sometimes(attempts: int, number: int, call: str, counted: CountedWork) -> None:
+    if random.random() < counted.failure_share:
+        os.write(attempts, f"{number} {call} failed\n".encode())
+        where = str(counted.work.mission)
+        raise OSError(errno.ETIMEDOUT, os.strerror(errno.ETIMEDOUT), where)
+
+
+def _count_commits(counted: CountedWork) -> None:
+    """Replace the commit of this process by one that is noted and fails sometimes."""
+    real = getattr(product_manifests.commit, "counted", product_manifests.commit)
+    attempts = os.open(counted.attempts, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
+
+    def commit(
+        mission: Mission,
+        number: int,
+        manifest: product_manifests.ProductManifest,
+        provenance: Mapping[str, Any],
+    ) -> bool:
+        _fail_sometimes(attempts, number, "write", counted)
+        is_committed = bool(real(mission, number, manifest, provenance))
+        if is_committed:
+            os.write(attempts, f"{number} committed\n".encode())
+        return is_committed
+
+    commit.counted = real  # type: ignore[attr-defined]  # so that a second work counts once
+    product_manifests.commit = commit
