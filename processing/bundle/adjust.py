@@ -27,6 +27,7 @@ from processing.bundle.free_datum import (
     free_motions,
     in_datum,
     scaled_directions,
+    state_in_datum,
 )
 from processing.bundle.gauss_newton import (
     Progress,
@@ -35,7 +36,12 @@ from processing.bundle.gauss_newton import (
     iterate,
 )
 from processing.bundle.network import Network, NetworkError, validate
-from processing.bundle.normal_equations import ReducedEquations, cofactor_matrix, null_directions
+from processing.bundle.normal_equations import (
+    ReducedEquations,
+    cofactor_matrix,
+    null_directions,
+    reduced_equations,
+)
 from processing.bundle.rank_diagnosis import RankDefect, rank_defects
 from processing.bundle.robust_weights import WeightFunction, robust_exclusions
 from processing.bundle.statistics import ObservationGroup, groups_of, spread_of
@@ -73,6 +79,8 @@ class AdjustmentSettings:
         free_datum: datum of a free network: `unknowns` is the shortest correction of the scaled
             unknowns, the others are inner constraints on object points, stations or all of them.
         datum_names: the points and stations of those inner constraints; empty: all.
+        retained: object points that are not eliminated, so that `cofactor` of the result holds
+            their covariances with each other and with all other unknowns.
     """
 
     max_iterations: int = 50
@@ -87,6 +95,7 @@ class AdjustmentSettings:
     minimum_norm: bool = False
     free_datum: FreeDatum = "unknowns"
     datum_names: tuple[str, ...] = ()
+    retained: tuple[str, ...] = ()
 
     @property
     def is_snooping(self) -> bool:
@@ -205,7 +214,7 @@ def adjust(
         left_out = undetermined_points(active, state, weight) | weak
         if weak.any():
             _refuse_without_points(~undetermined_points(network, began), left_out)
-        layout = layout_of(active, left_out)
+        layout = layout_of(active, left_out, settings.retained)
         run = Run(
             active,
             layout,
@@ -381,6 +390,8 @@ def _figures(
     selection: _Selection,
 ) -> Adjustment:
     layout = run.layout
+    if run.minimum_norm and settings.free_datum != "unknowns":
+        rows, reduced = _moved_to_datum(run, settings, given, rows, reduced)
     run.report_progress("covariances", len(run.history), run.history[-1])
     found: tuple[RankDefect, ...] = ()
     directions, motions = None, None
@@ -417,7 +428,7 @@ def _figures(
         point_cofactor[point] = 0.0
         point_cofactor[point][np.ix_(there, there)] = cofactor[np.ix_(at[there], at[there])]
     redundancy_number = 1.0 - leverage
-    figures = DatumFigures(run.state, cofactor, point_cofactor, influence)
+    figures = DatumFigures(cofactor, point_cofactor, influence)
     if settings.free_datum != "unknowns" and motions is not None and len(motions.combinations):
         figures = in_datum(
             given,
@@ -433,7 +444,7 @@ def _figures(
         network=given,
         layout=layout,
         settings=settings,
-        state=figures.state,
+        state=run.state,
         sigma0=sigma0,
         redundancy=redundancy,
         observations=observations,
@@ -453,6 +464,24 @@ def _figures(
         excluded=selection.excluded,
         rank_defects=found,
     )
+
+
+def _moved_to_datum(
+    run: Run,
+    settings: AdjustmentSettings,
+    given: Network,
+    rows: Equations,
+    reduced: ReducedEquations,
+) -> tuple[Equations, ReducedEquations]:
+    """Move the block to its datum; rows and reduced equations there, for they hold its scale."""
+    motions = free_motions(run.layout, run.state, reduced)
+    if not len(motions.combinations):
+        return rows, reduced
+    run.state = state_in_datum(
+        given, run.layout, run.state, motions, settings.free_datum, settings.datum_names
+    )
+    rows = run.rows(run.state)
+    return rows, reduced_equations(rows, run.layout)
 
 
 def _fixed_distance_points(layout: ParameterLayout) -> Flags:

@@ -130,12 +130,47 @@ def scaled_directions(motions: Motions, reduced: ReducedEquations) -> Array:
 
 @dataclass(frozen=True)
 class DatumFigures:
-    """State and cofactors in a datum; shapes as in `Adjustment`."""
+    """Cofactors in a datum; shapes as in `Adjustment`."""
 
-    state: ParameterValues
     cofactor: Array
     point_cofactor: Array
     influence: Array
+
+
+def state_in_datum(
+    network: Network,
+    layout: ParameterLayout,
+    state: ParameterValues,
+    motions: Motions,
+    datum: FreeDatum,
+    chosen: tuple[str, ...] = (),
+) -> ParameterValues:
+    """Move a free network to another datum.
+
+    Of chosen object points and stations: the sum of squares of the differences between their
+    adjusted and starting coordinates is smallest (inner constraints). `dependent`: one exposure
+    keeps its starting position and attitude, and another one coordinate.
+
+    Args:
+        network: starting values.
+        layout: columns.
+        state: in any datum.
+        motions: what is free.
+        datum: object points, stations, or both; or `dependent`.
+        chosen: names as of `in_datum`.
+
+    Returns:
+        The same network, moved.
+
+    Raises:
+        NetworkError: a name that is not there.
+
+    Source: Meissl (1962); docs/explanation/mathematics/bundle.md#rank-and-free-networks.
+    """
+    if datum == "dependent":
+        return dependent_datum(network, layout, motions, chosen).applied(network, state)
+    points, stations = _members(network, layout, datum, chosen)
+    return _best_fit(network, state, motions, points, stations)
 
 
 def in_datum(
@@ -148,18 +183,16 @@ def in_datum(
     datum: FreeDatum,
     chosen: tuple[str, ...] = (),
 ) -> DatumFigures:
-    """Move a free network to another datum.
+    """Transform cofactors of a free network to another datum.
 
-    Of chosen object points and stations: the sum of squares of the differences between their
-    adjusted and starting coordinates is smallest, and so is the trace of their covariance (inner
-    constraints). `dependent`: one exposure keeps its starting position and attitude, and another
-    one coordinate.
+    Of chosen object points and stations the trace of their covariance is smallest (inner
+    constraints). `dependent`: one exposure and a coordinate of another have no variance.
 
     Args:
         network: starting values.
         layout: columns.
         figures: in any datum.
-        reduced: reduced equations of the adjustment.
+        reduced: reduced equations of the adjustment, at the values of `state_in_datum`.
         row_point: eliminated point of each row, -1 where there is none, shape (m,).
         motions: what is free.
         datum: object points, stations, or both; or `dependent`.
@@ -176,14 +209,11 @@ def in_datum(
     Source: Meissl (1962); docs/explanation/mathematics/bundle.md#rank-and-free-networks.
     """
     if datum == "dependent":
-        dependent = dependent_datum(network, layout, motions, chosen)
         points = np.zeros(0, dtype=np.int64)
-        taken = dependent.columns(layout)
-        state = dependent.applied(network, figures.state)
+        taken = dependent_datum(network, layout, motions, chosen).columns(layout)
     else:
         points, stations = _members(network, layout, datum, chosen)
         taken = layout.station[stations].ravel()
-        state = _best_fit(network, figures.state, motions, points, stations)
     g_points, g_columns = motions.points[points], motions.columns[taken]
     normal = np.einsum("pid,pie->de", g_points, g_points) + g_columns.T @ g_columns
     d = len(normal)
@@ -238,7 +268,7 @@ def in_datum(
     row_t = row_t + np.einsum("mj,mjd->md", b, inside[of])
     influence = figures.influence.copy()
     influence[there] -= np.einsum("mid,md->mi", g[of], row_t)
-    return DatumFigures(state, cofactor, point_cofactor, influence)
+    return DatumFigures(cofactor, point_cofactor, influence)
 
 
 @dataclass(frozen=True)

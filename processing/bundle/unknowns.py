@@ -6,6 +6,7 @@ each other keep theirs. Everything held has column -1.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -113,18 +114,21 @@ def initial_values(network: Network) -> ParameterValues:
     )
 
 
-def layout_of(network: Network, left_out: NDArray[np.bool_]) -> ParameterLayout:
+def layout_of(
+    network: Network, left_out: NDArray[np.bool_], retained: Sequence[str] = ()
+) -> ParameterLayout:
     """Assign a column to every unknown.
 
     Args:
         network: what is estimated and what is held.
         left_out: object points that are not adjusted, shape (points,).
+        retained: names of object points that have columns although no distance ties them.
 
     Returns:
         Columns of stations, attitudes, heads, cameras, lines and tied points, in this order.
 
     Raises:
-        NetworkError: a constraint names what is not there.
+        NetworkError: a constraint or a name of a retained point that is not there.
     """
     columns: list[Unknown] = []
 
@@ -171,7 +175,7 @@ def layout_of(network: Network, left_out: NDArray[np.bool_]) -> ParameterLayout:
     locked = network.points.sigma_m == 0.0
     retained_points = np.full((len(network.points.names), 3), -1, dtype=np.int64)
     ends = np.stack([network.distances.point_a, network.distances.point_b], axis=1)
-    tied = np.unique(ends[~left_out[ends].any(axis=1)])
+    tied = np.union1d(ends[~left_out[ends].any(axis=1)], _retained(network, left_out, retained))
     for point in tied:
         for axis in range(3):
             if not locked[point, axis]:
@@ -247,6 +251,20 @@ def _used(network: Network) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     station[network.gnss.station] = True
     attitude[network.measured_attitudes.attitude] = True
     return station, attitude
+
+
+def _retained(network: Network, left_out: NDArray[np.bool_], names: Sequence[str]) -> Indices:
+    """Object points of those names that are adjusted."""
+    if not names:
+        return np.zeros(0, dtype=np.int64)
+    at = {name: k for k, name in enumerate(network.points.names)}
+    foreign = [n for n in names if n not in at or network.points.at_infinity[at[n]]]
+    if foreign:
+        raise NetworkError(
+            [f"covariances of {', '.join(foreign[:5])}: no object points at finite distance"]
+        )
+    found = np.array(sorted({at[name] for name in names}), dtype=np.int64)
+    return found[~left_out[found]]
 
 
 def _table(rows: list[list[int]], width: int) -> Indices:
