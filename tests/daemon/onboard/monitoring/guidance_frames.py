@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ Ends = Sequence[Sequence[float]]
 
 
 def guidance_frame(
-    lines: dict[str, Ends],
+    lines: Mapping[str, Ends],
     along_share: float,
     *,
     east_deg: float = 0.0,

@@ -314,8 +314,8 @@ def test_no_text_is_missing_from_the_catalogs_and_none_is_clipped(cockpit: Cockp
         assert found["overlapping"] == [], f"{width}: {found['overlapping']}"
         assert not found["scrolls"]
     untranslated = browser.evaluate(
-        "[...document.querySelectorAll('button, h2, dt, label, th, .lamp .name, .label')]"
-        ".filter((one) => !one.closest('#image-panel, #strip, .leaflet-container'))"
+        "[...document.querySelectorAll('button, h2, dt, label, th, .note, .lamp .name, .label')]"
+        ".filter((one) => !one.closest('.leaflet-container, #exposure-now'))"
         ".map((one) => one.textContent.trim()).filter((text) => /[a-z]{3}/i.test(text)"
         " && !text.includes('['))"
     )

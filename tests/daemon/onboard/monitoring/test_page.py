@@ -201,7 +201,7 @@ def test_an_exposure_without_image_shows_none_not_that_of_another(browser: Brows
     browser.click("#rows tr:nth-last-child(4) td:nth-child(2)")
     browser.wait_for("document.querySelector('#quicklook').hidden", WITHIN_S)
     assert browser.text("#image-which") == "4"
-    assert browser.text("#no-image") == "exposure 4: no quick look"
+    assert browser.text("#no-image") == "Exposure 4: no quick look"
     assert browser.text("#histogram-note") == ""
 
 

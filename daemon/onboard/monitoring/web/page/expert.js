@@ -43,6 +43,22 @@ function values({ brief }) {
   return listed.map(([code, shown, state, id]) => [code, shown, shown === "–" ? { state: "absent", limit: state.limit } : state, id]);
 }
 
+const ROWS_SHOWN = 100;
+
+// Figures of the stitching and of time, one row for each of the last exposures.
+function rowOf(one) {
+  const f = one.figures || {};
+  const cells = [one.number, one.mark_sigma_ns == null ? "" : sigma(one.mark_sigma_ns), f.sigma0_px == null ? "" : number(f.sigma0_px, 3),
+    f.tie_points_pp === undefined ? "" : `${f.tie_points_pp}+${f.tie_points_pc ?? 0}`, f.dc_k == null ? "" : number(f.dc_k, 1),
+    f.displaced_sensor || ""];
+  return element("tr", {}, ...cells.map((content) => element("td", { textContent: content })));
+}
+
+function drawRows(flight) {
+  const newest = [...flight.exposures.values()].sort((a, b) => b.number - a.number).slice(0, ROWS_SHOWN);
+  by("expert-rows").replaceChildren(...newest.map(rowOf));
+}
+
 export function start(_root, feed) {
   feed.subscribe((record, isFirstRecord) => {
     const { status = {} } = feed.flight.brief;
@@ -57,6 +73,7 @@ export function start(_root, feed) {
       element("dt", {}, element("span", { textContent: t(`expert.${code}`) }),
         element("span", { id: id || "", textContent: `${MARKS[state] || ""} ${shown}` })),
       element("dd", { textContent: [t(`expert.${code}.text`), limit].filter(Boolean).join(" ") }))));
+    if (isFirstRecord || !record || record.exposures) drawRows(feed.flight);
     if (isFirstRecord || !record || record.history) drawCharts();
     if (!record) fitCharts();
   });

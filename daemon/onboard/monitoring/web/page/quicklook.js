@@ -3,6 +3,9 @@
 import { fetchOk, fetchJson } from "./http.js";
 import { flight } from "./telemetry.js";
 import { t } from "./i18n.js";
+import { angle, number as formatNumber, percent } from "./format.js";
+import { element } from "./dom.js";
+import { verdictText } from "./verdict.js";
 import { isSlow, thumbnailOf } from "./thumbnails.js";
 import { drawHistogram, drawVectors, clearHistogram, listOverlaps } from "./residuals.js";
 
@@ -54,7 +57,7 @@ function quicklookHistogram() {
   }
   const draw = canvas.getContext("2d");
   clearHistogram(canvas);
-  canvas.setAttribute("aria-label", "Histogram of the quick look");
+  canvas.setAttribute("aria-label", t("image.histogram_quicklook"));
   const maximum = Math.max(...counts.flatMap((one) => [...one.slice(1, 255)]), 1);
   ["#d33", "#2a2", "#35e"].forEach((colour, band) => {
     draw.strokeStyle = colour;
@@ -66,37 +69,21 @@ function quicklookHistogram() {
   });
 }
 
-function share(value) {
-  return value == null ? null : `${(100 * value).toFixed(0)} %`;
-}
-
+// Figures of the exposure; those of the stitching are on the page for experts.
 function showFigures(one) {
-  figuresList.replaceChildren();
-  const figures = one.figures || {};
-  const lines = {
-    "tie points": figures.tie_points_pp === undefined ? null : `${figures.tie_points_pp} + ${figures.tie_points_pc ?? 0}`,
-    "σ0": figures.sigma0_px == null ? null : `${figures.sigma0_px.toFixed(3)} px`,
-    "accuracy": figures.stitched_sigma_px == null ? null : `${figures.stitched_sigma_px.toFixed(3)} px`,
-    "displaced": figures.displaced_sensor,
-    "saturated": figures.saturated_fraction == null ? null : `${(100 * figures.saturated_fraction).toFixed(2)} %`,
-    "tilt": figures.tilt_deg == null ? null : `${figures.tilt_deg.toFixed(1)}°`,
-    "overlap": share(figures.forward_overlap),
-    "sidelap": share(figures.sidelap),
-    "crab": figures.crab_deg == null ? null : `${figures.crab_deg.toFixed(1)}°`,
-    "sun": figures.sun_deg == null ? null : `${figures.sun_deg.toFixed(0)}°`,
-    "GSD": figures.gsd_m == null ? null : `${(100 * figures.gsd_m).toFixed(1)} cm`,
-    "pipeline": one.duration_s == null ? null : `${one.duration_s.toFixed(2)} s`,
-  };
-  for (const [name, value] of Object.entries(lines)) {
-    if (value == null) continue;
-    const line = document.createElement("div");
-    const term = document.createElement("dt");
-    const definition = document.createElement("dd");
-    term.textContent = name;
-    definition.textContent = value;
-    line.append(term, definition);
-    figuresList.append(line);
-  }
+  const f = one.figures || {};
+  const listed = [
+    ["expert.saturated", f.saturated_fraction, (value) => percent(value, 2)],
+    ["expert.tilt", f.tilt_deg, (value) => angle(value, 1)],
+    ["expert.overlap", f.forward_overlap, percent],
+    ["image.sidelap", f.sidelap, percent],
+    ["expert.crab", f.crab_deg, (value) => angle(value, 1)],
+    ["expert.sun", f.sun_deg, angle],
+    ["expert.gsd", f.gsd_m, (value) => `${formatNumber(100 * value, 1)} cm`],
+    ["image.pipeline", one.duration_s, (value) => `${formatNumber(value, 2)} s`],
+  ];
+  figuresList.replaceChildren(...listed.filter(([, value]) => value != null).map(([code, value, shown]) =>
+    element("div", {}, element("dt", { textContent: t(code) }), element("dd", { textContent: shown(value) }))));
 }
 
 // On a slow link nothing is fetched while the image is not seen, and only the thumbnail until an exposure is selected.
@@ -106,7 +93,7 @@ async function showImage(number, isFollowing = false) {
   showFigures(one);
   numberLabel.textContent = `${number}`;
   if (one.step !== "processed") {
-    showPlaceholder(`exposure ${number}: ${one.step === "lost" ? "lost, no image" : `${one.step}, no image yet`}`);
+    showPlaceholder(one.step === "lost" ? t("image.lost", { number }) : t("image.waiting", { number, step: verdictText(one.step) }));
     return;
   }
   if (!viewport.clientWidth && isFollowing && isSlow()) return;
@@ -130,8 +117,8 @@ async function showImage(number, isFollowing = false) {
     listOverlaps(vectors, number);
     place();
   };
-  image.onerror = () => showPlaceholder(`exposure ${number}: the quick look cannot be read`);
-  image.alt = `Quick look of exposure ${number}, verdict ${one.verdict}`;
+  image.onerror = () => showPlaceholder(t("image.unreadable", { number }));
+  image.alt = t("image.alt", { number, verdict: verdictText(one.verdict) });
   if (isFollowing && isSlow()) {
     const thumbnail = await thumbnailOf(number);
     if (shownAddress !== address) return;
@@ -142,7 +129,7 @@ async function showImage(number, isFollowing = false) {
   const picture = await (await fetchOk(address))?.blob();
   if (shownAddress !== address) return;
   if (!picture) {
-    showPlaceholder(`exposure ${number}: no quick look`);
+    showPlaceholder(t("image.no_quicklook", { number }));
     // Retry after RETRY_MS, not with every telemetry record.
     shownAddress = address;
     setTimeout(() => { if (shownAddress === address) shownAddress = null; }, RETRY_MS);
@@ -153,7 +140,7 @@ async function showImage(number, isFollowing = false) {
 }
 
 function clearImage() {
-  showPlaceholder("no image yet");
+  showPlaceholder(t("image.none"));
   numberLabel.textContent = "";
   figuresList.replaceChildren();
 }

@@ -1,5 +1,8 @@
 // Residuals of the stitching over the quick look, and the histogram of raw counts.
 
+import { t } from "./i18n.js";
+import { number as formatNumber } from "./format.js";
+
 const FEW = 12;
 const SCREEN_PX = 24;
 const KINDS = ["", "colour", "left-out"];
@@ -10,7 +13,7 @@ const histogramNote = document.getElementById("histogram-note");
 // Residual vectors in pixels of the virtual image, enlarged so that most are visible.
 export function drawVectors(svg, residuals, width, height) {
   svg.replaceChildren();
-  note.textContent = "No residuals for this exposure.";
+  note.textContent = t("image.no_vectors");
   if (!residuals?.vectors?.length) return;
   const reduced = width / residuals.width_px;
   const lengths = residuals.vectors.filter((v) => v[4] !== 2).map((v) => Math.hypot(v[2], v[3])).sort((a, b) => a - b);
@@ -30,26 +33,27 @@ export function drawVectors(svg, residuals, width, height) {
     }).join(""));
     svg.append(path);
   });
-  note.textContent = `${residuals.vectors.length} vectors, ${(enlarge / reduced).toFixed(0)}x enlarged; ` +
-    `90th percentile ${p90Px.toFixed(2)} px. Solid: between PAN sensors, dashed: to colour, thick: rejected.`;
+  note.textContent = t("image.vectors_note", { n: residuals.vectors.length, enlarge: formatNumber(enlarge / reduced),
+    p90: formatNumber(p90Px, 2) });
 }
 
 export function clearHistogram(canvas) {
   canvas.getContext("2d").clearRect(0, 0, canvas.width, canvas.height);
-  canvas.setAttribute("aria-label", "Histogram");
+  canvas.setAttribute("aria-label", t("image.histogram"));
   histogramNote.replaceChildren();
 }
 
 export function listOverlaps(residuals, number) {
   const rows = (residuals?.overlaps || []).map((one) => {
     const row = document.createElement("tr");
-    const few = one.used < FEW ? "▲ few: " : "";
-    const cells = [one.sensors.join("–"), `${few}${one.used}`, one.sought, one.rms_px == null ? "" : one.rms_px.toFixed(3)];
+    const few = one.used < FEW ? `▲ ${t("image.few")}: ` : "";
+    const cells = [one.sensors.join("–"), `${few}${one.used}`, one.sought, one.rms_px == null ? "" : formatNumber(one.rms_px, 3)];
     row.append(...cells.map((text) => Object.assign(document.createElement("td"),
       { textContent: text, className: few ? "usable" : "" })));
     return row;
   });
   document.getElementById("overlaps").replaceChildren(...rows);
+  document.getElementById("overlaps-which").textContent = rows.length ? number : "";
   const drawing = document.getElementById("drawing");
   drawing.hidden = !residuals;
   drawing.href = `/api/v1/exposures/${number}/residuals.svg`;
@@ -74,7 +78,7 @@ export function drawHistogram(canvas, countsOfSensor) {
   }
   const pen = canvas.getContext("2d");
   pen.clearRect(0, 0, canvas.width, canvas.height);
-  histogramNote.replaceChildren("Raw counts, black to full scale. Median / 99th percentile: ");
+  histogramNote.replaceChildren(`${t("image.histogram_note")} `);
   for (const [name, counts] of Object.entries(groups)) {
     const maximum = Math.max(...counts, 1);
     pen.strokeStyle = COLOURS[name];
@@ -86,7 +90,7 @@ export function drawHistogram(canvas, countsOfSensor) {
     const total = counts.reduce((a, b) => a + b, 0) || 1;
     const high = 100 * counts[counts.length - 1] / total;
     const label = `${name} ${(100 * quantile(counts, 0.5)).toFixed(0)} / ${(100 * quantile(counts, 0.99)).toFixed(0)} %` +
-      (high >= 0.5 ? ` ▲ ${high.toFixed(1)} % full` : "");
+      (high >= 0.5 ? ` ▲ ${t("image.full_share", { share: formatNumber(high, 1) })}` : "");
     const swatch = document.createElement("i");
     swatch.className = "swatch";
     swatch.style.borderTop = `${name === "PAN" ? 4 : 2}px solid ${COLOURS[name]}`;
@@ -94,5 +98,5 @@ export function drawHistogram(canvas, countsOfSensor) {
     curveItem.append(swatch, label);
     histogramNote.append(curveItem, " ");
   }
-  canvas.setAttribute("aria-label", `Histogram of raw counts. ${histogramNote.textContent}`);
+  canvas.setAttribute("aria-label", `${t("image.histogram_raw")}. ${histogramNote.textContent}`);
 }

@@ -2,7 +2,6 @@
 
 import { by, element } from "./dom.js";
 import { knows, t } from "./i18n.js";
-import { number, sigma } from "./format.js";
 import { lastWhere } from "./feed.js";
 
 export const MARKS = { good: "●", usable: "▲", refly: "■", lost: "✖" };
@@ -37,18 +36,12 @@ function drawVerdict() {
 }
 
 function row(one, feed) {
-  const figures = one.figures || {};
   const word = one.verdict || one.step;
   const cells = [
     [element("button", { type: "button", textContent: one.number })],
     [`${MARKS[word] || ""} ${verdictText(word)}`, one.verdict || (one.step === "lost" ? "lost" : "")],
     [one.line || ""],
     [one.frames == null ? "" : `${one.frames}`],
-    [one.mark_sigma_ns == null ? "" : sigma(one.mark_sigma_ns)],
-    [figures.sigma0_px == null ? "" : number(figures.sigma0_px, 3)],
-    [figures.tie_points_pp === undefined ? "" : `${figures.tie_points_pp}+${figures.tie_points_pc ?? 0}`],
-    [figures.dc_k == null ? "" : number(figures.dc_k, 1)],
-    [figures.displaced_sensor || ""],
   ];
   const created = element("tr", {}, ...cells.map(([content, style]) => element("td", { className: style || "" }, content)));
   created.addEventListener("click", () => feed.select(one.number));
