@@ -6,6 +6,7 @@ states that the feature is read-only, locked or not available, or that the value
 
 from __future__ import annotations
 
+import contextlib
 import ipaddress
 import itertools
 import struct
@@ -93,6 +94,7 @@ class DescribedRegisters:
         self._writers = self._find_writers()
         self._fixed, self._moving = self._place_registers()
         self._choices = self._find_choices()
+        self._selected = self._place_selected()
 
     def reset(self) -> None:
         """Write what the camera holds at power-on."""
@@ -221,24 +223,39 @@ class DescribedRegisters:
 
     def _find_choices(self) -> dict[str, list[dict[str, int]]]:
         """Values of the controller's selectors under which each command may be given."""
+        return {name: self._choices_of(name) for name in COMMANDS if name in self.nodes.nodes}
+
+    def _choices_of(self, name: str) -> list[dict[str, int]]:
+        """Values of the controller's selectors on which a node depends."""
         held = controller_selectors(self.nodes)
-        found = {}
-        for name in COMMANDS:
-            if name not in self.nodes.nodes:
-                continue
-            waiting, visited = [name], set()
-            while waiting:
-                current = waiting.pop()
-                if current not in visited:
-                    visited.add(current)
-                    waiting += self.nodes.references(current)
-            selectors = sorted(visited & held.keys())
-            choices = itertools.product(*(held[selector] for selector in selectors))
-            found[name] = [
-                dict(zip(selectors, choice, strict=True))
-                for choice in itertools.islice(choices, _CHOICES_MAX)
-            ]
-        return found
+        waiting, visited = [name], set()
+        while waiting:
+            current = waiting.pop()
+            if current not in visited:
+                visited.add(current)
+                waiting += self.nodes.references(current)
+        selectors = sorted(visited & held.keys())
+        choices = itertools.product(*(held[selector] for selector in selectors))
+        return [
+            dict(zip(selectors, choice, strict=True))
+            for choice in itertools.islice(choices, _CHOICES_MAX)
+        ]
+
+    def _place_selected(self) -> set[int]:
+        """Words in which a register lies under some selector that the controller holds."""
+        words: set[int] = set()
+        before = {name: int(self.nodes.number(name)) for name in controller_selectors(self.nodes)}
+        for name in self._moving:
+            choices = self._choices_of(name) if before else [{}]
+            for choice in choices if choices != [{}] else ():
+                for selector, value in choice.items():
+                    self.nodes.set_local(selector, value)
+                with contextlib.suppress(NodeError):
+                    start = self.nodes.address(name) & _ADDRESS_MASK
+                    words.update(range(start >> 2, (start + self.nodes.length(name) + 3) >> 2))
+        for selector, value in before.items():
+            self.nodes.set_local(selector, value)
+        return words
 
     @staticmethod
     def register_of(nodes: NodeMap, name: str) -> str:
@@ -294,6 +311,8 @@ class DescribedRegisters:
             if start < address + length and address < end:
                 found.append(name)
             near = near or abs(start - address) < _SELECTED_RANGE_NBYTES
+        if any(word in self._selected for word in words):
+            found.append("")
         return found or [""] * near
 
     def _find_writers(self) -> dict[str, list[str]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
 from typing import Final
 
 import numpy as np
@@ -31,9 +32,16 @@ class Memory:
 
 
 def first_frame(
-    driver: AravisHead, memory: Memory, *, events: list[DeviceEvent] | None = None
+    driver: AravisHead,
+    memory: Memory,
+    *,
+    events: list[DeviceEvent] | None = None,
+    trigger: Callable[[], None] | None = None,
 ) -> tuple[Frame, NDArray[np.uint16]]:
-    """Run the driver until one triggered frame has come; its events are added to `events`."""
+    """Run the driver until one triggered frame has come; its events are added to `events`.
+
+    `trigger` starts the exposure; the head's own software trigger without.
+    """
     frames: list[tuple[Frame, NDArray[np.uint16]]] = []
     arrived = threading.Event()
 
@@ -53,7 +61,7 @@ def first_frame(
         while driver.state is not LifeCycle.ACTIVE and time.monotonic() < deadline:
             time.sleep(0.01)
         for _ in range(ATTEMPTS):
-            driver.trigger()
+            (trigger or driver.trigger)()
             if arrived.wait(WITHIN_S / ATTEMPTS):
                 break
     finally:

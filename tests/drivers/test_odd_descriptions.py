@@ -20,7 +20,7 @@ from drivers.cameras.aravis.description_cycles import (
     DescriptionUnreadableError,
     features_with_cycles,
 )
-from drivers.contract import DeviceError
+from drivers.contract import DeviceError, FrameStatus
 from sim_hw.gige.described_head import DescribedHead
 from sim_hw.gige.genicam.description_file import DescriptionError, read_description
 from tests.drivers.described_frames import Memory, first_frame
@@ -77,10 +77,10 @@ def zipped(text: str, method: int = zipfile.ZIP_DEFLATED) -> bytes:
 
 @contextmanager
 def head(
-    text: str | bytes, **settings: object
+    text: str | bytes, *, big_endian_words: bool = False, **settings: object
 ) -> Iterator[tuple[DescribedHead, AravisHead, Memory]]:
     data = text.encode("utf-8") if isinstance(text, str) else text
-    emulated = DescribedHead(ADDRESS, data)
+    emulated = DescribedHead(ADDRESS, data, big_endian_words=big_endian_words)
     emulated.start()
     memory = Memory()
     try:
@@ -131,6 +131,59 @@ def test_it_is_armed_and_sends_the_pattern(text: str | bytes) -> None:
             assert emulated.registers.symbolic_or("TriggerSelector", "") == "FrameBurstStart"
 
 
+ABSENT = """
+ <IntReg Name="ReverseInq"><Address>0x10070</Address><Length>4</Length><AccessMode>RO</AccessMode>
+  <pPort>Device</pPort><Endianess>BigEndian</Endianess></IntReg>"""
+
+
+@pytest.mark.parametrize(
+    "where", ['<Boolean Name="ReverseX">', '<IntReg Name="ReverseReg">'], ids=["feature", "value"]
+)
+def test_what_a_head_does_not_implement_is_left_alone(where: str) -> None:
+    """A family shares one description; presence is stated of a feature, or of its register."""
+    condition = f"{where}<pIsImplemented>ReverseInq</pIsImplemented>"
+    text = with_nodes(ABSENT, text=TEXT.replace(where, condition))
+    with head(text) as (emulated, driver, memory):
+        nodes = emulated.registers.nodes
+        nodes.write("ReverseInq", 0)
+        nodes.write("ReverseReg", 1)
+        found = driver.bind()
+        frame, _ = first_frame(driver, memory)
+        assert frame.status is FrameStatus.COMPLETE
+        assert "ReverseX" not in found["features"]
+        assert not emulated.registers.refused
+    with (
+        pytest.raises(DeviceError, match="the head has no feature ReverseX"),
+        head(text, features={"ReverseX": True}) as (emulated, driver, _),
+    ):
+        emulated.registers.nodes.write("ReverseInq", 0)
+        driver.bind()
+
+
+def test_a_trigger_mode_that_only_the_frame_trigger_has_is_found() -> None:
+    of_frames = """<IntSwissKnife Name="OfFrames"><pVariable Name="S">SelectorReg</pVariable>
+     <Formula>S = 1</Formula></IntSwissKnife>"""
+    text = TEXT.replace(
+        '<Enumeration Name="TriggerMode">',
+        '<Enumeration Name="TriggerMode"><pIsImplemented>OfFrames</pIsImplemented>',
+    )
+    with head(with_nodes(of_frames, text=text)) as (emulated, driver, _):
+        emulated.registers.nodes.write("SelectorReg", 0)
+        driver.bind()
+        assert emulated.registers.symbolic_or("TriggerMode", "") == "On"
+
+
+def test_an_exposure_time_in_seconds_is_written_in_seconds() -> None:
+    text = TEXT.replace(
+        '<Float Name="ExposureTimeAbs">', '<Float Name="ExposureTimeAbs"><Unit>s</Unit>'
+    )
+    with head(text, exposure_time_us=2e7) as (emulated, driver, memory):
+        driver.bind()
+        assert emulated.registers.number_or("ExposureTimeAbs", -1) == 20.0
+        frame, _ = first_frame(driver, memory)
+        assert frame.settings["ExposureTime"] == 2e7
+
+
 def test_a_mode_of_exposure_in_the_makers_own_words_is_kept() -> None:
     nodes = """
      <Enumeration Name="ExposureMode"><EnumEntry Name="TriggerWidth"><Value>0</Value></EnumEntry>
@@ -174,7 +227,7 @@ def test_a_mode_of_exposure_in_the_makers_own_words_is_kept() -> None:
             TEXT.replace('"FrameStart"', '"FrameBurstStart"'),
             "FrameStart or AcquisitionBurstFrameCount is needed",
         ),
-        (TEXT.replace('"FrameStart"', '"LineStart"'), "LineStart; FrameStart is needed"),
+        (TEXT.replace('"FrameStart"', '"LineStart"'), "LineStart, where FrameStart is needed"),
         (zipped(TEXT, zipfile.ZIP_BZIP2), "description cannot be read (Invalid Genicam data)"),
         (
             TEXT.replace('ToolTip=""', 'ToolTip="25 \xb0C"').encode("latin-1"),

@@ -85,6 +85,7 @@ class AravisHead(AravisSettings, HeadDevice):
     counted: ClassVar = (
         *("frames", "frames_incomplete", "frames_corrupt", "underruns", "opened", "latches"),
         *("other_senders", "kernel_drops", "ptp_readings", "ptp_not_slave"),
+        "temperatures_implausible",
     )
 
     def __init__(
@@ -109,8 +110,9 @@ class AravisHead(AravisSettings, HeadDevice):
             sink: receives an event while another controller has control.
 
         Returns:
-            Identity, size of a frame, packet size, rate of the link, chunks, sigma of the clock and
-            temperature.
+            Identity, size of a frame, packet size, rate of the link, chunks or the reason why there
+            are none, features that the driver wrote or switched off with the values that the head
+            holds, sigma of the clock and temperature.
 
         Raises:
             DeviceError: it does not answer, refuses a setting, or stays under another's control.
@@ -129,7 +131,8 @@ class AravisHead(AravisSettings, HeadDevice):
             "link": ""
             if session.camera.link_mbps is None
             else f"{session.camera.link_mbps:g} Mbit/s",
-            "chunks": "yes" if session.camera.chunk_parser is not None else "no",
+            "chunks": ", ".join(session.camera.chunks) or f"no: {session.camera.chunks_missing}",
+            "features": session.camera.holds,
             "clock": "no" if session.latch is None else f"+-{session.latch.sigma_ns / 1e3:.0f} us",
             "temperature": ""
             if session.temperature_c is None
@@ -259,7 +262,10 @@ class AravisHead(AravisSettings, HeadDevice):
             self._open()
 
     def _opened_sentence(self) -> str:
-        return f"The head {self.name} is open at {self.address}; nothing to do."
+        """Names what the driver wrote, so that the log of a mission holds it at every opening."""
+        sentence = f"The head {self.name} is open at {self.address}; nothing to do."
+        session = self._session
+        return sentence if session is None else f"{sentence} It holds {session.camera.holds}."
 
     def _event_for(self, error: DeviceError) -> str:
         return "held-by-another" if isinstance(error, ControlDeniedError) else "lost"
@@ -328,7 +334,7 @@ class AravisHead(AravisSettings, HeadDevice):
                     session = _Session(camera, FrameStream(camera, self, self._memory, free))
                     self._session = session
                 session.latch = camera.latch()
-                session.temperature_c = camera.temperature_c()
+                session.temperature_c = camera.thermometer.read_c()
             except ControlDeniedError:
                 raise
             except DeviceError as error:
@@ -449,7 +455,7 @@ class AravisHead(AravisSettings, HeadDevice):
                 raise AravisHeadLostError("it has been restarted")
         with self._control:
             session.latch = session.camera.latch()
-            session.temperature_c = session.camera.temperature_c()
+            session.temperature_c = session.camera.thermometer.read_c()
             if session.camera.ptp is not None:
                 session.ptp = session.camera.ptp.read(self.name, self.clock.mono_ns())
                 self.counters["ptp_readings"] += 1
@@ -462,6 +468,7 @@ class AravisHead(AravisSettings, HeadDevice):
     def _count(self, session: _Session) -> None:
         before, now = self._of_stream, session.stream.counted()
         now["other_senders"] += session.camera.other_senders()
+        now["temperatures_implausible"] += session.camera.thermometer.implausible
         self._of_stream = now
         if now["underruns"] > before["underruns"]:
             self._report_underrun()

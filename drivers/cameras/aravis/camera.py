@@ -1,4 +1,4 @@
-"""One opened GenICam head: its settings, clock, temperature and trigger.
+"""One opened GenICam head: its settings, clock and trigger.
 
 Frames are in `drivers.cameras.aravis.stream`; opening, loss and reconnection are in
 `drivers.cameras.aravis.aravis_head`.
@@ -24,7 +24,9 @@ from drivers.cameras.aravis.feature_access import FeatureError, Features
 from drivers.cameras.aravis.formats import packing_of, packing_problem
 from drivers.cameras.aravis.gvcp import GVCP_PORT, is_ip_address
 from drivers.cameras.aravis.head_configuration import HeadConfiguration
+from drivers.cameras.aravis.head_thermometer import TEMPERATURES, HeadThermometer
 from drivers.cameras.aravis.library import aravis, aravis_error, message_of
+from drivers.cameras.aravis.missing_features import missing_sentence
 from drivers.cameras.aravis.packet_filter import ControlSocketFilter, SocketCapture
 from drivers.cameras.aravis.packet_pacing import link_rate_mbps, write_pacing
 from drivers.cameras.aravis.presets import FeatureValue
@@ -44,8 +46,6 @@ CLOCKS: Final = (
     ("GevTimestampControlLatch", "GevTimestampValue", False),
 )
 ENDLESS_NAMES_MAX: Final = 4
-TEMPERATURES: Final = ("DeviceTemperature", "TemperatureAbs")
-TEMPERATURE_PLACES: Final = ("Sensor", "Sensorboard", "SensorBoard", "Mainboard", "Coreboard")
 
 
 @dataclass(frozen=True)
@@ -88,6 +88,7 @@ class AravisCamera:
         self._who = f"{head} at {settings.address}"
         self.chunk_parser: Any = None
         self.chunks: list[str] = []
+        self.chunks_missing = ""
         self._pacing: Mapping[str, FeatureValue] = {}
         self._control: ControlSocketFilter | None = None
         try:
@@ -134,8 +135,8 @@ class AravisCamera:
             raise DeviceError(f"{self._who}: {refusal}")
         self._tick_hz = self._read_tick_frequency()
         self._latch_features = self._find_latch()
-        self._temperature_feature = self._find_temperature()
-        if settings.temperature_probe and self._temperature_feature is None:
+        self.thermometer = HeadThermometer(self._features)
+        if settings.temperature_probe and self.thermometer.feature is None:
             raise DeviceError(
                 f"{self._who}: the head has no thermometer ({' or '.join(TEMPERATURES)}) for "
                 f"temperature_probe = {settings.temperature_probe!r}; leave that setting out"
@@ -164,9 +165,10 @@ class AravisCamera:
         return bool(camera.is_gv_device() and not camera.get_device().is_controller())
 
     @property
-    def written(self) -> Mapping[str, FeatureValue]:
+    def holds(self) -> str:
         """Every feature the driver wrote or switched off, with the value the head holds."""
-        return self._configuration.written
+        held = {**self._configuration.written, **self._pacing}
+        return ", ".join(f"{name} = {value}" for name, value in held.items())
 
     def start(self) -> None:
         """Start acquisition; raises the error of Aravis."""
@@ -280,15 +282,6 @@ class AravisCamera:
                 best = ClockLatch(clock_ns, before_ns + sigma_ns, sigma_ns)
         return best
 
-    def temperature_c(self) -> float | None:
-        """Read the head's thermometer.
-
-        Returns:
-            Temperature, degC; None if the head has none.
-        """
-        name = self._temperature_feature
-        return None if name is None else self._features.number(name)
-
     def check_alive(self) -> None:
         """Read a feature that is not cached; raises the error of Aravis."""
         name = self._configuration.exposure_feature
@@ -338,6 +331,10 @@ class AravisCamera:
         """Write every setting; returns one sentence per refusal."""
         configuration = self._configuration
         configuration.write()
+        if self._camera.is_gv_device() and self._features.kind("PayloadSize") is None:
+            configuration.missing.append("no feature PayloadSize")
+        if configuration.missing:
+            return [missing_sentence(self._features, configuration.missing)]
         if settings.trigger_source == "action" and not self._camera.is_gv_device():
             configuration.refusals.append(
                 'trigger_source is "action"; only GigE Vision heads accept actions'
@@ -346,7 +343,9 @@ class AravisCamera:
             self._write_packets(settings, configuration.refusals)
         if configuration.refusals:
             return configuration.refusals
-        self.chunks = switch_on_chunks(self._features) if settings.chunks else []
+        self.chunks, self.chunks_missing = (
+            switch_on_chunks(self._features) if settings.chunks else ([], "chunks = false")
+        )
         if self.chunks:
             self.chunk_parser = self._camera.create_chunk_parser()
         return self._read_geometry(settings)
@@ -354,8 +353,6 @@ class AravisCamera:
     def _read_geometry(self, settings: AravisSettings) -> list[str]:
         """Read size and format of a frame; one sentence per reason why they cannot be used."""
         features = self._features
-        if features.kind("PayloadSize") is None and self._camera.is_gv_device():
-            return ["the head has no feature PayloadSize; the size of its frames is unknown"]
         try:
             pixel_format = str(features.get("PixelFormat"))
             code = int(self._camera.get_pixel_format())
@@ -429,16 +426,6 @@ class AravisCamera:
                     self._features.execute(command)
                     return command, value, is_ns
         return None
-
-    def _find_temperature(self) -> str | None:
-        """The feature of the head's temperature; the sensor's where there are several."""
-        features = self._features
-        for selector in ("DeviceTemperatureSelector", "TemperatureSelector"):
-            place = features.first_entry(selector, TEMPERATURE_PLACES)
-            if place is not None:
-                with contextlib.suppress(FeatureError):
-                    features.set(selector, place)
-        return features.first_available(TEMPERATURES)
 
     def _frame_settings(self) -> Mapping[str, float | int | str]:
         features = self._features

@@ -18,35 +18,46 @@ COUNTERS: Final = ("Counter1", "Counter0")
 COUNTER_EVENTS: Final = ("ExposureStart", "FrameStart", "FrameTrigger", "AcquisitionTrigger")
 
 
-def switch_on_chunks(features: Features) -> list[str]:
+def switch_on_chunks(features: Features) -> tuple[list[str], str]:
     """Let the head append what it knows of each frame.
 
     Args:
         features: the head's features.
 
     Returns:
-        Names of the chunks that it appends; empty if it has none.
+        Names of the chunks that it appends, and the reason if there are none.
     """
     if not features.is_available("ChunkModeActive"):
-        return []
+        return [], "the head has no feature ChunkModeActive"
+    if features.kind("ChunkSelector") != "enumeration":
+        # Such a head appends data whose layout its description does not state.
+        return [], "the description has no ChunkSelector, which names the chunks"
     found: list[str] = []
+    refused: list[str] = []
     try:
         features.set("ChunkModeActive", True)
+        offered = features.entries("ChunkSelector")
         for chunk in CHUNKS:
-            if chunk not in features.entries("ChunkSelector"):
+            if chunk not in offered or (
+                chunk == "CounterValue" and not _configure_counter(features)
+            ):
                 continue
-            if chunk == "CounterValue" and not _configure_counter(features):
-                continue
-            with contextlib.suppress(FeatureError):
+            try:
                 features.set("ChunkSelector", chunk)
                 features.set("ChunkEnable", True)
                 found.append(chunk)
-    except FeatureError:
-        found = []
-    if not found:
-        with contextlib.suppress(FeatureError):
-            features.set("ChunkModeActive", False)
-    return found
+            except FeatureError as error:
+                refused.append(str(error))
+        if not found and not refused:
+            has = ", ".join(offered) or "no entry"
+            refused.append(f"ChunkSelector has {has}, of which none is used")
+    except FeatureError as error:
+        found, refused = [], [str(error)]
+    if found:
+        return found, ""
+    with contextlib.suppress(FeatureError):
+        features.set("ChunkModeActive", False)
+    return [], refused[0]
 
 
 def _configure_counter(features: Features) -> bool:

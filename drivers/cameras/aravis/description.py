@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import gc
-import re
-from collections.abc import Iterable
 from typing import Any, Final
 
 from drivers.cameras.aravis.camera_access import endless_features, local_interface, open_camera
 from drivers.cameras.aravis.discovery import FoundHead
 from drivers.cameras.aravis.feature_access import FeatureError, Features
-from drivers.cameras.aravis.formats import widest_format
+from drivers.cameras.aravis.formats import pattern_and_bits, usual_format
 from drivers.cameras.aravis.gvcp import is_ip_address
 from drivers.cameras.aravis.library import OPENING, aravis_error, message_of
 from drivers.cameras.head_description import HeadDescription
 from drivers.contract import DeviceError
 
 FILTER_ARRAYS: Final = {"RG": "RGGB", "BG": "BGGR", "GR": "GRBG", "GB": "GBRG"}
-_FORMAT: Final = re.compile(r"(?:Mono|Bayer(RG|GR|GB|BG))(\d+)\w*")
 
 
 def describe(head: FoundHead) -> HeadDescription:
@@ -54,13 +51,13 @@ def _described(name: str, head: FoundHead, camera: Any) -> HeadDescription:
     if camera.is_gv_device() and not device.is_controller():
         raise DeviceError(f"{name}: another program controls the head; end that program")
     features = Features(device, endless_features(name, device))
-    pixel_format = usual_format(features.entries("PixelFormat"))
+    pixel_format = usual_format(features.entries("PixelFormat"), features.text("PixelColorFilter"))
     if pixel_format is None:
         raise DeviceError(
             f"{name}: it has no pixel format of 8 to 16 bits, monochrome or Bayer; it cannot be "
             "used"
         )
-    pattern, bits = _pattern_and_bits(pixel_format)
+    pattern, bits = pattern_and_bits(pixel_format)
     serial = head.serial or _text(camera.get_device_serial_number())
     width, height = (int(features.get(key)) for key in ("Width", "Height"))
     return HeadDescription(
@@ -83,39 +80,6 @@ def _described(name: str, head: FoundHead, camera: Any) -> HeadDescription:
             "height_px": height,
         },
     )
-
-
-def usual_format(offered: Iterable[str]) -> str | None:
-    """The pixel format to use: Bayer where the head has one pattern in its widest format.
-
-    A colour head also offers monochrome, which it computes from its pixels. A head that offers
-    several patterns is none.
-
-    Args:
-        offered: GenICam names of pixel formats.
-
-    Returns:
-        The name of a format, or None if no format is supported.
-
-    Example:
-        >>> usual_format(["Mono8", "Mono12", "BayerRG8", "BayerRG12"])
-        'BayerRG12'
-    """
-    names = list(offered)
-    widest = widest_format(names)
-    raw = [name for name in names if name.startswith("Bayer") and _FORMAT.fullmatch(name)]
-    raw_widest = widest_format(raw)
-    if widest is None or raw_widest is None:
-        return widest
-    is_colour = len({_pattern_and_bits(name)[0] for name in raw}) == 1
-    has_all_bits = _pattern_and_bits(raw_widest)[1] == _pattern_and_bits(widest)[1]
-    return raw_widest if is_colour and has_all_bits else widest
-
-
-def _pattern_and_bits(pixel_format: str) -> tuple[str, int]:
-    found = _FORMAT.fullmatch(pixel_format)
-    assert found is not None, "widest_format returns no other name"
-    return found[1] or "", int(found[2])
 
 
 def _text(answer: object) -> str:

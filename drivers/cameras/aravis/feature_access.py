@@ -16,6 +16,8 @@ from drivers.cameras.aravis.presets import FeatureValue
 
 RELATIVE_TOLERANCE: Final = 1e-3
 """Between a number that was written and the number read back; heads round to their steps."""
+CHAIN_MAX: Final = 50
+"""Nodes between a feature and its register; a longer chain refers to itself."""
 
 
 class FeatureError(DriverError):
@@ -35,6 +37,7 @@ class Features:
         self.endless = endless
         self._library = aravis()
         self._failed = aravis_error()
+        self._chains: dict[str, tuple[str, ...]] = {}
 
     def kind(self, name: str) -> str | None:
         """The type of a feature's value.
@@ -62,6 +65,24 @@ class Features:
                 return found
         return None
 
+    def is_implemented(self, name: str) -> bool:
+        """Whether this head has the feature; a family of heads shares one description.
+
+        Args:
+            name: GenICam name.
+
+        Returns:
+            False also if the head does not answer.
+        """
+        # Quirk: Aravis reports a feature as available that the head does not implement, and looks
+        # at the feature alone, not at the node that holds its value. Both are checked here.
+        # Upstream: no report known (2026-11-24); arv_gc_feature_node_is_available.
+        chain = self._chain(name)
+        try:
+            return bool(chain) and all(node.is_implemented() for node in chain)
+        except self._failed:
+            return False
+
     def is_available(self, name: str) -> bool:
         """Whether the head has the feature and offers it in its present state.
 
@@ -71,10 +92,10 @@ class Features:
         Returns:
             False also if the head does not answer.
         """
-        if self.kind(name) is None:
+        if not self.is_implemented(name):
             return False
         try:
-            return bool(self._device.is_feature_available(name))
+            return all(node.is_available() for node in self._chain(name))
         except self._failed:
             return False
 
@@ -87,9 +108,8 @@ class Features:
         Returns:
             False also if the head does not answer.
         """
-        node = None if name in self.endless else self._device.get_feature(name)
         try:
-            return bool(node is not None and node.is_locked())
+            return any(node.is_locked() for node in self._chain(name))
         except self._failed:
             return False
 
@@ -106,11 +126,47 @@ class Features:
         # Upstream: AravisProject/aravis#826.
         if not self.is_available(name) or self.is_locked(name):
             return False
+        read_only = self._library.GcAccessMode.RO
         try:
-            mode = self._device.get_feature(name).get_actual_access_mode()
+            return all(node.get_actual_access_mode() != read_only for node in self._chain(name))
         except self._failed:
             return False
-        return bool(mode != self._library.GcAccessMode.RO)
+
+    def unit(self, name: str) -> str:
+        """The unit of a number.
+
+        Args:
+            name: GenICam name.
+
+        Returns:
+            As the description states it; empty if it states none.
+        """
+        node = None if name in self.endless else self._device.get_feature(name)
+        return str(getattr(node, "get_unit", str)() or "").strip()
+
+    def _chain(self, name: str) -> list[Any]:
+        """A feature and the nodes that hold its value; empty if there is no such feature."""
+        if name not in self._chains:
+            chain: list[str] = []
+            following = "" if self.kind(name) is None else name
+            while following and len(chain) < CHAIN_MAX:
+                chain.append(following)
+                following = self._value_node(following)
+            # Names, since a node that outlives its device is invalid.
+            self._chains[name] = tuple(chain)
+        return [self._device.get_feature(link) for link in self._chains[name]]
+
+    def _value_node(self, name: str) -> str:
+        """The node that a node takes its value from; empty for a register or constant."""
+        library = self._library
+        child = self._device.get_feature(name).get_first_child()
+        while child is not None:
+            if isinstance(child, library.GcPropertyNode) and child.get_node_name() == "pValue":
+                found = child.get_linked_node()
+                is_feature = isinstance(found, library.GcFeatureNode)
+                return str(found.get_name()) if is_feature else ""
+            child = child.get_next_sibling()
+        return ""
 
     def entries(self, name: str) -> list[str]:
         """The entries that an enumeration offers in the head's present state.
@@ -254,6 +310,8 @@ class Features:
             self.execute(name)
             return True
         converted = _converted(name, kind, value)
+        if not self.is_implemented(name):
+            raise FeatureError(f"the head has no feature {name}")
         if not self.is_available(name):
             raise FeatureError(f"{name} is not available in the head's present state")
         if self._is_held(name, converted):

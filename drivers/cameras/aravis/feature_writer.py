@@ -15,13 +15,15 @@ class FeatureWriter:
     Args:
         features: the head's features.
 
-    `written` holds what the head holds afterwards, by feature; `refusals` one sentence per error.
+    `written` holds what the head holds afterwards, by feature; `refusals` one sentence per error;
+    `missing` what no head can be used without, such as `no feature Width`.
     """
 
     def __init__(self, features: Features) -> None:
         self.features = features
         self.written: dict[str, FeatureValue] = {}
         self.refusals: list[str] = []
+        self.missing: list[str] = []
 
     def set(self, key: str, name: str, value: FeatureValue, hint: str) -> bool:
         """Write a feature.

@@ -14,14 +14,17 @@ from typing import Final
 
 from drivers.cameras.aravis.feature_access import FeatureError, Features
 from drivers.cameras.aravis.feature_writer import FeatureWriter
-from drivers.cameras.aravis.formats import widest_format
+from drivers.cameras.aravis.formats import usual_format
 from drivers.cameras.aravis.neutral_features import switch_off
 from drivers.cameras.aravis.presets import FeatureValue, preset_features
 from drivers.cameras.aravis.settings import AravisSettings
 from drivers.cameras.aravis.trigger_configuration import write_strobe, write_trigger
 
 EXPOSURE_TIMES: Final = ("ExposureTime", "ExposureTimeAbs", "ExposureTimeRaw", "ExposureValue")
-"""Exposure time in microseconds; the raw one in units of `ExposureTimeBaseAbs`."""
+"""Exposure time, in microseconds unless the head states another unit; the raw one in units of
+`ExposureTimeBaseAbs`."""
+UNITS_US: Final[Mapping[str, float]] = {"s": 1e6, "ms": 1e3, "ns": 1e-3}
+"""Units other than microseconds, in microseconds."""
 PULSE_WIDTH_MODES: Final = ("Off", "TriggerWidth", "TriggerControlled")
 """Modes of exposure in which no exposure time is used."""
 GAINS_DB: Final = ("Gain", "GainAbs")
@@ -47,7 +50,8 @@ class HeadConfiguration:
         features: the head's features.
         settings: the configured settings.
 
-    `written` holds what the head holds afterwards, by feature; `refusals` one sentence per error.
+    `written` holds what the head holds afterwards, by feature; `refusals` one sentence per error;
+    `missing` what no head can be used without.
     """
 
     def __init__(self, features: Features, settings: AravisSettings) -> None:
@@ -55,6 +59,7 @@ class HeadConfiguration:
         self._settings = settings
         self._writer = FeatureWriter(features)
         self.written, self.refusals = self._writer.written, self._writer.refusals
+        self.missing = self._writer.missing
         self.exposure_feature = ""
         self.gain_feature = ""
 
@@ -113,8 +118,10 @@ class HeadConfiguration:
             FeatureError: the head refuses one.
         """
         features = self._features
-        if self.gain_feature in GAINS_DB or gain_db:
-            features.set(self.gain_feature or "Gain", self._gain_value(gain_db))
+        if self.gain_feature in GAINS_DB:
+            features.set(self.gain_feature, self._gain_value(gain_db))
+        elif gain_db:
+            raise FeatureError(self._no_gain_in_db(gain_db))
         if tdi_shifts or features.is_available("TdiShifts"):
             features.set("TdiShifts", tdi_shifts)
         features.set(self.exposure_feature, self._exposure_value(exposure_time_us))
@@ -149,25 +156,21 @@ class HeadConfiguration:
             )
         self.lock(False)
         if features.kind("AcquisitionStart") != "command":
-            self.refusals.append(
-                "the head has no command AcquisitionStart; it cannot be used as a head"
-            )
+            self.missing.append("no command AcquisitionStart")
 
     def _write_format(self) -> None:
         features, wanted = self._features, self._settings.pixel_format
         offered = features.entries("PixelFormat")
         if not offered:
-            self.refusals.append("the head offers no pixel format; it sends no images")
+            self.missing.append("no pixel format")
             return
         if not wanted and not features.is_writable("PixelFormat"):
             offered = [features.text("PixelFormat")]
         if not wanted:
-            wanted = widest_format(offered) or ""
+            wanted = usual_format(offered, features.text("PixelColorFilter")) or ""
         if not wanted:
-            self.refusals.append(
-                "the head has no monochrome or Bayer format of 8 to 16 bits; it has "
-                + ", ".join(offered)
-            )
+            has = ", ".join(name for name in offered if name) or "none that is valid"
+            self.missing.append(f"no monochrome or Bayer format of 8 to 16 bits (it has {has})")
         elif wanted not in offered:
             self.refusals.append(f"pixel_format is {wanted!r}; the head has {', '.join(offered)}")
         else:
@@ -181,7 +184,7 @@ class HeadConfiguration:
             ("height_px", "Height", settings.height_px),
         ):
             if not self._features.is_available(name):
-                self.refusals.append(f"the head has no feature {name}; its frame size is unknown")
+                self.missing.append(f"no feature {name}")
             elif wanted:
                 self._writer.set(key, name, wanted, "give the size of the sensor")
 
@@ -190,10 +193,8 @@ class HeadConfiguration:
         self._write_exposure_mode()
         name = features.first_available(EXPOSURE_TIMES)
         if name is None:
-            self.refusals.append(
-                "the head has no feature that sets its exposure time ("
-                + ", ".join(EXPOSURE_TIMES)
-                + "); it cannot be used"
+            self.missing.append(
+                f"no feature that sets its exposure time (none of {', '.join(EXPOSURE_TIMES)})"
             )
             return
         self.exposure_feature = name
@@ -234,8 +235,10 @@ class HeadConfiguration:
         )
 
     def _exposure_unit_us(self) -> float:
+        # Quirk: the standard has microseconds; some heads state seconds or milliseconds.
+        # Upstream: manual: GenICam description of Hamamatsu C16240-20UP, ExposureTime.
         if self.exposure_feature != "ExposureTimeRaw":
-            return 1.0
+            return UNITS_US.get(self._features.unit(self.exposure_feature), 1.0)
         return self._features.number("ExposureTimeBaseAbs") or 1.0
 
     def _exposure_value(self, exposure_time_us: float) -> FeatureValue:
@@ -269,22 +272,25 @@ class HeadConfiguration:
                 hint += "" if held is None else f"; set gain_db = {held:g}"
             self._writer.set("gain_db", name, self._gain_value(gain_db), hint)
             return
-        if gain_db:
-            raw = (
-                "; it has GainRaw in steps of its own, which features sets"
-                * features.is_available("GainRaw")
-            )
-            self.refusals.append(
-                f"gain_db is {gain_db:g}; the head has no gain in dB{raw}; set gain_db = 0"
-            )
-        elif features.is_available("GainRaw") and "GainRaw" not in self.written:
+        if features.is_available("GainRaw"):
             self.gain_feature = "GainRaw"
+        if gain_db:
+            self.refusals.append(self._no_gain_in_db(gain_db))
+        elif self.gain_feature and "GainRaw" not in self.written:
             if features.is_writable("GainRaw"):
                 self._writer.set(
                     "gain_db", "GainRaw", self._lowest_gain("GainRaw"), "set it in the head"
                 )
             else:
                 self.written["GainRaw"] = features.get("GainRaw")
+
+    def _no_gain_in_db(self, gain_db: float) -> str:
+        raw = (
+            f"; it has {self.gain_feature} in steps of its own, which features sets"
+            if self.gain_feature
+            else ""
+        )
+        return f"gain_db is {gain_db:g}; the head has no gain in dB{raw}; set gain_db = 0"
 
     def _gain_value(self, gain_db: float) -> FeatureValue:
         """The gain in dB, raised to the head's lowest if 0 dB is below it."""

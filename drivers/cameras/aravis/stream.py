@@ -15,6 +15,7 @@ from typing import Any, Final
 
 from drivers.cameras.aravis.byte_order import bits_of, is_swapped
 from drivers.cameras.aravis.camera import AravisCamera
+from drivers.cameras.aravis.head_thermometer import is_plausible
 from drivers.cameras.aravis.library import aravis, aravis_error
 from drivers.cameras.aravis.packet_filter import (
     StreamSocketFilter,
@@ -134,6 +135,7 @@ class FrameStream:
         self._ignored = 0
         self._restarts = 0
         self._chunks_unreadable = 0
+        self._temperatures_implausible = 0
         self._swapped = 0
         if camera.raw.is_gv_device():
             self._filter_to_head(camera, settings)
@@ -180,7 +182,9 @@ class FrameStream:
             chunk_exposure_us=_chunk(parser, "get_float_value", buffer, "ChunkExposureTime"),
             chunk_counter=_chunk(parser, "get_integer_value", buffer, "ChunkCounterValue"),
             chunk_gain=_chunk(parser, "get_float_value", buffer, "ChunkGain"),
-            chunk_temperature_c=_chunk(parser, "get_float_value", buffer, "ChunkTemperature"),
+            chunk_temperature_c=self._plausible(
+                _chunk(parser, "get_float_value", buffer, "ChunkTemperature")
+            ),
             chunk_frame_id=_chunk(parser, "get_integer_value", buffer, "ChunkFrameID"),
         )
         if is_complete and self._parser is not None and not received.has_chunk_data:
@@ -221,9 +225,9 @@ class FrameStream:
         Returns:
             Counts by the names of STATISTIC_NAMES; also `underruns` in frames, `stream_restarts`,
             `chunks_unreadable`, complete frames whose chunk data could not be read,
-            `frames_swapped`, whose bytes came in the other order, `other_senders`, dropped
-            datagrams of other senders, and `kernel_drops`, datagrams of the head that found the
-            buffer of the socket full.
+            `frames_swapped`, whose bytes came in the other order, `temperatures_implausible` in
+            chunk data, `other_senders`, dropped datagrams of other senders, and `kernel_drops`,
+            datagrams of the head that found the buffer of the socket full.
         """
         found: Counter[str] = Counter()
         for theirs, ours in STATISTIC_NAMES.items():
@@ -232,6 +236,7 @@ class FrameStream:
         found["stream_restarts"] = self._restarts
         found["chunks_unreadable"] = self._chunks_unreadable
         found["frames_swapped"] = self._swapped
+        found["temperatures_implausible"] = self._temperatures_implausible
         if self._senders is not None:
             found["other_senders"] = self._senders.poll(found["received_packets"])
             found["kernel_drops"] = self._senders.kernel_drops()
@@ -280,6 +285,13 @@ class FrameStream:
         self._parser = None
         self._buffers.clear()
         self._slots.clear()
+
+    def _plausible(self, temperature_c: float | None) -> float | None:
+        """A temperature in chunk data; None, and counted, if no thermometer has it."""
+        if temperature_c is None or is_plausible(temperature_c):
+            return temperature_c
+        self._temperatures_implausible += 1
+        return None
 
     def _info(self, name: str) -> int:
         return int(self._stream.get_info_uint64_by_name(name))

@@ -18,7 +18,15 @@ BURST_LENGTH: Final = "AcquisitionBurstFrameCount"
 """Frames of a burst; a burst of one frame is a single frame (SFNC 2.7, section 5.5)."""
 ACQUISITION_TRIGGER: Final = "AcquisitionStart"
 TRIGGER_DELAYS: Final = ("TriggerDelay", "TriggerDelayAbs")
-DEBOUNCERS: Final = ("LineDebouncerTime", "LineDebouncerTimeAbs", "LineDebounceTime")
+STROBES: Final = (
+    ("LineSelector", "LineSource", "ExposureActive"),
+    ("SyncOutSelector", "SyncOutSource", "Exposing"),
+)
+"""Selector of an output, its source, and the entry that is active during the exposure."""
+DEBOUNCERS: Final = (
+    *("LineDebouncerTime", "LineDebouncerTimeAbs", "LineDebounceTime"),
+    *("DebounceTime", "InputDebounceTime"),
+)
 
 
 def write_trigger(writer: FeatureWriter, settings: AravisSettings) -> None:
@@ -29,10 +37,8 @@ def write_trigger(writer: FeatureWriter, settings: AravisSettings) -> None:
         settings: the configured settings.
     """
     features = writer.features
-    if not features.is_available("TriggerMode"):
-        writer.refusals.append(
-            "the head has no feature TriggerMode; it cannot be triggered and is of no use here"
-        )
+    if not features.is_implemented("TriggerMode") and not features.entries("TriggerSelector"):
+        writer.missing.append("no feature TriggerMode")
         return
     if settings.trigger_source == "software" and features.kind("TriggerSoftware") != "command":
         writer.refusals.append(
@@ -53,6 +59,11 @@ def write_trigger(writer: FeatureWriter, settings: AravisSettings) -> None:
     hint = "choose one that the head has"
     if frame_trigger is not None:
         writer.set("trigger_source", "TriggerSelector", frame_trigger, hint)
+    # A head may have a mode for some of its triggers only.
+    if not features.is_available("TriggerMode"):
+        of = f" for its trigger {frame_trigger}" if frame_trigger is not None else ""
+        writer.missing.append(f"no feature TriggerMode{of}")
+        return
     with contextlib.suppress(FeatureError):
         features.set("TriggerMode", "Off")
     key, source = {
@@ -100,9 +111,9 @@ def _frame_trigger(writer: FeatureWriter, selectors: list[str]) -> str | None:
         return BURST_TRIGGER if is_single else None
     if selectors:
         missing = f" or {BURST_LENGTH}" if BURST_TRIGGER in selectors else ""
-        writer.refusals.append(
-            "the head has no trigger for single frames (TriggerSelector has "
-            f"{', '.join(selectors)}; FrameStart{missing} is needed)"
+        writer.missing.append(
+            f"no trigger for single frames (TriggerSelector has {', '.join(selectors)}, where "
+            f"FrameStart{missing} is needed)"
         )
     return None
 
@@ -172,11 +183,16 @@ def write_strobe(writer: FeatureWriter, settings: AravisSettings) -> None:
     if not line:
         return
     features = writer.features
-    if not features.entries("LineSelector"):
-        writer.refusals.append(f"strobe_line is {line!r}; the head has no LineSelector")
+    # Quirk: Allied Vision heads before Alvium have outputs of their own names.
+    # Upstream: manual: GenICam description of Mako G-125B, SyncOutSelector.
+    selector, source, value = next(
+        (names for names in STROBES if features.entries(names[0])), STROBES[0]
+    )
+    if not features.entries(selector):
+        writer.refusals.append(f"strobe_line is {line!r}; the head has no {selector}")
         return
-    hint = "the head has " + ", ".join(features.entries("LineSelector"))
-    writer.set("strobe_line", "LineSelector", line, hint)
-    if "Output" in features.entries("LineMode"):
+    hint = "the head has " + ", ".join(features.entries(selector))
+    writer.set("strobe_line", selector, line, hint)
+    if selector == "LineSelector" and "Output" in features.entries("LineMode"):
         writer.set("strobe_line", "LineMode", "Output", "choose a line that is an output")
-    writer.set("strobe_line", "LineSource", "ExposureActive", "choose another line")
+    writer.set("strobe_line", source, value, "choose another line")

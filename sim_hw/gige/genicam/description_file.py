@@ -17,6 +17,8 @@ from xml.etree import ElementTree
 from sim_hw import SimulatorError
 
 _CONTAINERS = frozenset({"Group", "RegisterDescription"})
+_ADDRESS_FORMULAS = frozenset({"IntSwissKnife", "SwissKnife"})
+"""Inside a register, these are parts of its address."""
 _BIT_PROPERTIES = frozenset({"Bit", "LSB", "MSB", "Sign"})
 _DESCRIPTION_MAX_NBYTES = 64 << 20
 _UTF_16_MARKS = (b"\xff\xfe", b"\xfe\xff")
@@ -155,8 +157,16 @@ def _nodes(parent: ElementTree.Element) -> Iterator[Node]:
             yield from _nodes(element)
         elif kind == "StructReg":
             yield from _struct_entries(element)
+            yield from _address_formulas(element)
         elif element.get("Name"):
             yield _node(kind, element)
+            yield from _address_formulas(element)
+
+
+def _address_formulas(register: ElementTree.Element) -> Iterator[Node]:
+    for element in register:
+        if _tag(element) in _ADDRESS_FORMULAS and element.get("Name"):
+            yield _node(_tag(element), element)
 
 
 def _node(kind: str, element: ElementTree.Element) -> Node:
@@ -168,8 +178,11 @@ def _properties(element: ElementTree.Element) -> dict[str, tuple[Property, ...]]
     found: dict[str, tuple[Property, ...]] = {}
     for child in element:
         tag = _tag(child)
-        if tag != "EnumEntry":
+        if tag in _ADDRESS_FORMULAS:
+            tag, text = "pAddress", child.get("Name", "")
+        else:
             text = (child.text or "").strip()
+        if tag != "EnumEntry":
             found[tag] = (*found.get(tag, ()), Property(text, dict(child.attrib)))
     return found
 

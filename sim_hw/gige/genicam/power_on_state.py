@@ -7,12 +7,22 @@ their limits are in order, and every enumeration has a valid entry.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from enum import Enum
 
 from sim_hw.gige.genicam.description_file import Node
 from sim_hw.gige.genicam.formula import Number
-from sim_hw.gige.genicam.node_map import INTEGER_REGISTERS, REGISTERS, NodeError, NodeMap
+from sim_hw.gige.genicam.node_map import REGISTERS, NodeError, NodeMap
+from sim_hw.gige.genicam.presence import (
+    leaves_of,
+    number_or,
+    try_write,
+    unlock,
+    value_chain,
+    write_bases,
+    write_presence,
+    write_selected_presence,
+)
 
 VALUED = frozenset(
     {"Integer", "Float", "Enumeration", "Boolean", "Command", "String"}
@@ -29,6 +39,8 @@ class InitialState(Enum):
     """Automatic functions on, as many cameras leave the factory or a viewer."""
     USER_SET = "user-set"
     """Another program has saved its own values: binning, offsets, a test pattern, a trigger."""
+    SPARSE = "sparse"
+    """The simplest camera of the family: only what a triggered frame needs is implemented."""
 
 
 SENSOR_WIDTH_PX, SENSOR_HEIGHT_PX = 640, 480
@@ -112,9 +124,20 @@ _USER_ENTRIES: Mapping[str, tuple[str, ...]] = {
     "TestPattern": ("GreyHorizontalRamp", "HorizontalRamp", "Increasing"),
     "TestImageSelector": ("GreyHorizontalRamp", "Testimage1", "TestImage1", "TestPattern1"),
 }
-_FIRST_BASE, _BASE_STEP = 0x4_0000, 0x400
+_NEEDED = (
+    *("AcquisitionMode", "AcquisitionStart", "AcquisitionStop", "PayloadSize", "PixelFormat"),
+    *("Width", "Height", "WidthMax", "HeightMax", "SensorWidth", "SensorHeight"),
+    *("ExposureMode", "ExposureTime", "ExposureTimeAbs", "ExposureTimeRaw", "ExposureTimeBaseAbs"),
+    *("TriggerSelector", "TriggerMode", "TriggerSource", "TriggerSoftware"),
+    *("AcquisitionBurstFrameCount", "GevSCPSPacketSize"),
+)
+"""What the simplest camera implements, as far as its description has it."""
+_SELECTED = (
+    ("ChunkSelector", ("ChunkEnable",)),
+    ("TriggerSelector", ("TriggerMode", "TriggerSource", "TriggerSoftware", "TriggerDelay")),
+)
+"""Selectors, and features whose presence is stated for each of their entries."""
 _RANGE_MIN = 10
-_TRIALS_MAX = 60
 
 
 def features_of(nodes: NodeMap) -> list[str]:
@@ -166,11 +189,14 @@ def write_power_on_state(nodes: NodeMap, state: InitialState = InitialState.FACT
         state: what the camera holds when it is opened.
     """
     features = [name for name in features_of(nodes) if nodes.nodes[name].kind in VALUED]
+    present = [name for name in _NEEDED if name in nodes.nodes]
+    if state is not InitialState.SPARSE:
+        present = features
     for selector, values in controller_selectors(nodes).items():
         nodes.set_local(selector, values[0])
-    _write_bases(nodes)
-    _write_presence(nodes, features)
-    held = {register for name in features for register in _value_chain(nodes, name)}
+    held = {register for name in features for register in value_chain(nodes, name)}
+    write_bases(nodes)
+    write_presence(nodes, present, held)
     known = [name for name in (*_SIZES, *_UPPER_LIMITS) if name in nodes.nodes]
     for name in dict.fromkeys((*known, *features)):
         if _is_number(nodes.nodes[name]):
@@ -178,119 +204,20 @@ def write_power_on_state(nodes: NodeMap, state: InitialState = InitialState.FACT
             _write_factory_value(nodes, name)
     for name in features:
         _write_factory_value(nodes, name)
+    unlock(nodes, present)
     # Conditions may depend on values that have just been written.
-    _write_presence(nodes, features)
-    _write_chunk_presence(nodes)
+    write_presence(nodes, present, held)
+    for selector, selected in _SELECTED:
+        write_selected_presence(nodes, selector, set(selected) & set(present), held)
     if state is InitialState.AUTOMATIC:
         _write_automatic(nodes, features)
     elif state is InitialState.USER_SET:
         for name, value in _USER_VALUES.items():
             if _is_writable(nodes, name):
-                _try_write(nodes, name, value)
+                try_write(nodes, name, value)
         for name, entries in _USER_ENTRIES.items():
             if _is_writable(nodes, name):
                 _choose_entry(nodes, name, entries)
-
-
-def _write_bases(nodes: NodeMap) -> None:
-    """Give each group of registers whose address is read from the camera a place of its own."""
-    bases: dict[str, None] = {}
-    for node in nodes.nodes.values():
-        if node.kind in REGISTERS:
-            for source in node.texts("pAddress"):
-                if source in nodes.nodes:
-                    bases |= dict.fromkeys(sorted(_leaves(nodes, source)))
-    place = _FIRST_BASE
-    for leaf in bases:
-        if _is_inquiry(nodes, leaf) and not _number_or(nodes, leaf, 0):
-            _try_write(nodes, leaf, place)
-            place += _BASE_STEP
-
-
-def _write_presence(nodes: NodeMap, features: Iterable[str]) -> None:
-    """Let as many features as possible be implemented and available."""
-    conditions = {source for name in features for source in _conditions(nodes, name)}
-    bits = [
-        leaf
-        for leaf in {leaf for condition in conditions for leaf in _leaves(nodes, condition)}
-        if _is_inquiry(nodes, leaf)
-    ]
-    for leaf in sorted(bits):
-        if not _number_or(nodes, leaf, 0):
-            _try_write(nodes, leaf, 1)
-    for condition in sorted(conditions):
-        if not _number_or(nodes, condition, 0):
-            _search_true(nodes, condition)
-
-
-def _write_chunk_presence(nodes: NodeMap) -> None:
-    """Let every chunk be switched on; whether one can be may be stated for each by itself."""
-    selector = nodes.nodes.get("ChunkSelector")
-    if selector is None or "ChunkEnable" not in nodes.nodes:
-        return
-    held = _number_or(nodes, "ChunkSelector", 0)
-    last = list(_value_chain(nodes, "ChunkSelector"))[-1]
-    for value in (*(nodes.entry_value(entry) for entry in selector.entries), held):
-        if nodes.nodes[last].texts("Value"):
-            nodes.set_local(last, value)
-        elif not _try_write(nodes, "ChunkSelector", value):
-            continue
-        _write_presence(nodes, ["ChunkEnable"])
-
-
-def _conditions(nodes: NodeMap, name: str) -> Iterator[str]:
-    """Nodes that decide whether a feature, what it stands for or one of its entries exists."""
-    visited: set[str] = set()
-    while name and name not in visited and name in nodes.nodes:
-        visited.add(name)
-        node = nodes.nodes[name]
-        for part in (node, *node.entries):
-            yield from part.texts("pIsImplemented")
-            yield from part.texts("pIsAvailable")
-        name = node.text("pValue")
-
-
-def _leaves(nodes: NodeMap, name: str) -> set[str]:
-    """Registers on which the value of a node depends."""
-    found, waiting, visited = set(), [name], set()
-    while waiting:
-        current = waiting.pop()
-        if current in visited or current not in nodes.nodes:
-            continue
-        visited.add(current)
-        if nodes.nodes[current].kind in REGISTERS:
-            found.add(current)
-        else:
-            waiting += nodes.references(current)
-    return found
-
-
-def _is_inquiry(nodes: NodeMap, leaf: str) -> bool:
-    """Whether a register only states what the camera has: read-only integers."""
-    node = nodes.nodes[leaf]
-    return node.kind in INTEGER_REGISTERS and node.text("AccessMode") == "RO"
-
-
-def _search_true(nodes: NodeMap, condition: str) -> None:
-    """Try values of the inquiry registers behind a condition until it is true."""
-    trials = 0
-    for leaf in sorted(_leaves(nodes, condition)):
-        if not _is_inquiry(nodes, leaf):
-            continue
-        before = _number_or(nodes, leaf, 0)
-        for value in _candidates(nodes, leaf):
-            trials += 1
-            if trials > _TRIALS_MAX:
-                return
-            if _try_write(nodes, leaf, value) and _number_or(nodes, condition, 0):
-                return
-        _try_write(nodes, leaf, before)
-
-
-def _candidates(nodes: NodeMap, leaf: str) -> list[int]:
-    limits = nodes.limits(leaf)
-    bits = max(1, int(limits.maximum).bit_length())
-    return [int(limits.maximum), 0, *(1 << bit for bit in range(min(bits, 32)))]
 
 
 def _is_number(node: Node) -> bool:
@@ -300,7 +227,7 @@ def _is_number(node: Node) -> bool:
 def _order_limits(nodes: NodeMap, name: str, held: Collection[str]) -> None:
     """Give a feature a range where its limits are registers or formulas of registers."""
     upper = _SIZES.get(name, _UPPER_LIMITS.get(name, _UPPER_LIMIT))
-    for owner in _value_chain(nodes, name):
+    for owner in value_chain(nodes, name):
         for tag, value in (
             ("pInc", 1),
             ("pMin", _LOWER_LIMITS.get(name, 0)),
@@ -329,40 +256,32 @@ def _search_range(nodes: NodeMap, name: str, upper: Number, held: Collection[str
     """
     leaves = sorted(
         leaf
-        for leaf in _leaves(nodes, name)
+        for leaf in leaves_of(nodes, name)
         if nodes.nodes[leaf].kind not in ("StringReg", "Register")
         and (leaf not in held or nodes.nodes[leaf].text("AccessMode") == "RO")
-        and not _number_or(nodes, leaf, 0)
+        and not number_or(nodes, leaf, 0)
     )
     for value in (upper, 1):
         for leaf in leaves:
-            before = _number_or(nodes, leaf, 0)
+            before = number_or(nodes, leaf, 0)
             if _fill_register(nodes, leaf, value) and _has_range(nodes, name):
                 return
             if value == upper:
-                _try_write(nodes, leaf, before)
-
-
-def _value_chain(nodes: NodeMap, name: str) -> Iterator[str]:
-    visited: set[str] = set()
-    while name and name not in visited and name in nodes.nodes:
-        visited.add(name)
-        yield name
-        name = nodes.nodes[name].text("pValue")
+                try_write(nodes, leaf, before)
 
 
 def _fill_register(nodes: NodeMap, source: str, value: Number) -> bool:
     """Write a limit, unless it has a value of its own; whether it was written."""
     if nodes.nodes[source].text("AccessMode") == "RO" and value != 1:
-        if _number_or(nodes, source, 0) > 1:
+        if number_or(nodes, source, 0) > 1:
             return False
-    elif _number_or(nodes, source, 0):
+    elif number_or(nodes, source, 0):
         return False
     try:
         limits = nodes.limits(source)
     except NodeError:
         return False
-    return _try_write(nodes, source, min(value, limits.maximum))
+    return try_write(nodes, source, min(value, limits.maximum))
 
 
 def _write_factory_value(nodes: NodeMap, name: str) -> None:
@@ -385,7 +304,7 @@ def _write_factory_value(nodes: NodeMap, name: str) -> None:
         wanted = limits.minimum
     if limits.minimum <= limits.maximum:
         wanted = min(max(wanted, limits.minimum), limits.maximum)
-    _try_write(nodes, name, wanted)
+    try_write(nodes, name, wanted)
 
 
 def _choose_first_entry(nodes: NodeMap, name: str) -> None:
@@ -400,7 +319,7 @@ def _choose_first_entry(nodes: NodeMap, name: str) -> None:
     ):
         return
     for entry in entries:
-        if nodes.is_implemented(entry) and _try_write(nodes, name, nodes.entry_value(entry)):
+        if nodes.is_implemented(entry) and try_write(nodes, name, nodes.entry_value(entry)):
             return
 
 
@@ -414,7 +333,7 @@ def _choose_entry(nodes: NodeMap, name: str, wanted: Iterable[str]) -> bool:
             if (
                 entry.name == choice
                 and nodes.is_implemented(entry)
-                and _try_write(nodes, name, nodes.entry_value(entry))
+                and try_write(nodes, name, nodes.entry_value(entry))
             ):
                 return True
     return False
@@ -426,7 +345,7 @@ def _write_automatic(nodes: NodeMap, features: Iterable[str]) -> None:
             _choose_entry(nodes, name, _AUTOMATIC_ENTRIES)
     for name in _AUTOMATIC_SWITCHES:
         if _is_writable(nodes, name):
-            _try_write(nodes, name, 1)
+            try_write(nodes, name, 1)
 
 
 def _is_writable(nodes: NodeMap, name: str) -> bool:
@@ -434,20 +353,3 @@ def _is_writable(nodes: NodeMap, name: str) -> bool:
         return nodes.access(name).is_writable
     except NodeError:
         return False
-
-
-def _try_write(nodes: NodeMap, name: str, value: Number) -> bool:
-    if name not in nodes.nodes:
-        return False
-    try:
-        nodes.write(name, value)
-    except (NodeError, OverflowError, ValueError, KeyError, ArithmeticError):
-        return False
-    return True
-
-
-def _number_or(nodes: NodeMap, name: str, default: Number) -> Number:
-    try:
-        return nodes.number(name)
-    except NodeError:
-        return default
