@@ -34,7 +34,8 @@ described in docs/reference/formats.md.
 
 Examples: `syntopic adjust project.toml`,
 `syntopic adjust project.toml --significance 0.05 --out adjusted`,
-`syntopic adjust project.toml --robust --weight-function tukey --reject 4`
+`syntopic adjust project.toml --robust --weight-function tukey --reject 4`,
+`syntopic adjust project.toml --protocol protocol.txt --covariance covariances.npz`
 """
 
 
@@ -79,8 +80,23 @@ def adjust(
             "(default: unknowns)."
         ),
     ] = None,
+    covariance: Annotated[
+        Path | None,
+        typer.Option(help="File for covariances (.npz): of all orientations, and of each point."),
+    ] = None,
+    covariance_point: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Object point whose covariances with all orientations and the other such points "
+            "are in --covariance; repeatable."
+        ),
+    ] = None,
+    protocol: Annotated[
+        Path | None, typer.Option(help="File for the protocol of the adjustment as plain text.")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
+    from daemon.postflight.adjustment.covariance_file import write_covariances
     from daemon.postflight.adjustment.csv_tables import ProjectError
     from daemon.postflight.adjustment.likely_mistakes import (
         SUSPICIOUS_SIGMA0,
@@ -89,6 +105,7 @@ def adjust(
     )
     from daemon.postflight.adjustment.project import read_project
     from daemon.postflight.adjustment.project_writer import write_results
+    from daemon.postflight.adjustment.protocol import write_protocol
     from daemon.postflight.adjustment.summary import print_report, report_of
     from processing.bundle.adjust import adjust as adjusted
     from processing.bundle.initial_values import completed
@@ -100,6 +117,8 @@ def adjust(
         raise ConfigurationError(["--free-datum is of a free network; leave out --no-free-network"])
     if reject is not None and significance is not None:
         raise ConfigurationError(["--reject and --significance both set the limit; give one"])
+    if covariance_point and covariance is None:
+        raise ConfigurationError(["--covariance-point needs --covariance, the file it is for"])
     if out is not None and (out / "project.toml").exists():
         raise ProjectError([f"{out} holds a project already; give another folder"])
     path = project / "project.toml" if project.is_dir() else project
@@ -124,6 +143,7 @@ def adjust(
         settings = replace(settings, minimum_norm=free_network)
     if free_datum is not None:
         settings = replace(settings, minimum_norm=True, free_datum=cast("FreeDatum", free_datum))
+    settings = replace(settings, retained=tuple(covariance_point or ()))
     problems: tuple[str, ...] = ()
     try:
         with Progress(console=Console(stderr=True), transient=True) as progress:
@@ -157,6 +177,10 @@ def adjust(
         report["cautions"] += likely_mistakes(given.network, result.sigma0)
     if out is not None:
         write_results(out, given, result, report)
+    if covariance is not None:
+        write_covariances(covariance, result)
+    if protocol is not None:
+        write_protocol(protocol, result, given.checks, report)
     if as_json:
         typer.echo(json.dumps(report))
     else:

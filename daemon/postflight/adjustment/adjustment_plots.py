@@ -25,6 +25,7 @@ from daemon.postflight.plots import (
 )
 from processing.bundle.adjust import Adjustment
 from processing.bundle.adjustment_results import PointDifferences, ResidualPattern
+from processing.bundle.residual_areas import ResidualAreas
 
 Array = NDArray[np.float64]
 
@@ -108,3 +109,29 @@ def block_svg(
         legend(figure, plot)
 
     return svg_of(draw, (8.0, 1.4 + 7.0 * float(span[1] / size)))
+
+
+def areas_svg(areas: ResidualAreas, title: str) -> str:
+    """Areas of the ground in grey by their root mean square, with the mean residual as vector."""
+    longest = max(float(np.hypot(*areas.mean_mm.T).max(initial=0.0)), 1e-12)
+    low, high = areas.centre_m.min(axis=0), areas.centre_m.max(axis=0)
+    span = high - low + areas.size_m
+    index = np.round((areas.centre_m - low) / areas.size_m).astype(int)
+    shape = index.max(axis=0) + 1
+    image = np.full((shape[1], shape[0]), np.nan)
+    image[index[:, 1], index[:, 0]] = areas.rms_mm * 1e3
+    enlarge = 0.8 * areas.size_m / longest
+    bar_mm = float(10.0 ** np.floor(np.log10(longest)))
+
+    def draw(figure: Figure) -> None:
+        plot = figure.subplots()
+        left, bottom = low - 0.5 * areas.size_m
+        edges = (float(left), float(left + span[0]), float(bottom), float(bottom + span[1]))
+        shown = plot.imshow(image, cmap="Greys", origin="lower", extent=edges, vmin=0.0)
+        figure.colorbar(shown, ax=plot, label="RMS um")
+        lines(plot, areas.centre_m, areas.centre_m + enlarge * areas.mean_mm, VECTOR)
+        plot.set(aspect="equal", xticks=[], yticks=[])
+        plot.set_title(title)
+        scale_bar(plot, bar_mm * enlarge / float(span[0]), f"{bar_mm * 1e3:g} um mean residual")
+
+    return svg_of(draw, (8.0, 1.4 + 6.0 * float(span[1] / span.max())))

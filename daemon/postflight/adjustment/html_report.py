@@ -9,7 +9,12 @@ from typing import Any
 import jinja2
 import numpy as np
 
-from daemon.postflight.adjustment.adjustment_plots import ResidualPanel, block_svg, pattern_svg
+from daemon.postflight.adjustment.adjustment_plots import (
+    ResidualPanel,
+    areas_svg,
+    block_svg,
+    pattern_svg,
+)
 from daemon.postflight.adjustment.project import CheckPoints
 from daemon.terminal.console import visible_value
 from processing.bundle.adjust import Adjustment
@@ -18,9 +23,11 @@ from processing.bundle.adjustment_results import (
     control_residuals,
     systematic_residuals,
 )
+from processing.bundle.residual_areas import residual_areas
 
 _CELLS = (16, 11)
 _MIN_POINTS = 200
+_MIN_AREAS = 4
 
 
 def report_page(result: Adjustment, checks: CheckPoints, report: Mapping[str, Any]) -> str:
@@ -44,6 +51,9 @@ def report_page(result: Adjustment, checks: CheckPoints, report: Mapping[str, An
     if np.isfinite(result.point_cofactor).all(axis=(1, 2)).any():
         against = check_point_differences(result, checks.names, checks.xyz_m, checks.sigma_m)
         drawings.append(block_svg(result, control_residuals(result), against, "From above"))
+    areas = residual_areas(result)
+    if len(areas.count) >= _MIN_AREAS:
+        drawings.append(areas_svg(areas, "Image residuals by area of the ground"))
     loader = jinja2.FileSystemLoader(Path(__file__).parents[1] / "templates")
     environment = jinja2.Environment(
         loader=loader,

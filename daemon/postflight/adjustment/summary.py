@@ -24,7 +24,9 @@ from processing.bundle.adjustment_results import (
     narrow_points,
     parameters_of,
 )
+from processing.bundle.correlations import CORRELATION_LIMIT, high_correlations
 from processing.bundle.data_snooping import names_of
+from processing.bundle.residual_areas import residual_areas
 from processing.bundle.self_calibration import parameter_count
 
 Array = NDArray[np.float64]
@@ -119,6 +121,8 @@ def report_of(
             "rounds": result.rounds,
             "problems": result.problems,
             "reliability": reliability_summary(result),
+            "correlations": _correlations(result),
+            "areas": _areas(result),
             "left_out": [network.points.names[k] for k in np.flatnonzero(result.left_out)],
             "narrow_points": [
                 {"point": name, "angle_deg": angle} for name, angle in narrow_points(result)
@@ -223,6 +227,7 @@ def print_report(console: Console, report: Mapping[str, Any]) -> None:
             + ("not final" if report["problems"] else "none left beyond the limit"),
             highlight=False,
         )
+    _print_wide_correlations(console, report["correlations"])
     _print_reliability(console, report["reliability"])
     if report["left_out"]:
         listed = ", ".join(report["left_out"][:_MAX_LISTED])
@@ -261,6 +266,18 @@ def _print_correlations(console: Console, report: Mapping[str, Any]) -> None:
                 )
 
 
+def _print_wide_correlations(console: Console, correlations: Mapping[str, Any]) -> None:
+    for g in correlations["groups"]:
+        largest = g["largest"][0]
+        console.print(
+            f"{g['count']} correlations beyond {correlations['limit']:g} of {g['first_kind']} and "
+            f"{g['second_kind']}{' of one owner' if g['is_of_one'] else ''}, largest "
+            f"{largest['first']} and {largest['second']}: {largest['value']:.4f}",
+            markup=False,
+            highlight=False,
+        )
+
+
 def _print_reliability(console: Console, reliability: Mapping[str, Any]) -> None:
     tests = f", {reliability['tests']} tests" if reliability["tests"] else ""
     console.print(
@@ -283,6 +300,38 @@ def _print_reliability(console: Console, reliability: Mapping[str, Any]) -> None
             shift,
         )
     console.print(table)
+
+
+def _correlations(result: Adjustment) -> dict[str, Any]:
+    groups = high_correlations(result)
+    return {
+        "limit": CORRELATION_LIMIT,
+        "count": sum(g.count for g in groups),
+        "groups": [
+            {
+                "first_kind": g.first_kind,
+                "second_kind": g.second_kind,
+                "is_of_one": g.is_of_one,
+                "count": g.count,
+                "largest": [
+                    {"first": c.first, "second": c.second, "value": c.value} for c in g.largest
+                ],
+            }
+            for g in groups
+        ],
+    }
+
+
+def _areas(result: Adjustment) -> dict[str, Any]:
+    areas = residual_areas(result)
+    rows = zip(areas.centre_m, areas.count, areas.rms_mm * 1e3, areas.mean_mm * 1e3, strict=True)
+    return {
+        "size_m": areas.size_m,
+        "cells": [
+            {"x_m": x, "y_m": y, "count": n, "rms_um": rms, "mean_x_um": vx, "mean_y_um": vy}
+            for (x, y), n, rms, (vx, vy) in rows
+        ],
+    }
 
 
 def _lines(result: Adjustment) -> list[dict[str, Any]]:

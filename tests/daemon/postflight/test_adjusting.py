@@ -158,7 +158,7 @@ def test_the_command_imports_and_adjusts(tmp_path) -> None:
     assert len((out / "residuals.csv").read_text().splitlines()) == 2074 + 2
     page = (out / "report.html").read_text()
     assert "<strong>sigma0 1.6148</strong>" in page
-    assert page.count("<svg") == 2, "residuals by camera, and the network from above"
+    assert page.count("<svg") == 3, "residuals by camera and by area, and the network from above"
     refused = runner.invoke(app, ["adjust", str(project), "--out", str(out)])
     assert refused.exit_code != 0
 
