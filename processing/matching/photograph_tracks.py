@@ -131,9 +131,14 @@ def _consistent(a_px: Array, b_px: Array, pairs: Indices) -> Indices:
     """Matches that one fundamental matrix explains."""
     if len(pairs) < MATCHES_MIN:
         return pairs[:0]
-    _, inside = cv2.findFundamentalMat(
-        a_px[pairs[:, 0]], b_px[pairs[:, 1]], cv2.USAC_MAGSAC, _EPIPOLAR_PX, _CONFIDENCE, _TRIALS
-    )
+    try:
+        _, inside = cv2.findFundamentalMat(
+            a_px[pairs[:, 0]], b_px[pairs[:, 1]], cv2.USAC_MAGSAC, _EPIPOLAR_PX, _CONFIDENCE,
+            _TRIALS,
+        )  # fmt: skip
+    except cv2.error:
+        # Matches that no model explains end in an assertion (`!model.empty()`) in OpenCV 5.0.
+        return pairs[:0]
     return pairs[:0] if inside is None else pairs[inside.ravel() > 0]
 
 
