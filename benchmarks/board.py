@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from daemon.postflight.calibration.board.report import covariance_of, estimated_parameters
+from daemon.postflight.calibration.head_parameters import covariance_of, estimated_parameters
 from processing.bundle.network import INTERIOR
 from processing.calibration.board.adjustment import BoardCalibration, BoardSettings, calibrate_board
 from processing.calibration.board.views import BoardView

@@ -73,10 +73,10 @@ def board(
         KIND,
         board_report,
         calibrated_rig,
-        covariance_bytes,
         rig_file,
     )
     from daemon.postflight.calibration.calibration_report import calibration_folder, read_previous
+    from daemon.postflight.calibration.head_parameters import covariance_bytes
     from processing.calibration.board.adjustment import BoardSettings, calibrate_board
     from processing.calibration.board.network import FREE
     from processing.matching.calibration_board import parse_board

@@ -17,6 +17,7 @@ from processing.bundle.adjust import Adjustment, AdjustmentSettings, adjust
 from processing.bundle.adjustment_results import image_residuals_mm
 from processing.bundle.network import INTERIOR, NetworkError
 from processing.bundle.rank_diagnosis import RankDefectError
+from processing.calibration.adjusted_heads import with_adjusted_heads
 from processing.calibration.board.network import FREE, board_network, started, with_lens
 from processing.calibration.board.relative_poses import RelativePoses, relative_poses
 from processing.calibration.board.views import (
@@ -25,7 +26,6 @@ from processing.calibration.board.views import (
     ViewPose,
     pose_of,
 )
-from processing.geometry.rotation import omega_phi_kappa, rotation_matrix
 from processing.matching.calibration_board import BoardError, CalibrationBoard
 from processing.rig import Cone, Rig
 
@@ -97,6 +97,16 @@ class BoardCalibration:
         given = result.network.points.xyz_m
         spread = np.diagonal(result.point_cofactor, axis1=1, axis2=2)
         return result.state.points - given, np.sqrt(np.clip(spread, 0.0, None))
+
+    @property
+    def oriented_heads(self) -> tuple[str, ...]:
+        """Heads that are oriented relative to the reference."""
+        return tuple(self.relative.mountings)
+
+    @property
+    def variance_factor(self) -> float:
+        """What cofactors are multiplied with: image noise is scaled already."""
+        return 1.0
 
     @property
     def is_complete(self) -> bool:
@@ -171,7 +181,7 @@ def calibrate_board(
     if settings.board_sigma_mm == 0.0:
         free = replace(settings, board_sigma_mm=SHAPE_SQUARES * board.square_mm)
         _, shape, _ = _converged(ordered, board, retained, poses, relative, free, rounds=3)
-    new = _calibrated(rig, ordered, result, relative, heads[0])
+    new = with_adjusted_heads(rig, ordered, result, relative.mountings, heads[0])
     final = {cone.name: cone for cone in new.cones}
     return BoardCalibration(
         rig=new,
@@ -325,46 +335,3 @@ def _rms_by_view(result: Adjustment, count: int) -> Array:
     image = result.network.image_points.image
     sums = np.bincount(image, weights=squares, minlength=count)
     return np.asarray(np.sqrt(sums / np.bincount(image, minlength=count)))
-
-
-def _calibrated(
-    rig: Rig,
-    cones: Sequence[Cone],
-    result: Adjustment,
-    relative: RelativePoses,
-    reference: str,
-) -> Rig:
-    """The rig with new lenses and mountings, and their standard deviations as far as it holds
-    them."""
-    new = {cone.name: cone for cone in cones}
-    base = rig.cone(reference)
-    base_rotation = rotation_matrix(*base.rotation_rad)
-    for k, head in enumerate(result.network.heads):
-        if head.name not in relative.mountings:
-            continue
-        rotation = base_rotation @ result.state.head_rotation[k]
-        right, forward, up = base_rotation @ result.state.head_offset[k] * 1e3
-        at = base.position_mm
-        omega, phi, kappa = (float(v) for v in omega_phi_kappa(rotation))
-        columns = result.layout.head_rotation[k]
-        spread = math.sqrt(float(np.trace(result.cofactor[np.ix_(columns, columns)])) / 3.0)
-        new[head.name] = replace(
-            new[head.name],
-            rotation_rad=(omega, phi, kappa),
-            position_mm=(at[0] + float(forward), at[1] + float(right), at[2] - float(up)),
-            rotation_sigma_urad=max(round(spread * 1e6, 3), 0.001),
-        )
-    for k, camera in enumerate(result.network.cameras):
-        cone = new[camera.name]
-        sigma = [_sigma(result, k, name) for name in ("dx0", "dy0", "df")]
-        sensor = replace(cone.sensors[0], position_sigma_um=round(1e3 * max(sigma[:2]), 4))
-        ppm = max(round(1e6 * sigma[2] / cone.lens.f_mm, 3), 0.001)
-        new[camera.name] = replace(
-            cone, sensors=(sensor,), lens=replace(cone.lens, f_sigma_ppm=ppm)
-        )
-    return replace(rig, cones=tuple(new.get(cone.name, cone) for cone in rig.cones))
-
-
-def _sigma(result: Adjustment, camera: int, name: str) -> float:
-    column = int(result.layout.interior[camera][INTERIOR.index(name)])
-    return math.sqrt(float(result.cofactor[column, column])) if column >= 0 else 0.0

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
@@ -24,156 +23,22 @@ from daemon.postflight.calibration.calibration_report import (
     correlation_table,
     serial_warnings,
 )
+from daemon.postflight.calibration.head_parameters import (
+    covariance_of,
+    estimated_parameters,
+    parameter_table,
+    quantities_of,
+)
 from daemon.postflight.calibration.laboratory.laboratory_series import part_serials
 from daemon.postflight.calibration.rig_writer import rig_toml
 from daemon.postflight.plots import Curve, chart_svg, histogram_svg, svg_of, vectors_svg
 from processing.bundle.adjustment_results import image_residuals_mm
-from processing.bundle.network import INTERIOR
 from processing.calibration.board.adjustment import BoardCalibration
-from processing.calibration.board.network import LENS_KEYS
-from processing.geometry.rotation import angles_by_rotation_vector, rotation_matrix
-from processing.rig import Cone, Rig
+from processing.rig import Rig
 
 Array = NDArray[np.float64]
 
 KIND: Final = "board"
-_UNITS: Final = {
-    "k1": "mm^-2",
-    "k2": "mm^-4",
-    "k3": "mm^-6",
-    "p1": "mm^-1",
-    "p2": "mm^-1",
-    "b1": "1",
-    "b2": "1",
-}
-
-
-@dataclass(frozen=True)
-class BoardParameter:
-    """One number with its column: its derivative by the column's unknown is `sign`.
-
-    Values are in mm, rad and ones.
-    """
-
-    where: str
-    what: str
-    unit: str
-    value: float
-    before: float
-    column: int
-    sign: float = 1.0
-
-
-def estimated_parameters(found: BoardCalibration) -> list[BoardParameter]:
-    """Lenses, sensor places, and small rotations and offsets of heads, as the rig file has them."""
-    result, rows = found.adjustment, []
-    for k, name in enumerate(found.heads):
-        new, old = found.rig.cone(name), found.before.cone(name)
-        columns = result.layout.interior[k]
-        named = {
-            "dx0": ("x", new.sensors[0].x_mm, old.sensors[0].x_mm + old.lens.dx0_mm, 1.0),
-            "dy0": ("y", new.sensors[0].y_mm, old.sensors[0].y_mm + old.lens.dy0_mm, 1.0),
-            # A larger df is a shorter principal distance.
-            "df": ("f", new.lens.f_mm, _distance(old), -1.0),
-        }
-        for j, parameter in enumerate(INTERIOR):
-            if columns[j] < 0:
-                continue
-            what, value, before, sign = named.get(
-                parameter,
-                (
-                    parameter,
-                    float(getattr(new.lens, LENS_KEYS[parameter])),
-                    float(getattr(old.lens, LENS_KEYS[parameter])),
-                    1.0,
-                ),
-            )
-            unit = _UNITS.get(parameter, "mm")
-            rows.append(BoardParameter(name, what, unit, value, before, int(columns[j]), sign))
-    for k, head in enumerate(result.network.heads):
-        if head.name not in found.relative.mountings:
-            continue
-        new, old = found.rig.cone(head.name), found.before.cone(head.name)
-        for axis, what in enumerate(("omega", "phi", "kappa")):
-            rows.append(
-                BoardParameter(
-                    head.name,
-                    what,
-                    "rad",
-                    new.rotation_rad[axis],
-                    old.rotation_rad[axis],
-                    int(result.layout.head_rotation[k, axis]),
-                )
-            )
-        # Offsets are in the axes of the reference camera: right, forward, up.
-        for axis, (what, place, sign) in enumerate(
-            (("right", 1, 1e3), ("forward", 0, 1e3), ("down", 2, -1e3))
-        ):
-            rows.append(
-                BoardParameter(
-                    head.name,
-                    what,
-                    "mm",
-                    new.position_mm[place],
-                    old.position_mm[place],
-                    int(result.layout.head_offset[k, axis]),
-                    sign,
-                )
-            )
-    return rows
-
-
-def _distance(cone: Cone) -> float:
-    return cone.lens.f_mm / (1.0 + cone.lens.df_mm / cone.lens.f_mm)
-
-
-def covariance_of(found: BoardCalibration, rows: Sequence[BoardParameter]) -> Array:
-    """Covariance (n, n), in mm, rad and ones; rotations are small ones about the head's axes.
-
-    Offsets are along the axes of the reference camera.
-    """
-    columns = np.array([r.column for r in rows])
-    sign = np.array([r.sign for r in rows])
-    cofactor = found.adjustment.cofactor[np.ix_(columns, columns)]
-    return np.asarray(cofactor * sign[:, None] * sign)
-
-
-def covariance_bytes(found: BoardCalibration) -> bytes:
-    """`covariance.npz`: names, values and covariance in mm, rad and ones."""
-    rows = estimated_parameters(found)
-    stream = io.BytesIO()
-    np.savez(
-        stream,
-        names=np.array([f"{r.where} {r.what}" for r in rows]),
-        values=np.array([r.value for r in rows]),
-        covariance=covariance_of(found, rows),
-    )
-    return stream.getvalue()
-
-
-def quantities_of(found: BoardCalibration) -> list[Quantity]:
-    """Everything estimated, angles in degrees of omega, phi, kappa."""
-    rows = estimated_parameters(found)
-    covariance = covariance_of(found, rows)
-    sigma = np.sqrt(np.diag(covariance))
-    angles: dict[str, Array] = {}
-    for k, row in enumerate(rows):
-        if row.what == "omega":
-            cone = found.rig.cone(row.where)
-            by = angles_by_rotation_vector("XYZ", rotation_matrix(*cone.rotation_rad))
-            own = by @ covariance[k : k + 3, k : k + 3] @ by.T
-            angles[row.where] = np.sqrt(np.diag(own))
-    quantities = []
-    for row, s in zip(rows, sigma.tolist(), strict=True):
-        if row.unit == "rad":
-            axis = ("omega", "phi", "kappa").index(row.what)
-            degrees = math.degrees(float(angles[row.where][axis]))
-            quantities.append(
-                Quantity(row.where, row.what, "deg", math.degrees(row.value), degrees)
-            )
-        else:
-            quantities.append(Quantity(row.where, row.what, row.unit, row.value, s))
-    return quantities
 
 
 def board_report(
@@ -238,7 +103,7 @@ def board_report(
         verdicts=_verdicts(found, findings, quantities, stays_uncalibrated=stays_uncalibrated),
         warnings=warnings,
         tables=[
-            _parameters(rows, quantities),
+            parameter_table(rows, quantities),
             correlation_table(rows, covariance_of(found, rows)),
             _coverage(findings),
             _focus(findings),
@@ -333,29 +198,6 @@ def rig_file(rig: Rig, found: BoardCalibration, *, date: str, blocking: Sequence
     if not rig.is_calibrated:
         lines += ["The rig is uncalibrated, there is no [calibration]:", *blocking]
     return rig_toml(rig, remark="\n".join(lines))
-
-
-def _parameters(rows: Sequence[BoardParameter], quantities: Sequence[Quantity]) -> ReportTable:
-    def in_unit(row: BoardParameter, value: float) -> float:
-        return math.degrees(value) if row.unit == "rad" else value
-
-    return ReportTable(
-        "Parameters",
-        ("head", "what", "value", "sigma", "unit", "in the rig file"),
-        [
-            (
-                q.where,
-                q.what,
-                float(f"{q.value:.9g}"),
-                float(f"{q.sigma or 0.0:.3g}"),
-                q.unit,
-                float(f"{in_unit(r, r.before):.9g}"),
-            )
-            for r, q in zip(rows, quantities, strict=True)
-        ],
-        "x, y: centre of the sensor about the principal point; f: principal distance; the others "
-        "after Heier et al. (2002), eq. 5.1, ideal from measured.",
-    )
 
 
 def _coverage(findings: BoardFindings) -> ReportTable:
