@@ -13,6 +13,7 @@ import typer
 from daemon.cli import (
     calibrate_board,
     calibrate_boresight,
+    calibrate_flight,
     calibrate_head,
     calibrate_lab,
     calibrate_platform,
@@ -65,6 +66,7 @@ app.command(name="radiometric", help=calibrate_radiometric.HELP)(calibrate_radio
 app.command(name="head", help=calibrate_head.HELP)(calibrate_head.head)
 app.command(name="lab", help=calibrate_lab.HELP)(calibrate_lab.lab)
 app.command(name="board", help=calibrate_board.HELP)(calibrate_board.board)
+app.command(name="flight", help=calibrate_flight.HELP)(calibrate_flight.flight)
 app.command(name="boresight", help=calibrate_boresight.HELP)(calibrate_boresight.boresight)
 app.command(name="rig", help=calibrate_rig.HELP)(calibrate_rig.rig)
 app.command(name="platform", help=calibrate_platform.HELP)(calibrate_platform.platform)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from daemon.initialization.answers import Answers
+
+FLIGHT: Final = "calibrate flight"
+"""`syntopic calibrate flight` with the first flight; `calibrate board` finds the same."""
 
 
 class Assumption(NamedTuple):
@@ -20,9 +23,9 @@ def assumptions(
 ) -> list[Assumption]:
     """All assumptions of the files that are written for these answers."""
     found = [
-        Assumption("calibration", "none: every product is marked", "the first flight"),
-        Assumption("lens distortion", "none", "the first flight"),
-        Assumption("focal length", "as printed on the lens", "the first flight"),
+        Assumption("calibration", "none: every product is marked", FLIGHT),
+        Assumption("lens distortion", "none", FLIGHT),
+        Assumption("focal length", "as printed on the lens", f"{FLIGHT}, at two heights"),
         Assumption("exposure time", "1000 us", "exposure_time_us, or [exposure] control"),
         Assumption("black level, gain", "0 DN, 1 electron per DN", "calibrate radiometric"),
         Assumption("antenna and boresight", "at the camera, level", "[mount], calibrate boresight"),
@@ -33,7 +36,7 @@ def assumptions(
             Assumption(
                 "place and angle of heads",
                 f"{answers.distance_mm:g} mm and {answers.angle_deg:g} degrees apart",
-                "the first flight",
+                FLIGHT,
             ),
         )
     if not has_trigger_unit:

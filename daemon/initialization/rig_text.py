@@ -33,7 +33,7 @@ def rig_text(answers: Answers, *, written_by: str) -> str:
         "that it is",
         "# uncalibrated. Values marked P are provisional: replace them, or calibrate the camera "
         "with its first",
-        "# flight. Every key: docs/reference/rig-file.md",
+        "# flight (syntopic calibrate flight). Every key: docs/reference/rig-file.md",
         "",
         "format = 1",
         f"name = {json.dumps(answers.name)}",

@@ -89,7 +89,7 @@ def calibration(configuration: Configuration, rig: Rig) -> Iterator[CheckResult]
             "calibration",
             "rig",
             f"caution: rig {rig.name} is uncalibrated; no exposure gets a better verdict than "
-            "usable. Calibrate the camera with its first flight",
+            "usable. Calibrate the camera with its first flight: syntopic calibrate flight MISSION",
         )
     if age_days > rig.calibration_valid_days:
         yield failed(

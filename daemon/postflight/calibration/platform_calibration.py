@@ -86,6 +86,11 @@ def read_missions(missions: Sequence[Path]) -> PlatformMissions:
                 skipped.append(record)
             else:
                 records.append(record)
+    if rig is not None and rig.virtual_image is None:
+        raise PlatformCalibrationError(
+            f"{rig.name} has no [virtual_image], and its images are not stitched; use `syntopic "
+            "calibrate flight` for its lenses and the angles of its heads"
+        )
     minimum = MIN_EXPOSURES if rig is None else min_exposures(rig)
     if rig is None or len(records) < minimum:
         raise PlatformCalibrationError(
@@ -209,8 +214,8 @@ def _warnings(
         warnings.append(
             f"{flown.rig.name} is uncalibrated: the angles hold for its nominal lenses, and it "
             "stays "
-            "uncalibrated. Calibrate the lenses (syntopic calibrate board), and process the "
-            "mission again with the new rig file"
+            "uncalibrated. Calibrate the lenses (syntopic calibrate flight, or calibrate board), "
+            "and process the mission again with the new rig file"
         )
     if calibration.missing:
         warnings.append(

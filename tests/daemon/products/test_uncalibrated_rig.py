@@ -120,7 +120,7 @@ def test_no_partial_calibration_makes_an_uncalibrated_rig_calibrated(tmp_path: P
     )
     with pytest.raises(ThermalCalibrationError, match="uncalibrated rig"):
         read_thermal_records([mission.path])
-    with pytest.raises(PlatformCalibrationError, match="0 exposures with a stitching record"):
+    with pytest.raises(PlatformCalibrationError, match=r"no \[virtual_image\].*calibrate flight"):
         read_missions([mission.path])
     angles = PlatformCalibration(cones=(), missing=())
     found = calibrated_rig(UNCALIBRATED, angles, calibration_id="p-1", date="2026-11-24")
@@ -144,6 +144,7 @@ def test_the_check_before_a_flight_warns_and_passes(tmp_path: Path) -> None:
     )
     (result,) = calibration(configuration, UNCALIBRATED)
     assert result.outcome is CheckOutcome.PASS and "uncalibrated" in result.sentence
+    assert "syntopic calibrate flight MISSION" in result.sentence
     assert json.dumps(result.as_json())
 
 

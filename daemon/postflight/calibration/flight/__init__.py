@@ -1,0 +1,1 @@
+"""Calibration of heads from the frames of a flight."""
