@@ -20,7 +20,7 @@ import subprocess
 import sys
 import threading
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from statistics import median
@@ -79,7 +79,8 @@ class Killer(threading.Thread):
 
     def end(self) -> None:
         self.is_ended.set()
-        self.join()
+        if self.is_alive():
+            self.join()
         self.scheduler.kill()
         self.scheduler.wait()
 
@@ -120,15 +121,29 @@ def level2_work(mission: Mission) -> Level2Work:
 
 
 def computed(
-    mission: Mission, executor: BatchExecutor, attempts: Path, failure_share: float
+    mission: Mission,
+    executor: BatchExecutor,
+    attempts: Path,
+    failure_share: float,
+    at_first: Callable[[], None] = lambda: None,
 ) -> tuple[BatchOutcome, float]:
-    """The outcome of a run, and its seconds from the first product to the last."""
+    """The outcome of a run, and its seconds from the first product to the last.
+
+    `at_first` is called after the first product.
+    """
     work = level2_work(mission)
     found = survey(
         work, mission, mission.numbers(), overlaps_of(mission, load_rig(mission.rig_path))
     )
     counted = CountedWork(work, attempts, failure_share)
-    outcome = run_batch(executor, counted, found.pending)
+    begun: list[object] = []
+
+    def progress(counts: object) -> None:
+        if not begun:
+            begun.append(counts)
+            at_first()
+
+    outcome = run_batch(executor, counted, found.pending, progress)
     times = [path.stat().st_mtime for path in mission.path.glob("manifests/L2/*/*.provenance.json")]
     return outcome, max(times) - min(times)
 
@@ -173,7 +188,6 @@ def cluster(folder: Path, workers: int, killer: Killer) -> Iterator[DaskExecutor
         process = subprocess.Popen(command, stdout=log, stderr=log)
     killer.worker_command = process.pid
     wait_for_workers(url, workers)
-    killer.start()
     try:
         yield DaskExecutor(ClusterAddress(url))
     finally:
@@ -211,7 +225,7 @@ def with_kills(pristine: Mission, plain: Mission, options: argparse.Namespace) -
     attempts = options.folder / "killed.txt"
     killer = Killer(0, options.kills, options.scheduler_kills, options.mean_s)
     with cluster(options.folder, options.workers, killer) as executor:
-        outcome, seconds = computed(copy, executor, attempts, STORE_FAILURE_SHARE)
+        outcome, seconds = computed(copy, executor, attempts, STORE_FAILURE_SHARE, killer.start)
     noted = counts_of(attempts)
     again = noted["computed"] - options.exposures
     commits = Counter(
@@ -261,6 +275,7 @@ def main() -> None:
     options.folder.mkdir(parents=True)
     pristine = flown_mission(options.folder / "flown", range(1, options.exposures + 1))
     calm = without_kills(pristine, options.folder, options.rounds, options.workers)
+    print(json.dumps(calm), file=sys.stderr)
     plain = Mission.open(options.folder / "plain-0" / pristine.id)
     killed = with_kills(pristine, plain, options)
     output: dict[str, Any] = {

@@ -174,6 +174,11 @@ class DaskExecutor:
         opening: Any = client.submit(run_on_worker, self._work, None, pure=False)
         try:
             refused = opening.result(timeout=OPEN_TIMEOUT_S)
+        except distributed.KilledWorker as error:
+            raise ClusterError(
+                f"workers of {self._address.url} died while they loaded the work; the last one is "
+                f"{error.last_worker}. See its messages; the kernel may have ended it for memory"
+            ) from error
         except (ImportError, AttributeError, RuntimeError, TimeoutError) as error:
             raise ClusterError(
                 f"the cluster cannot load the code of this command ({error}). Install the same "

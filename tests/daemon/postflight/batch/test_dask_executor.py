@@ -11,6 +11,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
+import distributed
 import pytest
 from typer.testing import CliRunner
 
@@ -100,6 +101,24 @@ def test_a_certificate_of_another_authority_is_refused(
     address = cluster_address(encrypted.url, *authority(tmp_path / "other", "stranger"))
     with pytest.raises(ClusterError, match=r"certificate.*signed by the authority of --tls-ca"):
         DaskExecutor(address).start(ToyWork(tmp_path))
+
+
+@pytest.mark.trust
+@pytest.mark.timeout(120)
+def test_workers_that_die_while_they_load_the_work_are_named(
+    encrypted: ClusterAddress, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Opening:
+        def result(self, timeout: float) -> object:
+            raise distributed.KilledWorker("open", "tcp://a", 3)
+
+    monkeypatch.setattr(distributed.Client, "submit", lambda *_args, **_options: Opening())
+    executor = DaskExecutor(encrypted)
+    try:
+        with pytest.raises(ClusterError, match="died while they loaded the work"):
+            executor.start(ToyWork(tmp_path))
+    finally:
+        executor.close(1.0)
 
 
 def client_with(**packages: str) -> Any:
