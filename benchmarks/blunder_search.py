@@ -3,7 +3,7 @@
 Three blocks: aerial lines with control, images around a building, and the network of the published
 camera calibration in tests/processing/bundle/data. Observations are computed from the adjusted
 values and disturbed with normal errors; 2 % of the image points are displaced by 50 px. `--large`
-takes a building of 180,000 image coordinates alone. `--others` adds GNSS positions, attitudes and
+takes a building of 256,000 image coordinates alone. `--others` adds GNSS positions, attitudes and
 distances, and a blunder of 20 standard deviations to one of 12 control points, GNSS positions,
 attitudes and distances.
 """
@@ -394,7 +394,7 @@ def main() -> None:
     parser.add_argument(
         "--weight-function", choices=("none", "huber", "cauchy", "tukey", "danish"), default="none"
     )
-    parser.add_argument("--large", action="store_true", help="The block of 180,000 coordinates.")
+    parser.add_argument("--large", action="store_true", help="The block of 256,000 coordinates.")
     parser.add_argument("--others", action="store_true", help="Blunders in other observations.")
     options = parser.parse_args()
     robust: WeightFunction = (

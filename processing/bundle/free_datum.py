@@ -23,6 +23,8 @@ FreeDatum = Literal["unknowns", "points", "stations", "all", "dependent"]
 
 _MAX_STEPS: Final = 50
 _STEP_CONVERGED: Final = 1e-14
+_SCALE_SHARE: Final = 1e-3
+"""Of a motion of the block, in m, below which it does not change the scale."""
 
 
 @dataclass(frozen=True)
@@ -363,7 +365,9 @@ def dependent_datum(
                 "exposures are right"
             ]
         )
-    has_scale = bool(np.abs(motions.combinations[:, 6]).max(initial=0.0) > 0.0)
+    size = float(np.sqrt(np.mean((network.stations.position_m - motions.centre) ** 2)))
+    moved = np.abs(motions.combinations) * np.array([1.0, 1.0, 1.0, size, size, size, size])
+    has_scale = bool((moved[:, 6] > _SCALE_SHARE * moved.sum(axis=1)).any())
     station = at[chosen[0]] if chosen else int(np.flatnonzero(free)[0]) if free.any() else -1
     of_image = np.flatnonzero(network.images.station == station)
     attitude = int(network.images.attitude[of_image[0]]) if len(of_image) else -1

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from processing.bundle.adjust import Adjustment, AdjustmentSettings, adjust
-from processing.bundle.network import Network, NetworkError
+from processing.bundle.network import Distances, Network, NetworkError
 from tests.processing.bundle.simulated_networks import aerial
 
 
@@ -158,3 +158,55 @@ def test_the_dependent_datum_is_that_of_held_parameters(free, names) -> None:
 def test_a_dependent_datum_of_names_that_are_no_exposures_is_refused(free) -> None:
     with pytest.raises(NetworkError, match="the names of one or two free exposures are right"):
         in_datum(free, "dependent", ("p3",))
+
+
+@pytest.mark.parametrize("some", [False, True])
+def test_scale_bars_and_self_calibration_with_inner_constraints_on_points(free, some) -> None:
+    """As of industrial targets: scale by bars, datum by all or chosen points, camera free."""
+    ends = np.array([[3, 20], [7, 12]])
+    xyz = free.points.xyz_m
+    bars = Distances(
+        ends[:, 0],
+        ends[:, 1],
+        np.linalg.norm(xyz[ends[:, 0]] - xyz[ends[:, 1]], axis=1),
+        np.full(2, 0.01),
+    )
+    camera = replace(free.cameras[0], free=frozenset({"k1"}))
+    network = replace(free, distances=bars, cameras=(camera,))
+    names = ("p3", "p7", "p12", "p15", "p20") if some else ()
+    result = in_datum(network, "points", names)
+    layout, points = result.layout, list(result.layout.eliminated_points)
+    c = layout.columns
+    design = np.zeros((len(result.equations.misclosure), c + 3 * len(points)))
+    design[:, :c] = result.equations.reduced.toarray()
+    for k, p in enumerate(result.equations.point):
+        if p >= 0:
+            design[k, c + 3 * p : c + 3 * p + 3] = result.equations.point_part[k]
+    scale = np.linalg.norm(design, axis=0)
+    _, values, right = np.linalg.svd(design / scale)
+    # Position and orientation are free; the bars give the scale.
+    assert values[-6] < 1e-9 * values[0] < 1e-3 * values[-7]
+    null = (right[-6:] / scale).T
+    chosen = np.zeros(len(scale), dtype=bool)
+    where = {int(p): c + 3 * at + np.arange(3) for at, p in enumerate(points)}
+    where |= {int(p): layout.retained_points[p] for p in np.unique(ends)}
+    for p, columns in where.items():
+        chosen[columns] = not names or f"p{p}" in names
+    constraint = np.where(chosen[:, None], null, 0.0).T
+    normal, m = design.T @ design, len(scale)
+    bordered = np.zeros((m + 6, m + 6))
+    bordered[:m, :m], bordered[m:, :m], bordered[:m, m:] = normal, constraint, constraint.T
+    unit = np.concatenate([scale, np.linalg.norm(constraint / scale, axis=1)])
+    spread = np.sqrt(np.diag(np.linalg.inv(bordered / unit[:, None] / unit))[:m]) / scale
+    for p, columns in where.items():
+        own = np.sqrt(np.diag(result.point_cofactor[p]))
+        assert own == pytest.approx(spread[columns], rel=1e-4), p
+    # No datum of the same points has a smaller trace.
+    trace = (spread[chosen] ** 2).sum()
+    for other in ("unknowns", "stations", "dependent"):
+        found = in_datum(network, other)
+        of_points = sum(
+            np.trace(found.point_cofactor[p]) for p in where if not names or f"p{p}" in names
+        )
+        assert of_points > trace
+        assert found.sigma0 == pytest.approx(result.sigma0, rel=1e-9)
