@@ -58,7 +58,7 @@ export function listAlarms(feed) {
   const brief = feed.flight.brief;
   const nowNs = brief?.status?.mono_ns;
   const all = [...(brief?.faults || []).map((one) => ofFault(one, nowNs)), ...[...feed.pageAlarms.values()].map(ofPage)];
-  // An alarm of the page says that all others may be old.
+  // An alarm of the page comes first: all others may be old.
   const rank = (one) => [one.untilMs ? 1 : 0, one.isService ? 1 : 0, one.isActive ? 0 : 1, one.isAcknowledged ? 1 : 0, RANK[one.severity] ?? 0];
   return all.map((one) => [rank(one), one])
     .sort(([a], [b]) => a[0] - b[0] || a[1] - b[1] || a[2] - b[2] || a[3] - b[3] || a[4] - b[4]).map(([, one]) => one);

@@ -1,8 +1,8 @@
 // Manual verdict of the selected exposure, next to the computed one, and its retake.
 
-import { fetchJson } from "./http.js";
 import { t } from "./i18n.js";
 import { element } from "./dom.js";
+import { retakeExposures } from "./retakes.js";
 import { verdictOf } from "./strip.js";
 
 export function start(root, feed) {
@@ -27,12 +27,7 @@ export function start(root, feed) {
     if (await feed.command(kind, kind === "withdraw" ? { number: feed.selected } : body)) reason.value = "";
   };
   const retake = async () => {
-    const station = await fetchJson(`/api/v1/plan/stations/${feed.selected}`);
-    if (!station) {
-      state.textContent = t("image.no_station", { number: feed.selected });
-      return;
-    }
-    feed.command("retake", { number: feed.selected, line: station.line, from_m: station.at_m, to_m: station.at_m });
+    await retakeExposures([feed.selected], feed.command);
   };
   const buttons = {
     reject: action("reject", () => decide("reject")),

@@ -4,6 +4,7 @@ import { fetchJson, fetchOk } from "./http.js";
 import { t } from "./i18n.js";
 import { element } from "./dom.js";
 import { drawTile } from "./mvt.js";
+import { startSelection } from "./map_selection.js";
 import { thumbnailOf } from "./thumbnails.js";
 
 const THUMBNAILS_MAX = 60;
@@ -134,6 +135,7 @@ async function placeThumbnails(map, flight) {
 
 export function startLayers(map, feed) {
   const tools = document.getElementById("map-tools");
+  startSelection(map, feed);
   for (const [name, order] of [["ground", 150], ["relief", 180], ["thumbnails", 350]]) {
     map.createPane(name).style.zIndex = order;
     map.getPane(name).style.pointerEvents = "none";

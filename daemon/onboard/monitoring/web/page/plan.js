@@ -16,6 +16,10 @@ let requestedMs = 0;
 let timer = null;
 let retakes = 0;
 let sendCommand = null;
+let gapsFound = null;
+
+// Gaps of the coverage as it was last computed; null before that.
+export const gaps = () => gapsFound;
 
 const areaOf = (one) => one.holes.reduce((sum, gap) => sum + gap.area_m2, 0);
 
@@ -45,16 +49,17 @@ async function updateAdvice() {
   requestedMs = Date.now();
   const advice = await fetchJson("/api/v1/advice");
   if (!advice?.segments) return;
-  const gaps = advice.segments.filter((one) => one.kind === "hole");
+  const found = advice.segments.filter((one) => one.kind === "hole");
   const share = advice.planned_m ? advice.covered_m / advice.planned_m : 0;
   coverageText.textContent = [
     t("lines.covered", { share: percent(share), length: distance(advice.planned_m) }),
-    gaps.length ? t("lines.gaps", { n: gaps.length, ha: number(advice.hole_m2 / 1e4, 2) }) : t("lines.no_gap"),
+    found.length ? t("lines.gaps", { n: found.length, ha: number(advice.hole_m2 / 1e4, 2) }) : t("lines.no_gap"),
     ...advice.notes,
   ].join(". ");
-  rows.replaceChildren(...gaps.map(row));
-  rows.closest(".scroll").hidden = !gaps.length;
-  drawGaps(gaps);
+  rows.replaceChildren(...found.map(row));
+  rows.closest(".scroll").hidden = !found.length;
+  gapsFound = found;
+  drawGaps(found);
 }
 
 // Fetch the plan once per mission. Fetch the coverage after new exposures, at most every REFRESH_MS.
@@ -66,6 +71,7 @@ async function followPlan(hasNewExposures) {
     retakes = wantedRetakes;
     const plan = current && await fetchJson("/api/v1/plan");
     hasPlan = Boolean(plan?.lines);
+    gapsFound = null;
     drawPlan(plan);
     if (hasPlan) updateAdvice();
     return;

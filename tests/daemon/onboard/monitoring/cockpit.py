@@ -1,0 +1,107 @@
+"""A flight that the test leads, seen on the operator's page."""
+
+from __future__ import annotations
+
+import json
+import time
+from typing import Any
+
+import cv2
+import numpy as np
+
+from daemon.onboard.service.messages import ServiceEvent
+from tests.daemon.onboard.monitoring import flight_events
+from tests.daemon.onboard.monitoring.guidance_frames import guidance_frame
+from tests.daemon.onboard.monitoring.test_page import WITHIN_S, Service
+from tests.support.browser import Browser
+
+NOON_GPS_NS = 1_466_078_418_000_000_000
+
+
+class Cockpit:
+    """A service, a browser on its page, and the present state of the flight."""
+
+    def __init__(self, service: Service, browser: Browser) -> None:
+        self.service, self.browser = service, browser
+        self.mono_s = 100.0
+
+    def emit(self, *events: dict[str, Any]) -> None:
+        for event in events:
+            self.mono_s += 0.1
+            stamped = event | {"mono_ns": str(int(self.mono_s * 1e9))}
+            while not self.service.child.try_send(ServiceEvent(stamped)):
+                time.sleep(0.02)
+
+    def status(self, phase: str, triggers: int = 0, left: int = 4120, **further: Any) -> None:
+        status = flight_events.status(phase, triggers, left)
+        position = status["position"] | {
+            "age_s": 0.2,
+            "satellites": 17,
+            "fix": "3d",
+            "height_m": 1395.0,
+        }
+        position["velocity_ned_mps"] = [55.0 if phase == "flying" else 0.0, 0.0, 0.0]
+        # 2026-06-21, 12:00 UTC and later: light until the evening.
+        disk: dict[str, Any] = {"gps_ns": str(NOON_GPS_NS + int(self.mono_s * 1e9))}
+        disk |= {"disk_free_bytes": left * 150_000_000, "exposure_bytes": 150_000_000}
+        disk |= {"disk_seconds": left * 2.4 if triggers else None, "is_disk_low": left < 100}
+        lines = {"flown": [], "current": "A0" if phase == "flying" else None, "next": "A1"}
+        disk |= {"lines": lines, "deviations": 0}
+        self.emit(status | {"position": position, "missing": []} | disk | further)
+
+    def guide(self, east_deg: float | None) -> None:
+        """Send guidance and wait until it is shown; without `east_deg` there is none."""
+        if east_deg is None:
+            return
+        sent = guidance_frame(LINES, 0.4, east_deg=east_deg)
+        while not self.service.child.try_send(ServiceEvent(sent)):
+            time.sleep(0.02)
+        self.until("document.querySelector('#guidance [data-key=line]') !== null")
+        self.until("!document.querySelector('#guidance').classList.contains('stale')")
+
+    def resize(self, width: int, height: int, theme: str = "") -> None:
+        metrics = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 500}
+        self.browser.call("Emulation.setDeviceMetricsOverride", **metrics)
+        self.browser.evaluate(f"document.documentElement.dataset.theme = '{theme}'")
+        self.browser.evaluate(
+            "new Promise((r) => requestAnimationFrame(() => requestAnimationFrame(r)))"
+        )
+
+    def until(self, script: str) -> None:
+        self.browser.wait_for(script, WITHIN_S)
+
+    def touch(self, selector: str, held_s: float = 0.0) -> None:
+        """One touch, where the centre of an element is seen and nothing covers it."""
+        place = self.browser.evaluate(f"centre({json.dumps(selector)})")
+        assert place is not None, f"{selector} is covered or not shown"
+        about = {"x": place[0], "y": place[1], "button": "left", "clickCount": 1}
+        self.browser.call("Input.dispatchMouseEvent", type="mousePressed", **about)
+        time.sleep(held_s)
+        self.browser.call("Input.dispatchMouseEvent", type="mouseReleased", **about)
+
+
+LINES = {
+    f"A{k}": [[15.43 + 0.004 * k, 47.07], [15.43 + 0.004 * k, 47.082]][:: -1 if k % 2 else 1]
+    for k in range(5)
+}
+
+
+def lines() -> dict[str, Any]:
+    features = [
+        {
+            "type": "Feature",
+            "properties": {"id": name, "strip": f"S{name[1:]}"},
+            "geometry": {"type": "LineString", "coordinates": ends},
+        }
+        for name, ends in LINES.items()
+    ]
+    return {"type": "FeatureCollection", "features": features, "specification": {"sun_deg": 20.0}}
+
+
+def picture_of(number: int) -> np.ndarray:
+    """Fields and a road, so that a picture of the page is not noise."""
+    random = np.random.default_rng(number)
+    fields = random.integers((60, 90, 60), (110, 150, 120), (6, 9, 3)).astype(np.uint8)
+    ground = cv2.resize(fields, (900, 600), interpolation=cv2.INTER_NEAREST)
+    cv2.line(ground, (0, 80 + 40 * number), (900, 300), (170, 170, 170), 9)
+    return ground
