@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -14,7 +15,19 @@ from tests.daemon.onboard.monitoring import flight_events
 from tests.daemon.onboard.monitoring.guidance_frames import guidance_frame
 from tests.daemon.onboard.monitoring.test_page import WITHIN_S, Service
 from tests.support.browser import Browser
+from tests.support.npm import npm_package
 
+SIZES = ((1280, 800), (2000, 1200), (390, 844))
+THEMES = ("", "dark")
+MEASURES = Path(__file__).with_name("cockpit_measures.js")
+CONTRAST = 7.0
+"""Of verdict, alarms, lamps and what is left, WCAG 2.2, 1.4.6."""
+DECIDED = {"color-contrast", "label-content-name-mismatch"}
+"""Rules of axe whose incomplete results are decided here: `contrasts` measures the first, where
+axe cannot see through a gradient or an overlap; the second cannot compare a glyph without letters
+with a name."""
+FAULTS = ("outside", "overlapping", "smallTexts", "smallTargets", "clipped", "cut")
+"""What no state of the page may have, by the names of `cockpit_measures.js`."""
 NOON_GPS_NS = 1_466_078_418_000_000_000
 
 
@@ -105,3 +118,17 @@ def picture_of(number: int) -> np.ndarray:
     ground = cv2.resize(fields, (900, 600), interpolation=cv2.INTER_NEAREST)
     cv2.line(ground, (0, 80 + 40 * number), (900, 300), (170, 170, 170), 9)
     return ground
+
+
+def axe(browser: Browser) -> list[Any]:
+    """Violations, and incomplete results that are not decided here."""
+    if not browser.evaluate("typeof axe === 'object'"):
+        browser.call("Page.setBypassCSP", enabled=True)
+        browser.evaluate((npm_package("axe-core") / "axe.min.js").read_text())
+    found = browser.evaluate("axe.run(document, {resultTypes: ['violations', 'incomplete']})")
+    assert found["testEngine"]["name"] == "axe-core"
+    return [
+        (one["id"], [node["html"][:120] for node in one["nodes"]][:4])
+        for one in (*found["violations"], *found["incomplete"])
+        if one in found["violations"] or one["id"] not in DECIDED
+    ]

@@ -71,7 +71,7 @@
     const [a, b] = [luminance(rgb(getComputedStyle(one).color)), luminance(ground(one))].sort((x, y) => y - x);
     return (a + 0.05) / (b + 0.05);
   }
-  const contrasts = () => Object.fromEntries(seen(".verdict .word, .verdict .which, #alarm-bar .what *, .faults li *, .lamp .name, .lamp .value, .g-label, .g-value, #guidance .age, #phase-button, #left dd, #left dt")
+  const contrasts = () => Object.fromEntries(seen(".verdict .word, .verdict .which, #alarm-bar .what *, .faults li *, .lamp .name, .lamp .value, .p-alarm, #aircraft li *, .g-label, .g-value, #guidance .age, #phase-button, #left dd, #left dt")
     .filter((one) => one.textContent.trim()).map((one) => [`${name(one)} ${one.textContent.slice(0, 20)}`, contrast(one)]).sort((a, b) => b[1] - a[1]));
 
   const scrolls = () => document.documentElement.scrollHeight > innerHeight || document.documentElement.scrollWidth > innerWidth || scrollY !== 0;

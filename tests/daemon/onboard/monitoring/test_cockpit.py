@@ -19,21 +19,21 @@ import pytest
 
 from processing.rig import shipped_rigs
 from tests.daemon.onboard.monitoring import flight_events
-from tests.daemon.onboard.monitoring.cockpit import Cockpit, lines, picture_of
+from tests.daemon.onboard.monitoring.cockpit import (
+    CONTRAST,
+    FAULTS,
+    MEASURES,
+    SIZES,
+    THEMES,
+    Cockpit,
+    axe,
+    lines,
+    picture_of,
+)
 from tests.daemon.onboard.monitoring.guidance_frames import aerial_map, vector_map
 from tests.daemon.onboard.monitoring.test_page import WITHIN_S, Service
 from tests.support.browser import Browser, chromium
-from tests.support.npm import npm_package
 
-SIZES = ((1280, 800), (2000, 1200), (390, 844))
-THEMES = ("", "dark")
-MEASURES = Path(__file__).with_name("cockpit_measures.js")
-CONTRAST = 7.0
-"""Of verdict, alarms, lamps and what is left, WCAG 2.2, 1.4.6."""
-DECIDED = {"color-contrast", "label-content-name-mismatch"}
-"""Rules of axe whose incomplete results are decided here: `contrasts` measures the first, where
-axe cannot see through a gradient or an overlap; the second cannot compare a glyph without letters
-with a name."""
 EXPOSURES = ["good", "good", "usable", "good", "good", "refly", "good", "good", "good"]
 
 
@@ -84,10 +84,6 @@ def opened(*devices: str) -> list[dict[str, Any]]:
 HEADS = [f"SU{k:02d}" for k in range(13)]
 
 
-FAULTS = ("outside", "overlapping", "smallTexts", "smallTargets", "clipped", "cut")
-"""What no state of the page may have, by the names of `cockpit_measures.js`."""
-
-
 def check(cockpit: Cockpit, state: str, *, east_deg: float | None = None) -> None:
     """Measure the page at each size and in each theme, and picture it.
 
@@ -111,20 +107,6 @@ def check(cockpit: Cockpit, state: str, *, east_deg: float | None = None) -> Non
         cockpit.guide(east_deg)
         save_picture(browser, f"{state}-{width}")
     cockpit.resize(1280, 800)
-
-
-def axe(browser: Browser) -> list[Any]:
-    """Violations, and incomplete results that are not decided here."""
-    if not browser.evaluate("typeof axe === 'object'"):
-        browser.call("Page.setBypassCSP", enabled=True)
-        browser.evaluate((npm_package("axe-core") / "axe.min.js").read_text())
-    found = browser.evaluate("axe.run(document, {resultTypes: ['violations', 'incomplete']})")
-    assert found["testEngine"]["name"] == "axe-core"
-    return [
-        (one["id"], [node["html"][:120] for node in one["nodes"]][:4])
-        for one in (*found["violations"], *found["incomplete"])
-        if one in found["violations"] or one["id"] not in DECIDED
-    ]
 
 
 def save_picture(browser: Browser, name: str) -> None:
