@@ -160,12 +160,15 @@ SUPPORT: Final = (
         "GigE Vision and USB3 Vision cameras (Basler, FLIR, Allied Vision, Lucid, JAI, ...)",
         (
             Proof("names and order of settings", _DESCRIPTION, "62 cameras' GenICam descriptions"),
-            Proof("stream and control", _PEER, "Aravis 0.8.26"),
+            Proof("stream and control of GigE Vision", _PEER, "Aravis 0.8.26"),
         ),
     ),
     DriverSupport(
         "head", "v4l2", "cameras with a V4L2 driver (MIPI CSI-2, USB)",
-        (Proof("control and stream", _PEER, "the kernel's vivid driver"),),
+        (
+            Proof("control and stream", _PEER, "the kernel's vivid driver"),
+            Proof("a sensor with its pipeline", _PEER, "the kernel's vimc driver"),
+        ),
     ),
     DriverSupport(
         "head", "folder", "frames that were taken before",

@@ -17,6 +17,7 @@ from daemon.initialization.rig_text import rig_text
 from daemon.postflight.calibration.rig_writer import rig_toml
 from processing.rig import Rig, load_rig
 from sim_hw.laboratory import calibration_field
+from sim_hw.world.true_camera import rotation_opk
 from tests.daemon.initialization.heads import head
 
 HEADS = ("left", "right")
@@ -96,5 +97,5 @@ def _compare(
         for what, error in errors.items():
             assert abs(error) < 4.0 * sigma[name, what], (name, what, error)
     turned = truth.master_from_cone(before.cone("right"))
-    found = calibration_field.rotation_opk(rig.cone("right").rotation_rad)
+    found = rotation_opk(rig.cone("right").rotation_rad)
     assert float(np.abs(turned.T @ found - np.eye(3)).max()) < 1e-4
