@@ -3,7 +3,8 @@
 Plants wrong inputs of sizes from 0.5 to 4 times their published detection limit, by seed, processes
 them as `syntopic process` does and holds image and report against the emulator's truth. With
 `--clean` it renders healthy exposures over hard scenes instead and counts false alarms, with
-`--drawn` it draws their adjustments without rendering.
+`--drawn` it draws their adjustments without rendering. It exits with 1 where an error is silent or
+misdescribed, or the stated sigmas are not those of the errors.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import json
 import sys
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, Final
@@ -58,7 +59,7 @@ def main() -> None:
             if given.json
             else clean_summary(found)
         )
-        sys.exit(1 if any(row["alarm"] for row in found) else 0)
+        sys.exit(_reported([*_alarms(found), *interval_failures(found, "healthy")]))
     if given.drawn:
         alarms = false_alarms(given.drawn, given.seed, given.results)
         print(json.dumps({"machine": machine(), "drawn": given.drawn, "alarms": alarms}))
@@ -69,7 +70,85 @@ def main() -> None:
         print(json.dumps({"machine": machine(), "cases": rows}))
     else:
         print(summary(rows))
-    sys.exit(1 if any(row["result"] in ("silent", "misled") for row in rows) else 0)
+    sys.exit(_reported(failures(rows)))
+
+
+def _reported(failed: Sequence[str]) -> int:
+    """Print what failed, one sentence a line; the exit status."""
+    for sentence in failed:
+        print(f"FAILED: {sentence}", file=sys.stderr)
+    return 1 if failed else 0
+
+
+def _alarms(rows: Iterable[Row]) -> list[str]:
+    return [f"{row['number']} {row['scene']}: {row['alarm']}" for row in rows if row["alarm"]]
+
+
+def failures(rows: Sequence[Row]) -> list[str]:
+    """What of a run is not as required, one sentence each.
+
+    Args:
+        rows: outcomes.
+
+    Returns:
+        Silent and misdescribed cases, normalised errors outside of their interval, and a sigma of
+        flagged images that states nothing.
+    """
+    flagged = [row for row in rows if row["flags"]]
+    unflagged = [row for row in rows if not row["flags"]]
+    failed = _wrong(rows) + interval_failures(unflagged, "unflagged")
+    failed += interval_failures(flagged, "flagged", lower=False)
+    pooled = _pooled(flagged)
+    if pooled is not None and not pooled.stated_px <= WIDEST * pooled.true_px:
+        failed.append(
+            f"flagged images state {pooled.stated_px:.3f} px, more than {WIDEST:g} times their "
+            f"true RMS of {pooled.true_px:.3f} px"
+        )
+    return failed
+
+
+def interval_failures(rows: Sequence[Row], label: str, *, lower: bool = True) -> list[str]:
+    """A sentence where normalised errors lie outside of the 99.9 % interval of chi-square.
+
+    Args:
+        rows: outcomes; those without a stitched image do not count.
+        label: of these images.
+        lower: False holds them to the upper limit alone.
+    """
+    pooled = _pooled(rows)
+    if pooled is None or (pooled.mean <= pooled.high and (pooled.mean >= pooled.low or not lower)):
+        return []
+    return [
+        f"{label} images: mean square of normalised errors {pooled.mean:.3f} is outside of "
+        f"{pooled.low:.3f} .. {pooled.high:.3f} (rank {pooled.rank})"
+    ]
+
+
+@dataclass(frozen=True)
+class _Pooled:
+    """Normalised errors of some images with the 99.9 % interval, and RMS errors and sigmas."""
+
+    images: int
+    rank: int
+    mean: float
+    low: float
+    high: float
+    true_px: float
+    stated_px: float
+
+
+def _pooled(rows: Iterable[Row]) -> _Pooled | None:
+    some = [row for row in rows if row["rank"]]
+    if not some:
+        return None
+    rank = sum(row["rank"] for row in some)
+    low, high = (float(chi2.ppf(p, rank)) / rank for p in (0.0005, 0.9995))
+    true_px, stated_px = (
+        float(np.sqrt(np.mean([row[key] ** 2 for row in some])))
+        for key in ("error_px", "stated_px")
+    )
+    mean = sum(row["squares"] for row in some) / rank
+    return _Pooled(len(some), rank, mean, low, high, true_px, stated_px)
 
 
 def results(cases: Sequence[Case], file: Path | None, jobs: int) -> Iterable[Row]:
@@ -129,9 +208,10 @@ def _wrong(rows: Iterable[Row]) -> list[str]:
     return [
         f"{row['result']}: {row['number']} {row['kind']} {row['rig']} {row['description']} "
         f"({row['share']:.2f} of the limit): {row['verdict']} {row['flags']} {row['named']}, "
-        f"error/sigma {row['over_sigma'] or 0:.2f} ({row['error_px'] or 0:.3f} px), band "
-        f"{row['band_px']:.2f} px, radiance {row['radiance']:.1%} of {row['radiance_of']}, "
-        f"detail {row['detail']:.0%}"
+        f"error/sigma {row['over_sigma'] or 0:.2f} ({row['error_px'] or 0:.3f} px), "
+        f"{row['worst_of'] or 'no head'} {row['worst'] or 0:.2f} of {row['worst_limit'] or 0:.2f}, "
+        f"band {row['band_px']:.2f} px, radiance {row['radiance']:.1%} of {row['radiance_of']}, "
+        f"detail {row['detail']:.0%}, blank {row['blank']:.1%} of {row['blank_of'] or 'none'}"
         for row in rows
         if row["result"] in ("silent", "misled")
     ]
@@ -141,19 +221,16 @@ def _sigmas(rows: Sequence[Row]) -> list[str]:
     """Normalised errors of flagged and unflagged images against the 99.9 % points of chi-square."""
     lines = []
     for label, flagged in (("without a flag", False), ("with a flag", True)):
-        some = [r for r in rows if r["rank"] and bool(r["flags"]) == flagged]
-        if not some:
+        some = [r for r in rows if bool(r["flags"]) == flagged]
+        pooled = _pooled(some)
+        if pooled is None:
             continue
-        rank = sum(r["rank"] for r in some)
-        mean = sum(r["squares"] for r in some) / rank
-        low, high = (float(chi2.ppf(p, rank)) / rank for p in (0.0005, 0.9995))
-        true = float(np.sqrt(np.mean([r["error_px"] ** 2 for r in some])))
-        stated = float(np.sqrt(np.mean([r["stated_px"] ** 2 for r in some])))
-        wide = sum(r["stated_px"] > WIDEST * r["error_px"] for r in some)
+        wide = sum(r["stated_px"] > WIDEST * r["error_px"] for r in some if r["rank"])
         lines.append(
-            f"{label}: {len(some)} images, mean square of normalised errors {mean:.3f} "
-            f"(rank {rank}, {low:.3f} .. {high:.3f}); {true:.3f} px true, {stated:.3f} stated; "
-            f"{wide} state more than {WIDEST:g} times their error"
+            f"{label}: {pooled.images} images, mean square of normalised errors {pooled.mean:.3f} "
+            f"(rank {pooled.rank}, {pooled.low:.3f} .. {pooled.high:.3f}); {pooled.true_px:.3f} px "
+            f"true, {pooled.stated_px:.3f} stated; {wide} state more than {WIDEST:g} times their "
+            "error"
         )
     return lines
 

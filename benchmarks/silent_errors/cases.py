@@ -7,15 +7,14 @@ import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.silent_errors.exposures import healthy, remeasured
 from benchmarks.silent_errors.faults import FAULTS
 from benchmarks.silent_errors.limits import LIMITS
-from benchmarks.silent_errors.truth import Found, compare, detail_of
+from benchmarks.silent_errors.truth import CleanImage, Found, compare, image_of
 from processing.quality.figures.circumstances import EstimatedDcFigures
 from processing.quality.figures.image import (
     BalanceFigures,
@@ -45,6 +44,8 @@ RADIANCE: Final = 0.08
 BAND_PX: Final = 0.5
 DETAIL: Final = 0.5
 """Of the fine detail of the same image without a fault."""
+BLANK: Final = 0.02
+"""Share of a head's part of the image without data, beyond that of the image without a fault."""
 WIDEST: Final = 3.0
 """Stated sigma over true error, above which a widened sigma states nothing."""
 
@@ -116,12 +117,16 @@ class Outcome:
     stated_px: float | None
     over_sigma: float | None
     worst: float | None
+    worst_of: str
+    worst_limit: float | None
     squares: float | None
     rank: int
     band_px: float
     radiance: float
     radiance_of: str
     detail: float
+    blank: float
+    blank_of: str
 
 
 def run(case: Case) -> Outcome:
@@ -130,7 +135,7 @@ def run(case: Case) -> Outcome:
     fault = FAULTS[case.kind](emulated, case.size, np.random.default_rng([case.seed, 29]))
     product = fault.emulated.process()
     report = product.report
-    found = compare(fault.emulated, product, clean_detail(case.rig, case.exposure))
+    found = compare(fault.emulated, product, clean_image(case.rig, case.exposure))
     over = None
     if found.error_px is not None and found.stated_px:
         over = found.error_px / found.stated_px
@@ -173,7 +178,10 @@ def _result(
     if report.verdict is not Verdict.GOOD:
         return "found"
     placed = over is None or over <= COVERED
-    shown = found.radiance <= RADIANCE and found.band_px <= BAND_PX and found.detail >= DETAIL
+    if found.worst is not None and found.worst_limit is not None:
+        placed = placed and found.worst <= found.worst_limit
+    shown = found.radiance <= RADIANCE and found.band_px <= BAND_PX
+    shown = shown and found.detail >= DETAIL and found.blank <= BLANK
     if not placed or (case.above and not shown):
         return "silent"
     return "right" if case.above else "covered"
@@ -218,10 +226,10 @@ def _names(first: Sequence[str], *others: Sequence[str]) -> frozenset[str]:
 
 
 @cache
-def clean_detail(rig: str, number: int) -> Mapping[str, NDArray[Any]]:
-    """Fine detail of the image of a healthy exposure."""
+def clean_image(rig: str, number: int) -> CleanImage:
+    """What the image of a healthy exposure shows."""
     emulated = healthy(rig, number)
-    return detail_of(emulated, emulated.process())
+    return image_of(emulated, emulated.process())
 
 
 def by_exposure(cases: Sequence[Case]) -> Iterator[Case]:

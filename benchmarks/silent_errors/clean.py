@@ -22,7 +22,7 @@ from benchmarks.silent_errors.cases import named_causes
 from benchmarks.silent_errors.exposures import remeasured, world_of
 from benchmarks.silent_errors.limits import DMC, L, X
 from benchmarks.silent_errors.scenes import SCENES
-from benchmarks.silent_errors.truth import compare
+from benchmarks.silent_errors.truth import CleanImage, compare
 from processing.quality.report import Verdict
 
 Row = dict[str, Any]
@@ -60,7 +60,7 @@ def clean_row(number: int, seed: int) -> Row:
     emulated = remeasured(rig, place, seed * 1_000_000 + number, scene=scene)
     product = emulated.process()
     report = product.report
-    found = compare(emulated, product, {})
+    found = compare(emulated, product, CleanImage())
     changing = [f.flag for f in report.findings if f.verdict is not Verdict.GOOD]
     unexpected = [str(f.name) for f in changing if not f & SCENES[scene].expected]
     named = {what: ", ".join(sorted(names)) for what, names in named_causes(report).items()}

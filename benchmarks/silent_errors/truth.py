@@ -5,13 +5,14 @@ Truth is the emulator's: its exact mapping of every raw pixel, and the radiance 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
+from scipy.stats import chi2
 
 from benchmarks.silent_errors.exposures import EmulatedExposure
 from benchmarks.uncertainty_consistency import NormalizedErrors, normalized_errors
@@ -34,6 +35,8 @@ MIN_PIXELS: Final = 12
 CHECK: Final = (5, 5)
 WITHOUT_DATA: Final = 1e-6
 """Weight of pixels without data up to which an interpolated value counts as measured."""
+BY_CHANCE: Final = 1e-3
+"""Probability with which the errors of any head exceed their limit where the covariance holds."""
 DARK: Final = 0.02
 """Radiance below which a relative error is meaningless."""
 
@@ -43,52 +46,85 @@ class Found:
     """Errors of one image, and what is stated of it.
 
     `error_px` is the RMS of a coordinate over the image, `stated_px` the report's sigma, `worst`
-    the RMS error of the worst PAN sensor over its own stated sigma, `normalised` the errors of
-    check points against the stated covariance. `band_px` is the largest RMS error of a colour band,
-    colour pixels. `radiance` is the largest relative error of a region, `radiance_of` its sensor;
-    `detail` the least share of the fine detail of a sensor that the image of the same exposure
-    without a fault shows.
+    the RMS error of the worst PAN sensor `worst_of` over its own stated sigma, `worst_limit` what
+    that ratio reaches in one of 1,000 images where the stated covariance holds. `normalised` are
+    the errors of check points against the stated covariance. `band_px` is the largest RMS error of
+    a colour band, colour pixels. `radiance` is the largest relative error of a region,
+    `radiance_of` its sensor. Against the image of the same exposure without a fault, `detail` is
+    the least share of the fine detail of a sensor, `blank` the largest share of its part of the
+    image that has no data, `blank_of` the sensor.
     """
 
     error_px: float | None
     stated_px: float | None
     worst: float | None
+    worst_of: str
+    worst_limit: float | None
     normalised: NormalizedErrors | None
     band_px: float
     radiance: float
     radiance_of: str
     detail: float
+    blank: float
+    blank_of: str
+
+
+@dataclass(frozen=True)
+class CleanImage:
+    """By sensor, what the image of an exposure without a fault shows.
+
+    `detail` is its fine detail, (2, 2, 2), `blank` the share of pixels without data.
+    """
+
+    detail: Mapping[str, Array] = field(default_factory=dict)
+    blank: Mapping[str, float] = field(default_factory=dict)
 
 
 def compare(
-    emulated: EmulatedExposure, product: Product | HeadsProduct, clean: Mapping[str, Array]
+    emulated: EmulatedExposure, product: Product | HeadsProduct, clean: CleanImage
 ) -> Found:
     """Compare an image with the truth.
 
     Args:
         emulated: the exposure it was made of.
         product: the image and its report.
-        clean: fine detail by sensor (`detail_of`) of the exposure without a fault.
+        clean: the image of the exposure without a fault (`image_of`).
     """
     regions = _radiance(emulated, product)
     worst = max(regions, key=lambda name: regions[name], default="")
-    detail = detail_of(emulated, product)
-    shares = [share for name in detail if (share := _share(detail[name], clean.get(name)))]
+    shown = image_of(emulated, product)
+    blank = {n: share - clean.blank.get(n, share) for n, share in shown.blank.items()}
+    blank_of = max(blank, key=lambda name: blank[name], default="")
+    found = Found(
+        error_px=None,
+        stated_px=None,
+        worst=None,
+        worst_of="",
+        worst_limit=None,
+        normalised=None,
+        band_px=0.0,
+        radiance=regions.get(worst, 0.0),
+        radiance_of=worst,
+        detail=_least_share(shown.detail, clean.detail),
+        blank=blank.get(blank_of, 0.0),
+        blank_of=blank_of,
+    )
     if isinstance(product, HeadsProduct):
-        return Found(None, None, None, None, 0.0, regions.get(worst, 0.0), worst, min(shares))
+        return found
     errors = _errors(emulated, product)
     every = np.concatenate(list(errors.values()))
     stated = product.report.figures.of(PrecisionFigures).stitched_sigma_px
     points = _check_points(emulated, product)
-    return Found(
+    ratio, name, limit = _worst_head(emulated, product, errors, points)
+    return replace(
+        found,
         error_px=float(np.sqrt(np.mean(every**2))),
         stated_px=None if stated is None else float(stated),
-        worst=_worst(errors, product),
+        worst=ratio,
+        worst_of=name,
+        worst_limit=limit,
         normalised=_normalised(emulated, product, points),
         band_px=max(_bands(emulated, product).values(), default=0.0),
-        radiance=regions.get(worst, 0.0),
-        radiance_of=worst,
-        detail=min(shares, default=1.0),
     )
 
 
@@ -115,11 +151,48 @@ def _true(emulated: EmulatedExposure, name: str, raw: Array) -> Array:
     return true_positions(emulated.snapshot.truth, name, raw if content is None else content(raw))
 
 
-def _worst(errors: Mapping[str, Array], product: Product) -> float | None:
-    stated = product.report.figures.of(PrecisionFigures).stitched_sigma_worst_px
-    if stated is None:
-        return None
-    return max(float(np.sqrt(np.mean(e**2))) for e in errors.values()) / stated
+def _worst_head(
+    emulated: EmulatedExposure,
+    product: Product,
+    errors: Mapping[str, Array],
+    points: Mapping[str, Array],
+) -> tuple[float | None, str, float | None]:
+    """RMS error over stated sigma, name and limit of the head that exceeds its limit the most."""
+    found: list[tuple[float, str, float]] = []
+    if product.mosaic.redundancy > 0:
+        heads = [name for name in errors if name in points]
+        for name in heads:
+            covariance = _of_head(emulated, product, name, points[name])
+            variance = float(np.trace(covariance)) / len(covariance)
+            ratio = float(np.sqrt(np.mean(errors[name] ** 2) / variance))
+            found.append((ratio, name, head_limit(covariance, len(heads))))
+    return max(found, key=lambda head: head[0] / head[2], default=(None, "", None))
+
+
+def _of_head(emulated: EmulatedExposure, product: Product, name: str, points: Array) -> Array:
+    """Stated covariance of points of one head; what is added for a frame moves it as a whole."""
+    mosaic, added = product.mosaic, product.uncertainty_contribution
+    tie, datum = placed_covariance_px(
+        emulated.rig, mosaic, {name: points}, product.temperatures.usable_c
+    )
+    image_wide = replace(added, frames={})
+    shared = disturbance_covariance_px(emulated.rig, mosaic, {name: points}, image_wide)
+    frame = np.diag(added.frames.get(name, np.zeros(2)))
+    return np.asarray(tie + datum + shared + np.tile(frame, (len(points), len(points))))
+
+
+def head_limit(covariance: Array, heads: int) -> float:
+    """RMS error over stated sigma that one of `heads` heads reaches in one of 1,000 images.
+
+    The mean square of correlated errors is taken as a chi-square of as many degrees of freedom
+    as has its variance (Satterthwaite).
+
+    Args:
+        covariance: of the errors of one head, (n, n).
+        heads: that are compared.
+    """
+    freedom = float(np.trace(covariance)) ** 2 / float(np.sum(covariance**2))
+    return float(np.sqrt(chi2.ppf(1.0 - BY_CHANCE / heads, freedom) / freedom))
 
 
 def _check_points(emulated: EmulatedExposure, product: Product) -> dict[str, Array]:
@@ -287,25 +360,36 @@ def _compared(
     return raw[good], shown[good].astype(np.float64), true[good].astype(np.float64)
 
 
-def detail_of(emulated: EmulatedExposure, product: Product | HeadsProduct) -> dict[str, Array]:
-    """Fine detail of the image, by sensor: differences of neighbouring pixels."""
+def image_of(emulated: EmulatedExposure, product: Product | HeadsProduct) -> CleanImage:
+    """Fine detail and pixels without data of an image, by sensor."""
+    pictures = dict(_pictures(emulated, product))
+    return CleanImage(
+        {name: _differences(picture) for name, picture in pictures.items()},
+        {name: float(np.mean(picture == 0)) for name, picture in pictures.items()},
+    )
+
+
+def _pictures(
+    emulated: EmulatedExposure, product: Product | HeadsProduct
+) -> Iterator[tuple[str, Array]]:
+    """The part of the image that each PAN sensor, colour cone or head makes, by its name."""
     if isinstance(product, HeadsProduct):
-        return {n: _differences(h.bands[BAYER_BANDS[1]]) for n, h in product.heads.items()}
-    found = {}
+        for name, head in product.heads.items():
+            yield name, head.bands[BAYER_BANDS[1]]
+        return
     truth = emulated.snapshot.truth
     for name in truth["pan_sensors"].tolist():
         columns, rows = (truth[f"{name}.vip_{what}"] for what in ("column", "row"))
         top, low = (int(rows[1:-1, 1:-1].min()), int(rows[1:-1, 1:-1].max()))
         left, right = (int(columns[1:-1, 1:-1].min()), int(columns[1:-1, 1:-1].max()))
-        found[name] = _differences(product.pan[max(top, 0) : low, max(left, 0) : right])
+        yield name, product.pan[max(top, 0) : low, max(left, 0) : right]
     for cone in emulated.rig.cones:
         if cone.role == "colour":
-            found[cone.name] = _differences(product.colour[cone.bands[0]])
-    return found
+            yield cone.name, product.colour[cone.bands[0]]
 
 
 def _differences(picture: Array) -> Array:
-    """Median absolute second difference over a frame's quarters, (2, 2, 2): by axis and place."""
+    """Mean absolute second difference over a frame's quarters, (2, 2, 2): by axis and place."""
     values = picture.astype(np.float32)
     half = (values.shape[0] // 2, values.shape[1] // 2)
     found = np.zeros((2, 2, 2))
@@ -317,5 +401,13 @@ def _differences(picture: Array) -> Array:
     return found
 
 
-def _share(of: Array, clean: Array | None) -> float | None:
-    return None if clean is None else float(np.min(of / np.maximum(clean, 1e-6)))
+def _least_share(of: Mapping[str, Array], clean: Mapping[str, Array]) -> float:
+    """The least share of detail in any part of any picture; a blank one has none."""
+    return min(
+        (
+            float(np.min(detail / np.maximum(clean[name], 1e-6)))
+            for name, detail in of.items()
+            if name in clean
+        ),
+        default=1.0,
+    )

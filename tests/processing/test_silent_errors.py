@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import math
 import os
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from benchmarks.silent_errors.cases import Case, draw, run
+from benchmarks.silent_errors.__main__ import failures
+from benchmarks.silent_errors.cases import Case, _result, draw, run
 from benchmarks.silent_errors.clean import clean_row, clean_rows
 from benchmarks.silent_errors.faults import FAULTS
 from benchmarks.silent_errors.limits import DMC, LIMITS, L, X, table
+from benchmarks.silent_errors.truth import Found, _least_share, head_limit
+from processing.quality.figures import QualityFigures
+from processing.quality.report import NO_FLAGS, QualityReport, Verdict
 
 DOCUMENT = Path(__file__).parents[2] / "docs/explanation/validity.md"
 SAMPLE = {
@@ -45,6 +51,14 @@ def test_a_tenth_of_a_colour_pixel_under_a_cloud_is_no_slip() -> None:
         assert not row["alarm"], row
 
 
+@pytest.mark.trust
+def test_tie_points_that_a_step_of_signal_draws_are_no_slip_of_the_neighbour() -> None:
+    (case,) = (c for c in draw(150, 21) if c.number == 117)
+    outcome = run(case)
+    assert outcome.description.startswith("RGB: signal -28.1 % from column 271")
+    assert outcome.result == "found" and outcome.named == {"step": "RGB"}
+
+
 def test_the_published_detection_limits_are_those_of_the_search() -> None:
     assert table() in DOCUMENT.read_text(encoding="utf-8")
     assert FAULTS.keys() == LIMITS.keys()
@@ -59,6 +73,78 @@ def test_sizes_are_drawn_by_seed_from_half_to_four_times_the_limit() -> None:
         (kind, rig) for kind, limit in LIMITS.items() for rig in limit.by_rig
     }
     assert all(case.size == case.share * LIMITS[case.kind].by_rig[case.rig] for case in cases)
+
+
+RIGHT = Found(
+    error_px=0.05,
+    stated_px=0.05,
+    worst=1.0,
+    worst_of="SU00",
+    worst_limit=3.0,
+    normalised=None,
+    band_px=0.1,
+    radiance=0.01,
+    radiance_of="SU00",
+    detail=0.9,
+    blank=0.0,
+    blank_of="",
+)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "result"),
+    [
+        (RIGHT, "right"),
+        (replace(RIGHT, worst=3.1), "silent"),
+        (replace(RIGHT, detail=0.0), "silent"),
+        (replace(RIGHT, blank=0.03), "silent"),
+        (replace(RIGHT, radiance=0.09), "silent"),
+    ],
+)
+def test_an_image_is_judged_head_by_head(wrong: Found, result: str) -> None:
+    case = Case(number=0, kind="slip", rig=X, exposure=0, share=2.0, seed=1)
+    good = QualityReport(Verdict.GOOD, NO_FLAGS, (), QualityFigures(()))
+    assert _result(case, good, wrong, 1.0, {}, frozenset()) == result
+
+
+def test_the_limit_of_a_head_is_that_of_its_degrees_of_freedom() -> None:
+    assert head_limit(np.eye(4), 1) == pytest.approx(2.149, abs=1e-3)
+    # Errors that move a head as a whole have two, whatever the number of check points.
+    moved = np.tile(np.eye(2), (25, 25))
+    assert head_limit(moved, 1) == pytest.approx(head_limit(np.eye(2), 1))
+    assert head_limit(moved, 1) == pytest.approx(np.sqrt(-np.log(1e-3)))
+    assert head_limit(moved, 9) == pytest.approx(np.sqrt(-np.log(1e-3 / 9)))
+
+
+def test_a_blank_head_has_no_detail() -> None:
+    detail = np.full((2, 2, 2), 5.0)
+    assert _least_share({"SU00": detail, "R": 0.0 * detail}, {"SU00": detail, "R": detail}) == 0.0
+    assert _least_share({"SU00": 0.5 * detail, "R": detail}, {"SU00": detail}) == 0.5
+    assert _least_share({"nadir": detail}, {}) == 1.0
+
+
+def _row(flags: str, squares: float, *, stated_px: float = 0.1, **other: object) -> dict[str, Any]:
+    row = {"result": "found", "flags": flags, "rank": 1000, "squares": squares, "error_px": 0.1}
+    return {**row, "stated_px": stated_px, **other}
+
+
+@pytest.mark.parametrize(
+    ("rows", "failed"),
+    [
+        ([_row("", 1000.0), _row("BLUR", 1000.0)], ""),
+        ([_row("", 1200.0)], "unflagged images: mean square of normalised errors 1.200"),
+        ([_row("", 800.0)], "unflagged images: mean square of normalised errors 0.800"),
+        ([_row("BLUR", 1200.0)], "flagged images: mean square of normalised errors 1.200"),
+        ([_row("BLUR", 500.0)], ""),
+        ([_row("BLUR", 1000.0, stated_px=0.31)], "flagged images state 0.310 px"),
+        ([_row("BLUR", 1000.0, stated_px=math.inf)], "flagged images state inf px"),
+    ],
+)
+def test_a_run_fails_where_errors_are_not_those_stated(
+    rows: list[dict[str, Any]], failed: str
+) -> None:
+    sentences = failures(rows)
+    assert [s[: len(failed)] for s in sentences] == ([failed] if failed else [])
 
 
 @pytest.mark.soak
