@@ -29,7 +29,6 @@ from daemon.postflight.displacements import flight_displacements, write_displace
 from daemon.products.exposure_conditions import GPS_EPOCH
 from daemon.terminal.console import visible_value
 from drivers.timescales.leap_seconds import leap_seconds_at
-from processing.quality.band_levels import level_steps
 from processing.quality.figures import QualityFigures
 from processing.quality.figures.circumstances import DcFigures
 from processing.quality.figures.image import BandLevelFigures
@@ -40,6 +39,7 @@ from processing.quality.figures.stitching import (
     DisplacementTestFigures,
     MisreadProbeFigures,
 )
+from processing.quality.level_steps import level_steps
 from processing.rig import RigError
 
 REPORT_FILE = "report.html"

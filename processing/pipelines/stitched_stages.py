@@ -41,6 +41,7 @@ from processing.quality.figures.stitching import SaturatedOverlapFigures, Suppor
 from processing.quality.frame_blocks import block_edges, block_figures, edge_limits
 from processing.quality.frame_identity import identity_figures
 from processing.quality.frame_signal import sharpness_figures, signal_figures
+from processing.quality.ground_steps import GroundView, is_drawn_by_step
 from processing.quality.local_sharpness import local_blur_figures
 from processing.quality.relative_sharpness import relative_sharpness_figures
 from processing.quality.signal_steps import signal_steps, step_figures
@@ -124,7 +125,8 @@ def figures_of(
     yield from signal_figures(pan, level1, corrected.statistics)
     yield sharpness_figures(pan, level1, exposed)
     means = {n: seen.lines for n, seen in corrected.statistics.items() if seen.lines is not None}
-    steps = signal_steps(rig.sensors, means)
+    view = GroundView(rig, mosaic.placements, level1)
+    steps = signal_steps(rig.sensors, means, view)
     limits = edge_limits(rig, means)
     blocks = block_edges(rig, mosaic.placements, level1, means, limits)
     yield from stitching_figures(
@@ -152,7 +154,15 @@ def figures_of(
     yield level_figures(rig, shared)
     yield identity_figures(rig, corrected.by_pattern, start, tie_points, image.registrations)
     yield from layer_figures(adjusted.layers)
-    yield slip_figures(rig, stitching.slips)
+    every = [line for step in steps for line in step.every]
+    yield slip_figures(
+        rig,
+        [
+            slip
+            for slip in stitching.slips
+            if not is_drawn_by_step(view, every, slip.sensor, (slip.axis, slip.first, slip.last))
+        ],
+    )
     yield precision_figures(
         rig, mosaic, level1, temperatures.usable_c, adjusted.uncertainty_contribution
     )

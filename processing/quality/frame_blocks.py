@@ -9,17 +9,24 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from processing.geometry.placement import SensorPlacement, raw_from_vip_mm, vip_mm_from_raw
-from processing.geometry.topology import exact_colour_ratio
 from processing.image.line_means import BUNDLE_PX, LineMeans
 from processing.quality.figures.image import BlockFigures
-from processing.radiometry.level1 import exposed_rows, level1_counts_per_dn
+from processing.quality.ground_steps import (
+    MAX_SHARED,
+    SAMPLES,
+    Axis,
+    GroundView,
+    sides_of,
+    signal_change,
+)
+from processing.radiometry.level1 import level1_counts_per_dn
 from processing.rig import Rig, Sensor
 
 Array = NDArray[Any]
@@ -41,14 +48,12 @@ NEAR_PX: Final = 3 * BUNDLE_PX
 MAX_RATIO: Final = 3.0
 """Of the steps of two edges of one block, whose ground differs from side to side."""
 MAX_FRAMES: Final = 3
-"""Such edges in more frames of one exposure are roofs or rows of plants along the track."""
+ISOLATED_REACH: Final = 4.0
+"""Such edges in more frames of one exposure may be roofs or rows of plants along the track: only
+those count that are so far from the next one, in distances at which other heads are compared."""
 CANDIDATES: Final = 6
 """Edges of a frame that are compared with other heads, the largest."""
-MAX_SHARED: Final = 0.5
-"""Of the step that another head may show."""
 MIN_HEADS: Final = 2
-SAMPLES: Final = 120
-"""Places along an edge, at most."""
 _RELATIVE: Final = 0.02
 
 
@@ -61,7 +66,7 @@ class BlockEdge:
     """
 
     sensor: str
-    axis: Literal["rows", "columns"]
+    axis: Axis
     at: int
     first: int
     last: int
@@ -89,17 +94,19 @@ def block_edges(
     Returns:
         The largest edge of each frame that has one, the largest first.
     """
-    edges = {
-        name: _cornered(_candidates(rig.sensor(name), lines, limits[name]))
-        for name, lines in means.items()
-    }
+    view = GroundView(rig, placements, frames)
+    every = {n: _candidates(rig.sensor(n), lines, limits[n]) for n, lines in means.items()}
+    edges = {name: _cornered(of_frame) for name, of_frame in every.items()}
     if sum(1 for of_frame in edges.values() if of_frame) > MAX_FRAMES:
-        return ()
+        edges = {
+            name: [e for e in of_frame if _is_isolated(e, every[name], view.reach_px(name))]
+            for name, of_frame in edges.items()
+        }
     found = []
     for name, of_frame in edges.items():
         sensor = rig.sensor(name)
         for edge in of_frame[:CANDIDATES]:
-            block = _unshared(rig, placements, frames, sensor, edge)
+            block = _unshared(view, edge, sensor)
             if block is not None:
                 found.append(block)
                 break
@@ -164,7 +171,7 @@ def block_figures(
 
 @dataclass(frozen=True)
 class _Edge:
-    axis: Literal["rows", "columns"]
+    axis: Axis
     at: int
     first: int
     last: int
@@ -174,7 +181,7 @@ class _Edge:
 def _candidates(sensor: Sensor, lines: LineMeans, limits: tuple[float, float]) -> list[_Edge]:
     """Runs of bundles with the same step between two lines, the largest first."""
     edges: list[_Edge] = []
-    axes: tuple[tuple[Literal["rows", "columns"], Array, int, int], ...] = (
+    axes: tuple[tuple[Axis, Array, int, int], ...] = (
         ("rows", lines.by_row, lines.first_row, sensor.width_px),
         ("columns", lines.by_column, 0, sensor.height_px),
     )
@@ -273,75 +280,54 @@ def _cornered(edges: list[_Edge]) -> list[_Edge]:
     return [a for a in edges if any(joined(a, b) for b in edges if b is not a)]
 
 
-def _unshared(
-    rig: Rig,
-    placements: Mapping[str, SensorPlacement],
-    frames: Mapping[str, Array],
-    sensor: Sensor,
-    edge: _Edge,
-) -> BlockEdge | None:
+def _is_isolated(edge: _Edge, every: list[_Edge], reach_px: float) -> bool:
+    """Whether no other edge of the frame runs next to it: rows of plants are many."""
+    return not any(
+        0 < abs(edge.at - other.at) < ISOLATED_REACH * reach_px
+        for other in every
+        if other.axis == edge.axis
+    )
+
+
+def _unshared(view: GroundView, edge: _Edge, sensor: Sensor) -> BlockEdge | None:
     """The edge as a block where no other head shows half of it; None where one does, or too few see
-    it."""
-    pan = {s.name for cone in rig.pan_cones for s in cone.sensors}
-    ratio = max(round(exact_colour_ratio(rig) or 1.0), 1)
-    away = 1.5 * ratio + 1.0 if sensor.name in pan else 2.5
+    it.
+
+    An edge that all colour heads show is none of the ground where PAN shows less than half of it.
+    """
+    name, away = sensor.name, view.reach_px(sensor.name)
     along = np.linspace(edge.first + 2, edge.last - 2, min(SAMPLES, edge.last - edge.first))
-    sides = []
-    for side in (-away, away):
-        across = np.full_like(along, edge.at + 0.5 + side)
-        pair = (along, across) if edge.axis == "rows" else (across, along)
-        sides.append(np.stack(pair, axis=1))
-    own = _step(frames[sensor.name], placements[sensor.name], tuple(sides), 1)
+    sides = sides_of(edge.axis, edge.at, along, away)
+    own = signal_change(view.frames[name], view.placements[name], sides, 1)
     if own is None or not edge.step * own > _RELATIVE * abs(edge.step):
         return None
-    ground = [vip_mm_from_raw(placements[sensor.name], side) for side in sides]
-    others = []
-    for name, frame in frames.items():
-        if name == sensor.name:
+    ground = [vip_mm_from_raw(view.placements[name], side) for side in sides]
+    others: list[float] = []
+    pan: list[float] = []
+    for other, frame in view.frames.items():
+        if other == name:
             continue
         with np.errstate(invalid="ignore"):
-            places = tuple(raw_from_vip_mm(placements[name], side) for side in ground)
-        seen = _step(frame, placements[name], places, 1 if name in pan else 0)
+            before, after = (raw_from_vip_mm(view.placements[other], side) for side in ground)
+        reach = 1 if view.is_pan(other) else 0
+        seen = signal_change(frame, view.placements[other], (before, after), reach)
         if seen is not None:
-            others.append(seen * np.sign(own))
-    if len(others) < MIN_HEADS or max(others) > MAX_SHARED * abs(own):
+            (pan if view.is_pan(other) else others).append(seen * np.sign(own))
+    colours = sum(1 for cone in view.rig.cones if cone.role == "colour") - (not view.is_pan(name))
+    if len(others) + len(pan) < MIN_HEADS:
+        return None
+    least = min(abs(own), *others) if others and len(others) == colours else 0.0
+    by_all_colours = not view.is_pan(name) and pan and np.median(pan) < MAX_SHARED * least
+    if max(others + pan) > MAX_SHARED * abs(own) and not by_all_colours:
         return None
     counts = level1_counts_per_dn(sensor.bits)
     return BlockEdge(
-        sensor.name,
+        name,
         edge.axis,
         edge.at,
         edge.first,
         edge.last,
         edge.step / counts,
         own,
-        float(max(others)),
+        float(max(pan if by_all_colours else others + pan)),
     )
-
-
-def _step(
-    frame: Array, placement: SensorPlacement, sides: tuple[Array, ...], reach: int
-) -> float | None:
-    """Change of signal from one row of places to the other, of itself; None where it is not seen.
-
-    Each place counts by the mean of the pixels within `reach`; 2 x 2 of a colour filter array.
-    """
-    sensor = placement.sensor
-    bayer = sensor.colour_filter_array != "none"
-    first, last = exposed_rows(sensor, placement.tdi_shifts)
-    around = range(2) if bayer else range(-reach, reach + 1)
-    values = []
-    for places in sides:
-        inside: Array = np.asarray(np.isfinite(places).all(axis=1))
-        at = np.rint(np.where(inside[:, None], places, 0.0)).astype(np.int64)
-        inside &= (at[:, 0] >= 2) & (at[:, 0] < sensor.width_px - 2)
-        inside &= (at[:, 1] >= first + 2) & (at[:, 1] <= last - 2)
-        at = np.where(inside[:, None], at, 2)
-        pixels = np.stack([frame[at[:, 1] + y, at[:, 0] + x] for y in around for x in around])
-        inside &= ((pixels & 1) == 0).all(axis=0) & (pixels > 0).all(axis=0)
-        values.append(np.where(inside, pixels.mean(axis=0), np.nan))
-    both = np.isfinite(values[0]) & np.isfinite(values[1])
-    if np.count_nonzero(both) < 0.8 * len(sides[0]):
-        return None
-    before, after = (float(np.median(side[both])) for side in values)
-    return (after - before) / max(0.5 * (after + before), 1.0)

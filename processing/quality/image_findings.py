@@ -139,6 +139,11 @@ def signal_findings(figures: QualityFigures, thresholds: Thresholds) -> list[Fin
                 f"The {where} show banding of {abs(step):.0%} in {lines} lines: check power "
                 "supply and cable of the head. Radiometry of this frame is wrong."
             )
+        if (steps.signal_step_frames or 1) > 2:
+            sentence += (
+                f" {steps.signal_step_frames} frames step while other heads show no such ground: "
+                "check what these heads share, supply and clock."
+            )
         findings.append(Finding(Flag.FRAME_CORRUPT, Verdict.USABLE, sentence, step))
     repeated = figures.of(RepeatedLineFigures)
     if repeated.repeated_lines is not None:

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Final, Literal
+from dataclasses import dataclass, field
+from typing import Any, Final
 
 import numpy as np
 from numba import njit
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from processing.image.line_means import LineMeans
 from processing.quality.figures.image import SignalStepFigures
+from processing.quality.ground_steps import Axis, GroundView, LineStep, read_out_frames
 from processing.radiometry.level1 import level1_counts_per_dn
 from processing.rig import Sensor
 
@@ -33,7 +34,7 @@ MAX_BLUR: Final = 0.2
 """Of the step, beyond the usual change, in the lines before and after it: read-out steps from one
 line to the next, a lens spreads rows of plants and eaves and leaves 0.35 and more."""
 MAX_FRAMES: Final = 2
-"""Steps in more frames of one exposure are rows of plants or roofs along the track."""
+"""Steps in more frames of one exposure may be rows of plants or roofs along the track."""
 MIN_STEP_DN: Final = 6.0
 SIGMAS: Final = 8.0
 ALL: Final = 2000
@@ -46,28 +47,31 @@ _MAD_TO_SIGMA: Final = 1.4826
 class SignalStep:
     """Between line `at` and the next along `axis` the signal changes by `relative` of itself.
 
-    `lines` counts the lines of the frame where it steps: more than a few are banding.
+    `lines` counts the lines of the frame where it steps: more than a few are banding; `every` are
+    all of them.
     """
 
     sensor: str
-    axis: Literal["rows", "columns"]
+    axis: Axis
     at: int
     relative: float
     lines: int
+    every: tuple[LineStep, ...] = field(default=(), compare=False, repr=False)
 
 
 def signal_steps(
-    sensors: Sequence[Sensor], means: Mapping[str, LineMeans]
+    sensors: Sequence[Sensor], means: Mapping[str, LineMeans], view: GroundView | None = None
 ) -> tuple[SignalStep, ...]:
     """Search frames for steps along whole lines.
 
     Args:
         sensors: those to look at.
         means: of their lines, by sensor name.
+        view: frames and places; None where heads share no ground.
 
     Returns:
-        The largest step of each frame and axis that has one, the largest first; none where more
-        than `MAX_FRAMES` frames have one.
+        The largest step of each frame and axis that has one, the largest first. Where more than
+        `MAX_FRAMES` frames have one, only those that the ground cannot be the cause of.
     """
     found = []
     for sensor in sensors:
@@ -75,7 +79,7 @@ def signal_steps(
             continue
         lines = means[sensor.name]
         least = MIN_STEP_DN * level1_counts_per_dn(sensor.bits)
-        axes: tuple[tuple[Literal["rows", "columns"], Array, int], ...] = (
+        axes: tuple[tuple[Axis, Array, int], ...] = (
             ("rows", lines.by_row, lines.first_row),
             ("columns", lines.by_column, 0),
         )
@@ -84,8 +88,17 @@ def signal_steps(
             if step is not None:
                 found.append(step)
     if len({step.sensor for step in found}) > MAX_FRAMES:
-        return ()
+        found = _of_read_out(found, view)
     return tuple(sorted(found, key=lambda step: -abs(step.relative)))
+
+
+def _of_read_out(steps: Sequence[SignalStep], view: GroundView | None) -> list[SignalStep]:
+    axes: tuple[Axis, ...] = ("rows", "columns")
+    named = {
+        axis: read_out_frames({s.sensor: s.every for s in steps if s.axis == axis}, view)
+        for axis in axes
+    }
+    return [step for step in steps if step.sensor in named[step.axis]]
 
 
 def step_figures(steps: Sequence[SignalStep]) -> SignalStepFigures:
@@ -106,12 +119,13 @@ def step_figures(steps: Sequence[SignalStep]) -> SignalStepFigures:
         signal_step_axis=worst.axis,
         signal_step_at=worst.at,
         signal_step_lines=worst.lines,
+        signal_step_frames=len({step.sensor for step in steps}),
     )
 
 
 def _largest(
     sensor: str,
-    axis: Literal["rows", "columns"],
+    axis: Axis,
     means: Array,
     offset: int,
     min_counts: float,
@@ -149,8 +163,13 @@ def _largest(
     if not steps.any():
         return None
     best = int(np.argmax(np.where(steps, np.abs(middle), 0.0)))
-    stepping = int(np.count_nonzero(steps))
-    return SignalStep(sensor, axis, int(lines[best]) + offset, float(middle[best]), stepping)
+    every = tuple(
+        LineStep(sensor, axis, int(lines[k]) + offset, float(middle[k]))
+        for k in np.flatnonzero(steps)
+    )
+    return SignalStep(
+        sensor, axis, int(lines[best]) + offset, float(middle[best]), len(every), every
+    )
 
 
 def _are_sharp(means: Array, lines: Array, steps: Array, slope: float, spread: float) -> Array:

@@ -4,20 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from scipy.interpolate import RectBivariateSpline
 
+from benchmarks.silent_errors.exposures import healthy
 from processing.geometry.exposure_times import unknown_exposure_figures
 from processing.geometry.placement import nominal_placements
-from processing.quality.band_levels import level_steps
 from processing.quality.common_windows import measure_common_windows
-from processing.quality.figures.image import BandLevelFigures
+from processing.quality.figures.image import BandLevelFigures, SignalStepFigures
+from processing.quality.level_steps import level_steps
 from processing.quality.local_sharpness import local_blur_figures
+from processing.quality.report import Verdict
 from processing.quality.word_format import wrong_format
 from tests.processing.injected_errors import (
+    BLACK_DN,
     InjectedExposure,
     banded,
     block,
@@ -80,6 +85,105 @@ def test_a_step_within_a_frame_accuses_no_neighbour_of_another_gain(
 def test_banding_is_named(error_free: InjectedExposure) -> None:
     outcome = error_free.with_frame("SU10", banded(30, 20)).outcome()
     assert outcome.figure("signal_step_sensor") == "SU10" and "banding" in outcome.sentences
+
+
+def heads_of(exposure: InjectedExposure, which: str) -> list[str]:
+    """The sensors of PAN heads, of colour heads or of all."""
+    roles = {"all": ("pan", "colour")}.get(which, (which,))
+    return [s.name for cone in exposure.rig.cones if cone.role in roles for s in cone.sensors]
+
+
+SHARED = {"step": gain(1.2, 250), "columns": gain(1.2, 250, axis=1), "banding": banded(80, 12)}
+
+
+@pytest.mark.parametrize(
+    ("rig", "which", "change"),
+    [
+        ("ultracam-x-mini", "pan", "step"),
+        ("ultracam-x-mini", "colour", "step"),
+        ("ultracam-x-mini", "all", "banding"),
+        ("ultracam-l-mini", "all", "columns"),
+        ("dmc-mini", "colour", "banding"),
+        ("dmc-mini", "all", "step"),
+    ],
+)
+def test_steps_that_a_supply_or_clock_makes_in_many_frames_are_named(
+    rig: str, which: str, change: str
+) -> None:
+    exposure = rendered(rig)
+    heads = heads_of(exposure, which)
+    for sensor in heads:
+        exposure = exposure.with_frame(sensor, SHARED[change])
+    outcome = exposure.outcome()
+    assert outcome.verdict != "good" and "FRAME_CORRUPT" in outcome.flags
+    assert outcome.figure("signal_step_sensor") in heads, outcome.sentences
+    if which != "colour":
+        assert outcome.figure("signal_step_frames") > 2
+    if which != "colour" and outcome.figure("mismatched_sensors") is None:
+        assert "check what these heads share" in outcome.sentences
+
+
+@pytest.mark.parametrize("change", SHARED)
+def test_steps_in_many_frames_of_heads_that_share_no_ground_are_named(change: str) -> None:
+    exposure = healthy("midas-mini", 0)
+    for sensor in exposure.rig.sensors[:4]:
+        exposure = exposure.with_frame(sensor.name, SHARED[change])
+    report = exposure.process().report
+    steps = report.figures.of(SignalStepFigures)
+    assert report.verdict is Verdict.USABLE and steps.signal_step_frames == 4
+
+
+def test_banding_of_one_frequency_in_heads_that_share_no_ground_is_named() -> None:
+    exposure = healthy("midas-mini", 0)
+    for number, sensor in enumerate(exposure.rig.sensors[:4]):
+        shifted = partial(np.roll, shift=7 * number, axis=0)
+        exposure = exposure.with_frame(
+            sensor.name, lambda f, shifted=shifted: np.minimum(f + shifted(BANDS[: len(f)]), 4095)
+        )
+    steps = exposure.process().report.figures.of(SignalStepFigures)
+    assert steps.signal_step_frames == 4
+
+
+BANDS = (80 * ((np.arange(2000) // 15) % 2)).astype(np.uint16)[:, None]
+
+
+@pytest.mark.parametrize("which", ["pan", "colour", "all"])
+def test_a_block_that_many_frames_share_is_named(which: str) -> None:
+    exposure = rendered("ultracam-x-mini")
+    heads = heads_of(exposure, which)
+    for sensor in heads:
+        exposure = exposure.with_frame(sensor, block(250, slice(150, 400), slice(250, 600)))
+    outcome = exposure.outcome()
+    assert outcome.verdict != "good" and outcome.figure("block_sensor") in heads
+
+
+@pytest.mark.parametrize(("axis", "period"), [("rows", 7), ("rows", 20), ("columns", 60)])
+@pytest.mark.parametrize("rig", ["ultracam-x-mini", "dmc-mini"])
+def test_stripes_on_the_ground_that_all_heads_see_are_no_steps(
+    rig: str, axis: str, period: int
+) -> None:
+    outcome = with_stripes(rendered(rig), axis, period).outcome()
+    assert outcome.figure("signal_step_sensor") is None, outcome.sentences
+    assert outcome.figure("block_sensor") is None, outcome.sentences
+
+
+def with_stripes(exposure: InjectedExposure, axis: str, period: int) -> InjectedExposure:
+    """Stripes of 20 % more light on the ground, along rows or columns of the virtual image."""
+    truth = exposure.truth.truth
+    for sensor in exposure.rig.sensors:
+        name = sensor.name
+        key = "vip_row" if axis == "rows" else "vip_column"
+        at = RectBivariateSpline(
+            truth[f"{name}.rows"], truth[f"{name}.columns"], truth[f"{name}.{key}"], kx=1, ky=1
+        )(np.arange(sensor.height_px), np.arange(sensor.width_px))
+        factor = 1.0 + 0.2 * (np.floor(at / period).astype(int) % 2)
+
+        def brightened(frame: Any, factor: Any = factor) -> Any:
+            signal = (frame.astype(np.float64) - BLACK_DN) * factor + BLACK_DN
+            return np.clip(np.rint(signal), 0, 4095).astype(np.uint16)
+
+        exposure = exposure.with_frame(name, brightened)
+    return exposure
 
 
 @pytest.mark.parametrize("factor", [0.5, 0.85, 1.3])

@@ -110,6 +110,10 @@ class SignalStepFigures(FigureGroup):
         int | None,
         "lines of the frame where the signal steps; many are banding",
     ] = None
+    signal_step_frames: Annotated[
+        int | None,
+        "frames with such a step; several at once have a cause that their heads share",
+    ] = None
 
 
 @dataclass(frozen=True)
