@@ -187,8 +187,8 @@ def verified_mosaic(rig: Rig, mosaic: Mosaic, tie_points: TiePoints) -> Mosaic:
     return mosaic
 
 
-def has_scaled_head(rig: Rig, mosaic: Mosaic, tie_points: TiePoints) -> bool:
-    """Whether a converging head differs from its neighbours in scale, equally along both axes.
+def most_scaled_head(rig: Rig, mosaic: Mosaic, tie_points: TiePoints) -> tuple[str, float] | None:
+    """The converging head that differs most from its neighbours in scale, equally along both axes.
 
     That is a principal distance; lines lost in read-out change one axis.
 
@@ -198,15 +198,20 @@ def has_scaled_head(rig: Rig, mosaic: Mosaic, tie_points: TiePoints) -> bool:
         tie_points: those the mosaic is of.
 
     Returns:
-        True where one does by more than `SCALED_PPM`; False for rigs with a master cone.
+        Name of its cone, and by how much of itself it has to grow; None where no head differs by
+        `SCALED_PPM`, and for rigs with a master cone.
     """
+    scales = {}
     for name in mosaic.model.mountings:
         _, _, affine, points = _affine_shift(rig, mosaic, tie_points, name)
-        along, across = affine[0, 0], affine[1, 1]
+        along, across = float(affine[0, 0]), float(affine[1, 1])
         least = min(abs(along), abs(across))
         if points >= MIN_POINTS and along * across > 0.0 and least > SCALED_PPM * 1e-6:
-            return True
-    return False
+            scales[name] = 0.5 * (along + across)
+    if not scales:
+        return None
+    most = max(scales, key=lambda name: abs(scales[name]))
+    return most, scales[most]
 
 
 def check_platform(

@@ -11,7 +11,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import Final, Literal
 
-from processing.geometry.placement import SensorPlacement
+from processing.geometry.placement import SensorPlacement, start_similarity
 from processing.matching.tie_points import TiePoints
 from processing.mosaic.calibration_support import (
     contradicted_colour,
@@ -22,7 +22,7 @@ from processing.mosaic.confirmed_points import unconfirmed
 from processing.mosaic.fixed_mosaic import fixed_mosaic
 from processing.mosaic.free_mosaic import Mosaic, MosaicSettings, free_mosaic
 from processing.mosaic.model import residuals_px
-from processing.mosaic.mounting import has_scaled_head, verified_mosaic
+from processing.mosaic.mounting import most_scaled_head, verified_mosaic
 from processing.mosaic.pan_only import pan_only_mosaic
 from processing.mosaic.readout_slips import Slip, find_slips, inside_slips, of_sensor, slip_of
 from processing.mosaic.validity import Validity, evaluate_master, robust_datum
@@ -30,6 +30,7 @@ from processing.rig import Rig
 
 SLIP_ROUNDS: Final = 4
 Method = Literal["free", "fixed", "pan-only"]
+Placements = Mapping[str, SensorPlacement]
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,7 @@ class Stitching:
 
 def stitch(
     rig: Rig,
-    start: Mapping[str, SensorPlacement],
+    start: Placements,
     tie_points: TiePoints,
     *,
     present: Collection[str],
@@ -107,7 +108,7 @@ def stitch(
 
 def _without_slips(
     rig: Rig,
-    start: Mapping[str, SensorPlacement],
+    start: Placements,
     tie_points: TiePoints,
     mosaic: Mosaic,
     settings: MosaicSettings,
@@ -115,22 +116,51 @@ def _without_slips(
     """Leave out the tie points of shifted bands and adjust again.
 
     An adjustment with a shifted band in it spreads the shift over healthy sensors and bends the
-    frame to meet it halfway. Its size and reach are measured with the frame itself left out.
+    frame to meet it halfway. Its size and reach are measured with the frame itself left out. A head
+    of another scale is searched at that scale: its residuals would hide a band, or seem to be one.
     """
     slips: tuple[Slip, ...] = ()
-    if has_scaled_head(rig, mosaic, tie_points):
-        return tie_points, mosaic, slips
+    scaled, adjusted = _rescaled(rig, start, tie_points, mosaic, settings)
     for _ in range(SLIP_ROUNDS):
-        found = find_slips(rig, tie_points, mosaic.residuals_px)
+        found = find_slips(rig, tie_points, adjusted.residuals_px)
         if not found:
             break
         candidate = found[0].sensor
         others = tie_points.only(~of_sensor(tie_points, candidate))
-        without = free_mosaic(rig, start, others, settings=settings)
+        without = free_mosaic(rig, scaled, others, settings=settings)
         seen = residuals_px(without.model, without.placements, tie_points)
         slip = slip_of(rig, tie_points, seen, candidate) or found[0]
         slip = replace(slip, alternatives=found[0].alternatives)
         slips += (slip,)
         tie_points = tie_points.only(~inside_slips(tie_points, (slip,)))
+        adjusted = mosaic = free_mosaic(rig, scaled, tie_points, settings=settings)
+    if slips and scaled is not start:
         mosaic = free_mosaic(rig, start, tie_points, settings=settings)
     return tie_points, mosaic, slips
+
+
+def _rescaled(
+    rig: Rig,
+    start: Placements,
+    tie_points: TiePoints,
+    mosaic: Mosaic,
+    settings: MosaicSettings,
+) -> tuple[Placements, Mosaic]:
+    """Placements with converging heads at the scales their neighbours show, and their mosaic."""
+    for _ in mosaic.model.mountings:
+        head = most_scaled_head(rig, mosaic, tie_points)
+        if head is None:
+            break
+        name, scale = head
+        start = {
+            sensor: _scaled(p, 1.0 + scale) if p.cone.name == name else p
+            for sensor, p in start.items()
+        }
+        mosaic = free_mosaic(rig, start, tie_points, settings=settings)
+    return start, mosaic
+
+
+def _scaled(placement: SensorPlacement, factor: float) -> SensorPlacement:
+    """The placement of a head with another principal distance."""
+    other = replace(placement, f_ratio=placement.f_ratio * factor)
+    return replace(other, similarity=start_similarity(other))

@@ -194,6 +194,17 @@ def test_a_converging_head_with_a_wrong_principal_distance_is_not_called_correct
     assert_covered(outcome)
 
 
+@pytest.mark.parametrize("slipped_head", ["P2", "P3"])
+def test_a_slip_next_to_a_head_with_a_wrong_principal_distance_is_named(
+    converging: InjectedExposure, slipped_head: str
+) -> None:
+    scaled = converging.with_cone("3", with_f(1.0005))
+    outcome = scaled.with_frame(slipped_head, slipped("rows", 300, 3, 120)).outcome()
+    assert outcome.verdict == "refly" and outcome.figure("slip_sensors") == slipped_head
+    assert abs(outcome.figure("slip_first") - 300) < 40
+    assert "CALIBRATION_EXPIRED" in outcome.flags and "not corrected" in outcome.sentences
+
+
 def test_a_converging_head_that_rotated_widens_the_sigma_by_the_mean(
     converging: InjectedExposure,
 ) -> None:
