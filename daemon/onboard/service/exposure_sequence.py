@@ -53,6 +53,9 @@ from drivers.contract import (
     Record,
     TemperatureSample,
 )
+from processing.quality.figures import QualityFigures
+from processing.quality.figures.image import BandLevelFigures
+from processing.quality.level_steps import LevelHistory
 
 EARLY_FRAME_LIMIT_NS: Final = 12_000_000_000
 """Longest wait of a frame for the answer to its trigger, which comes within ten seconds."""
@@ -87,6 +90,7 @@ class ExposureSequence:
         self._emit = emit
         self._on_histograms = on_histograms
         self._mono_ns = mono_ns
+        self._levels = LevelHistory()
         self._orders: dict[int, Order] = {}
         self._early: list[Frame] = []
 
@@ -283,9 +287,25 @@ class ExposureSequence:
     def _on_processed(self, done: Processed) -> None:
         seconds = round(done.duration_s, 3)
         self._emit("processed", number=done.number, report=dict(done.report), duration_s=seconds)
+        self._compare_levels(done.number, done.report)
         self._on_histograms(done.number, done.histograms)
         self._send("writer", IndexProducts(done.number, done.files, done.report.get("verdict")))
         self._pass_on(self._queue.finished(done.number))
+
+    def _compare_levels(self, number: int, report: Mapping[str, Any]) -> None:
+        """Report bands that change alone against the exposures before: one cannot show it."""
+        figures = QualityFigures.from_json(report.get("figures", {}))
+        levels = figures.of(BandLevelFigures).level_by_band
+        known = {band: level for band, level in levels.items() if level is not None}
+        for step in self._levels.add(number, known):
+            self._emit(
+                "band-level",
+                number=number,
+                band=step.band,
+                before=step.before,
+                factor=round(step.factor, 3),
+                sentence=step.sentence,
+            )
 
     def _on_failed(self, failed: ProcessFailed) -> None:
         report, sentence = dict(failed.report), failed.sentence
