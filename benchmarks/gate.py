@@ -1,7 +1,8 @@
 """The performance gate of `make bench`: CPU time of the pipeline against the record.
 
 Ratios to a copy of the same bytes and to a bare cv2.remap, medians of runs in turn, hardly depend
-on the load of a machine. They do depend on its processor, so each has rows of its own.
+on the load of a machine. They do depend on its processor and on the ground of the exposure, so each
+has rows of its own.
 """
 
 from __future__ import annotations
@@ -17,32 +18,62 @@ from benchmarks.records import FOLDER, read_record
 RECORD: Final = FOLDER / "performance-gate.json"
 TOLERANCE: Final = 0.10
 COMMAND: Final = "python -m benchmarks.mini --accept"
-_COLUMNS: Final = ["processor", "over", "CPU time of the pipeline"]
+SLOWER, NOT_COMPARED = 1, 3
+"""Exit status where a ratio is above its record, and where there is no record of it."""
+_COLUMNS: Final = ["processor", "ground", "over", "CPU time of the pipeline", "cores", "date"]
+_KEY, _RATIO, _DATE = slice(0, 3), 3, 5
 
 
-def compared(ratios: Mapping[str, float], processor: str, record: Path = RECORD) -> dict[str, Any]:
+def processor_name(cpuinfo: Path = Path("/proc/cpuinfo")) -> str:
+    """Name of the processor with its family and model.
+
+    Virtual machines give several generations the same name.
+
+    Args:
+        cpuinfo: file of the kernel.
+
+    Returns:
+        "AMD EPYC, family 26, model 2".
+    """
+    known: dict[str, str] = {}
+    for line in cpuinfo.read_text(encoding="utf-8").splitlines():
+        key, _, value = line.partition(":")
+        known.setdefault(key.strip(), value.strip())
+    parts = [known.get("model name") or known.get("CPU part") or "unknown"]
+    parts += [f"{name[4:]} {known[name]}" for name in ("cpu family",) if name in known]
+    parts += [f"{name} {known[name]}" for name in ("model",) if name in known]
+    return ", ".join(parts)
+
+
+def compared(
+    ratios: Mapping[str, float], processor: str, ground: str, record: Path = RECORD
+) -> dict[str, Any]:
     """Compare measured ratios with those of the record.
 
     Args:
         ratios: CPU time of the pipeline over that of a task, by its name.
-        processor: model of the processor they were measured on.
+        processor: by `processor_name`, the one they were measured on.
+        ground: of the exposure.
         record: file of the record.
 
     Returns:
         `slower`: names of the tasks whose ratio is more than `TOLERANCE` above the record's;
-        `sentences`: what was found, one for each ratio.
+        `unknown`: names of those without a record; `status`: the exit status; `sentences`: what was
+        found, one for each ratio.
 
     Raises:
         RecordError: the record cannot be read.
     """
-    known = {(row[0], row[1]): float(row[2]) for row in _rows(record)}
-    slower, sentences = [], []
+    known = {row[_KEY]: float(row[_RATIO]) for row in _rows(record)}
+    slower, unknown, sentences = [], [], []
     for name, ratio in ratios.items():
-        limit = known.get((processor, name))
+        limit = known.get((processor, ground, name))
         if limit is None:
+            unknown.append(name)
             sentences.append(
-                f"{name}: {ratio:.2f}; the record has no figure for {processor}, so nothing was "
-                f"compared. Run `{COMMAND}` to add it."
+                f"{name}: {ratio:.2f}; the record has no figure for {processor} over {ground}, so "
+                f"nothing was compared. Run `{COMMAND}` on a state that is known to be fast to add "
+                "it."
             )
             continue
         change = ratio / limit - 1.0
@@ -54,27 +85,35 @@ def compared(ratios: Mapping[str, float], processor: str, record: Path = RECORD)
                 f"`{COMMAND}` and give the reason in the commit."
             )
         sentences.append(sentence)
-    return {"slower": slower, "sentences": sentences}
+    status = SLOWER if slower else NOT_COMPARED if unknown else 0
+    return {"slower": slower, "unknown": unknown, "status": status, "sentences": sentences}
 
 
-def accept(ratios: Mapping[str, float], processor: str, cores: int, record: Path = RECORD) -> None:
-    """Write measured ratios into the record; rows of other processors stay.
+def accept(
+    ratios: Mapping[str, float], processor: str, ground: str, cores: int, record: Path = RECORD
+) -> None:
+    """Write measured ratios into the record; rows of other processors and grounds stay.
 
     Args:
         ratios: as of `compared`.
-        processor: model of the processor.
-        cores: number of its cores.
+        processor: by `processor_name`.
+        ground: of the exposure.
+        cores: number of cores of the machine.
         record: file of the record.
 
     Raises:
         RecordError: the record cannot be read.
     """
-    rows = [list(row) for row in _rows(record) if row[0] != processor]
-    rows += [[processor, name, f"{ratio:.2f}"] for name, ratio in ratios.items()]
+    today = f"{datetime.now(UTC):%Y-%m-%d}"
+    rows = [list(row) for row in _rows(record) if row[:2] != (processor, ground)]
+    rows += [
+        [processor, ground, name, f"{ratio:.2f}", str(cores), today]
+        for name, ratio in ratios.items()
+    ]
     content = {
-        "date": [f"{datetime.now(UTC):%Y-%m-%d}"],
+        "date": sorted({row[_DATE] for row in rows}),
         "command": COMMAND,
-        "machine": f"{processor}, {cores} cores",
+        "machine": "each row's",
         "conditions": "CPU seconds, median of runs in turn",
         "figures": [{"table": {"columns": _COLUMNS, "rows": sorted(rows)}}],
     }

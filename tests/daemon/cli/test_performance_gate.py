@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -15,36 +16,72 @@ PROCESSOR = "Some Processor"
 @pytest.fixture
 def record(tmp_path: Path) -> Path:
     path = tmp_path / "performance-gate.json"
-    gate.accept({"copy": 10.0, "remap": 2.0}, PROCESSOR, 2, path)
+    gate.accept({"copy": 10.0, "remap": 2.0}, PROCESSOR, "landscape", 2, path)
     return path
 
 
 def test_a_tenth_more_passes_and_more_than_that_fails_with_its_cure(record: Path) -> None:
-    passed = gate.compared({"copy": 10.9, "remap": 2.19}, PROCESSOR, record)
+    passed = gate.compared({"copy": 10.9, "remap": 2.19}, PROCESSOR, "landscape", record)
     assert passed["slower"] == []
-    failed = gate.compared({"copy": 10.9, "remap": 2.21}, PROCESSOR, record)
+    failed = gate.compared({"copy": 10.9, "remap": 2.21}, PROCESSOR, "landscape", record)
     assert failed["slower"] == ["remap"]
     assert "record 2.00 (+10%)" in failed["sentences"][1]
     assert "--accept" in failed["sentences"][1] and "--accept" not in failed["sentences"][0]
 
 
 def test_a_faster_pipeline_passes(record: Path) -> None:
-    assert gate.compared({"copy": 5.0, "remap": 1.0}, PROCESSOR, record)["slower"] == []
+    assert (
+        gate.compared({"copy": 5.0, "remap": 1.0}, PROCESSOR, "landscape", record)["slower"] == []
+    )
 
 
-def test_a_processor_without_a_record_is_reported_as_not_compared(record: Path) -> None:
-    found = gate.compared({"copy": 99.0}, "Another Processor", record)
-    assert found["slower"] == []
+@pytest.mark.parametrize(
+    ("processor", "ground"), [("Another Processor", "landscape"), (PROCESSOR, "land")]
+)
+def test_a_processor_or_ground_without_a_record_does_not_pass(
+    record: Path, processor: str, ground: str
+) -> None:
+    found = gate.compared({"copy": 99.0}, processor, ground, record)
+    assert (found["slower"], found["unknown"], found["status"]) == ([], ["copy"], 3)
     assert "nothing was compared" in found["sentences"][0]
 
 
-def test_accepted_ratios_replace_those_of_their_own_processor_only(record: Path) -> None:
-    gate.accept({"copy": 7.0}, "Another Processor", 4, record)
-    gate.accept({"copy": 8.0, "remap": 1.5}, PROCESSOR, 2, record)
+def test_the_exit_status_is_that_of_the_worst_ratio(record: Path) -> None:
+    def status(**ratios: float) -> int:
+        return int(gate.compared(ratios, PROCESSOR, "landscape", record)["status"])
+
+    assert (status(copy=10.0), status(copy=20.0), status(other=1.0)) == (0, 1, 3)
+    assert status(copy=20.0, other=1.0) == 1
+
+
+def test_accepted_ratios_replace_those_of_their_own_processor_and_ground_only(
+    record: Path,
+) -> None:
+    text = record.read_text(encoding="utf-8")
+    record.write_text(re.sub(r"20\d\d-\d\d-\d\d", "2026-01-02", text), encoding="utf-8")
+    gate.accept({"copy": 7.0}, "Another Processor", "landscape", 4, record)
+    gate.accept({"copy": 6.0}, PROCESSOR, "land", 2, record)
+    content = read_record(record)
+    assert content.figures[0].table is not None
+    rows = content.figures[0].table.rows
+    assert [row[:5] for row in rows] == [
+        ("Another Processor", "landscape", "copy", "7.00", "4"),
+        (PROCESSOR, "land", "copy", "6.00", "2"),
+        (PROCESSOR, "landscape", "copy", "10.00", "2"),
+        (PROCESSOR, "landscape", "remap", "2.00", "2"),
+    ]
+    # Rows that stay keep the day they were measured on.
+    assert [row[5] for row in rows[2:]] == ["2026-01-02"] * 2
+    assert content.date[0] == "2026-01-02" < content.date[1]
+    gate.accept({"copy": 8.0}, PROCESSOR, "landscape", 2, record)
     table = read_record(record).figures[0].table
-    assert table is not None
-    assert table.rows == (
-        ("Another Processor", "copy", "7.00"),
-        (PROCESSOR, "copy", "8.00"),
-        (PROCESSOR, "remap", "1.50"),
-    )
+    assert table is not None and len(table.rows) == 3
+
+
+def test_generations_of_one_name_are_different_processors(tmp_path: Path) -> None:
+    info = tmp_path / "cpuinfo"
+    info.write_text("processor\t: 0\ncpu family\t: 26\nmodel\t\t: 2\nmodel name\t: AMD EPYC\n")
+    assert gate.processor_name(info) == "AMD EPYC, family 26, model 2"
+    info.write_text("processor\t: 0\nCPU part\t: 0xd0c\n\nprocessor\t: 1\nCPU part\t: 0xd0d\n")
+    assert gate.processor_name(info) == "0xd0c"
+    assert gate.processor_name()
