@@ -38,6 +38,7 @@ def triangulate_photographs(
     from daemon.mission.store.durable import create_file
     from daemon.postflight.adjustment.summary import print_report, report_of
     from daemon.postflight.calibration.rig_writer import rig_toml
+    from daemon.postflight.triangulation.control_mistakes import control_mistakes, doubtful_control
     from daemon.postflight.triangulation.ground_control import control_of
     from daemon.postflight.triangulation.photograph_block import photograph_block_of
     from daemon.postflight.triangulation.photograph_project import (
@@ -69,6 +70,8 @@ def triangulate_photographs(
 
         found = photograph_block_of(folder, crs=crs, progress=step)
         control = control_of(found, points, measured)
+        if mistakes := control_mistakes(found, control):
+            raise TriangulationError(f"{points}: {'; '.join(mistakes)}")
         project = photograph_project(
             found, control, position_sigma_m=position_sigma_m, reject_beyond=reject_beyond
         )
@@ -79,7 +82,8 @@ def triangulate_photographs(
         try:
             result = adjust(completed(project.network), project.settings, progress=show)
         except (NetworkError, RankDefectError) as error:
-            raise TriangulationError(f"{folder.path}: {error}") from error
+            doubts = "; ".join([str(error), *doubtful_control(found, control)])
+            raise TriangulationError(f"{folder.path}: {doubts}") from error
         report = report_of(
             result,
             project.checks,

@@ -58,7 +58,7 @@ def read_metashape(path: Path) -> Block:
     """Read the aligned cameras of the one component of the one chunk of a camera file.
 
     Positions are in metres in a local frame where the component lies on the earth, in its local
-    coordinates where the reference says so, and in units of the chunk (`Block.is_metric` false)
+    coordinates where the reference states them, and in units of the chunk (`Block.is_metric` false)
     where the component has no transformation.
 
     Raises:

@@ -1,7 +1,8 @@
 """The adjustment of a block of photographs: network, report section, adjusted rig.
 
 All parameters of the interior orientation are estimated with the orientations. Positions of EXIF
-are observations; their standard deviations are estimated as variance components.
+are observations; their standard deviations are estimated as variance components, and with control
+their common shift, such as that between heights above the ellipsoid and the geoid.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from daemon.postflight.adjustment.project import CheckPoints, Project
 from daemon.postflight.adjustment.project_file import AdjustSection, CameraSection, ProjectFile
 from daemon.postflight.importers.photographs import CONE
+from daemon.postflight.triangulation.control_mistakes import shift_to_control, unmeasured
 from daemon.postflight.triangulation.ground_control import GroundControl
 from daemon.postflight.triangulation.photograph_block import FREE, PhotographBlock
 from processing.bundle.adjust import Adjustment, AdjustmentSettings
@@ -29,13 +31,15 @@ from processing.bundle.network import (
     Points,
     Stations,
 )
+from processing.bundle.normal_equations import reduced_equations
 from processing.matching.block_matching import image_mm
 from processing.rig import Rig
 
 Array = NDArray[np.float64]
 
 TIE_SIGMA_PX: Final = 0.7
-CONTROL_MIN: Final = 3
+EXIF_LINE: Final = "EXIF"
+"""The positions of EXIF as one line, whose common shift against the control is unknown."""
 _LENS_FIELDS: Final = {"dx0": "dx0_mm", "dy0": "dy0_mm", "df": "df_mm"}
 
 
@@ -54,11 +58,13 @@ def photograph_project(
         position_sigma_m: of the positions of EXIF, east, north, up.
         reject_beyond: rejection limit in sigmas.
     """
+    shift_m = shift_to_control(found, control)
+    has_shift = _places_block(control)
     block, tied = found.block, found.tied
     n, pitch = len(block.names), block.image.pitch_mm
     is_control = np.array([role == "control" for role in control.roles], dtype=bool)
     names = (*(f"t{k}" for k in range(tied.points)), *control.names)
-    xyz = np.concatenate([found.xyz_m, np.full((len(control.names), 3), np.nan)])
+    xyz = np.concatenate([found.xyz_m + shift_m, np.full((len(control.names), 3), np.nan)])
     sigma = np.full((len(names), 3), np.nan)
     xyz[tied.points :][is_control] = control.xyz_m[is_control]
     sigma[tied.points :][is_control] = control.sigma_m[is_control]
@@ -68,7 +74,7 @@ def photograph_project(
     placed = np.flatnonzero(np.isfinite(found.position_m[:, 0]))
     network = Network(
         cameras=(replace(found.camera, sigma={}),),
-        stations=Stations(block.names, block.station_m, np.zeros(n, bool)),
+        stations=Stations(block.names, block.station_m + shift_m, np.zeros(n, bool)),
         attitudes=Attitudes(block.names, block.rotation, np.zeros(n, bool)),
         images=Images(block.names, every, every, np.zeros(n, np.int64), np.full(n, -1)),
         points=Points(names, xyz, sigma, np.zeros(len(names), bool)),
@@ -84,8 +90,10 @@ def photograph_project(
             position_m=found.position_m[placed],
             sigma_m=np.tile(position_sigma_m, (len(placed), 1)),
             lever_m=np.zeros((len(placed), 3)),
-            line=np.full(len(placed), -1),
+            line=np.zeros(len(placed), np.int64) if has_shift else np.full(len(placed), -1),
             time_s=np.zeros(len(placed)),
+            lines=(EXIF_LINE,) if has_shift else (),
+            drift="shift" if has_shift else "none",
         ),
     )
     settings = AdjustmentSettings(
@@ -98,6 +106,7 @@ def photograph_project(
             robust=True,
             reject_beyond=reject_beyond,
             variance_components=True,
+            gnss="shift" if has_shift else "none",
             image_sigma_um=TIE_SIGMA_PX * block.image.pitch_um,
         ),
         camera=(
@@ -141,7 +150,10 @@ def photographs_section(
     height_m = float(result.state.station[:, 2].mean() - np.nanmedian(result.state.points[:, 2]))
     gnss = result.network.gnss
     away = result.state.station[gnss.station] - gnss.position_m
-    controls = int(np.isfinite(result.network.points.sigma_m).any(axis=1).sum())
+    if len(gnss.lines):
+        away = away + result.state.shift[0]
+    controls = _measured_control(result)
+    correlation, ground_sigma_m = f_and_ground_height(result)
     return {
         "files": dict(found.files),
         "oriented": len(block.names),
@@ -152,21 +164,30 @@ def photographs_section(
         "f_sigma_px": sigma["df"] / pitch,
         "height_above_ground_m": height_m,
         "height_per_percent_m": 0.01 * height_m,
+        "position_shift_m": [float(v) for v in result.state.shift[0]] if len(gnss.lines) else None,
         "position_rms_m": [float(v) for v in np.sqrt(np.mean(away**2, axis=0))],
         "control_points": controls,
-        "f_and_height_separated": controls >= CONTROL_MIN,
+        "control_not_measured": unmeasured(control),
+        "f_ground_correlation": correlation,
+        "ground_sigma_of_f_m": ground_sigma_m,
+        "f_and_height_separated": ground_sigma_m <= height_m * pitch / f_mm,
     }
 
 
 def photograph_cautions(section: Mapping[str, Any]) -> list[str]:
     """What a reader has to know about the result, one sentence each."""
     found = list(section["left_out"])
+    found += section["control_not_measured"]
     if not section["f_and_height_separated"]:
+        used = section["control_points"]
+        how = f"by {used} control points" if used else "without control"
         found.append(
-            f"f and height are not separated without control: a change of f by 1 % "
+            f"f and height are not separated {how}: a change of f by 1 % "
             f"({0.01 * section['f_px']:.0f} px) moves the ground by "
-            f"{section['height_per_percent_m']:.2f} m. Give three control points or more "
-            "(--points)"
+            f"{section['height_per_percent_m']:.2f} m, and the standard deviation of f, "
+            f"{section['f_sigma_px']:.1f} px, by {section['ground_sigma_of_f_m']:.2f} m "
+            f"(correlation {section['f_ground_correlation']:.2f}). Give three control points or "
+            "more, spread over the block (--points)"
         )
     drift = abs(section["f_px"] / section["f_exif_px"] - 1.0)
     if drift > 0.05:
@@ -175,6 +196,46 @@ def photograph_cautions(section: Mapping[str, Any]) -> list[str]:
             f"{section['f_px']:.0f} px)"
         )
     return found
+
+
+def f_and_ground_height(result: Adjustment) -> tuple[float, float]:
+    """How far the principal distance decides the mean height of the object points.
+
+    Args:
+        result: adjusted photographs, df of the only camera among the unknowns.
+
+    Returns:
+        Correlation of f with the mean height, and the standard deviation of that height that
+        comes from f alone, m.
+    """
+    column = result.layout.interior[0][INTERIOR.index("df")]
+    of_f = float(result.cofactor[column, column])
+    reduced = reduced_equations(result.equations, result.layout)
+    points = len(result.layout.eliminated_points)
+    mean = np.zeros((points, 3))
+    mean[:] = reduced.point_factor[:, 2, :] / points
+    by_column = np.zeros(result.layout.columns)
+    by_column[reduced.sparse_columns] = -(reduced.coupling_sparse.T @ mean.ravel())
+    by_column[reduced.dense_columns] = -(reduced.coupling_dense.T @ mean.ravel())
+    both = -float(by_column @ result.cofactor[:, column])
+    of_height = float(by_column @ result.cofactor @ by_column + (mean**2).sum())
+    correlation = both / float(np.sqrt(of_f * of_height))
+    return correlation, result.sigma0 * abs(both) / float(np.sqrt(of_f))
+
+
+def _places_block(control: GroundControl) -> bool:
+    """Whether control fixes a shift: a point in two photographs, or three points."""
+    is_control = np.array([role == "control" for role in control.roles], dtype=bool)
+    views = np.bincount(control.point, minlength=len(control.names))[is_control]
+    return bool((views >= 2).any() or (views >= 1).sum() >= 3)
+
+
+def _measured_control(result: Adjustment) -> int:
+    """Control points with an image measurement that was used."""
+    table = result.network.image_points
+    seen = np.bincount(table.point[result.weight > 0.0], minlength=len(result.network.points.names))
+    is_control = np.isfinite(result.network.points.sigma_m).any(axis=1)
+    return int((is_control & (seen > 0)).sum())
 
 
 def _interior_sigmas(result: Adjustment) -> dict[str, float]:

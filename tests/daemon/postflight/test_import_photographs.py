@@ -9,7 +9,9 @@ from __future__ import annotations
 import csv
 import json
 import math
+import re
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -28,8 +30,18 @@ from daemon.postflight.importers.exif_tags import (
     position_of,
     read_tags,
 )
-from daemon.postflight.triangulation.ground_control import read_gcp_list
+from daemon.postflight.triangulation import photograph_block
+from daemon.postflight.triangulation.control_mistakes import control_mistakes, doubtful_control
+from daemon.postflight.triangulation.ground_control import GroundControl, read_gcp_list
+from daemon.postflight.triangulation.photograph_block import PhotographBlock
+from daemon.postflight.triangulation.photograph_project import (
+    photograph_cautions,
+    photograph_project,
+    photographs_section,
+)
 from daemon.postflight.triangulation.triangulation import TriangulationError
+from processing.bundle.adjust import adjust
+from processing.bundle.initial_values import completed
 from processing.geometry.rotation import rotation_matrix
 from processing.pipelines.perspective import raw_of_perspective
 from processing.rig import load_rig
@@ -124,7 +136,9 @@ def test_photographs_without_positions_or_focal_length_are_refused(tmp_path) -> 
 
 
 @pytest.fixture(scope="module")
-def triangulated(photographs, tmp_path_factory) -> tuple[Path, dict]:
+def triangulated_block(photographs, tmp_path_factory) -> tuple[Path, dict, PhotographBlock]:
+    """The mission, its report without control, and its oriented block."""
+    blocks: list[PhotographBlock] = []
     mission = tmp_path_factory.mktemp("mission") / "field"
     made = RUN.invoke(
         app, ["import", "photographs", str(photographs), "--out", str(mission), "--json"]
@@ -133,9 +147,26 @@ def triangulated(photographs, tmp_path_factory) -> tuple[Path, dict]:
     about = json.loads(made.stdout)
     assert about["photographs"] == len(USED)
     assert about["f_px"] == pytest.approx(2497.74 * WIDTH / 3600, rel=1e-4)
-    done = RUN.invoke(app, ["triangulate", str(mission), "--json"])
+    real = photograph_block.photograph_block_of
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            photograph_block,
+            "photograph_block_of",
+            lambda *args, **named: blocks.append(real(*args, **named)) or blocks[-1],
+        )
+        done = RUN.invoke(app, ["triangulate", str(mission), "--json"])
     assert done.exit_code == 0, f"{done.output} {done.exception}"
-    return mission, json.loads(done.stdout)
+    return mission, json.loads(done.stdout), blocks[0]
+
+
+@pytest.fixture(scope="module")
+def triangulated(triangulated_block) -> tuple[Path, dict]:
+    return triangulated_block[:2]
+
+
+@pytest.fixture(scope="module")
+def block(triangulated_block) -> PhotographBlock:
+    return triangulated_block[2]
 
 
 def test_photographs_are_triangulated_without_attitudes(triangulated) -> None:
@@ -208,6 +239,122 @@ def test_photographs_without_a_triangulation_have_no_orthomosaic(photographs, tm
     done = RUN.invoke(app, ["orthomosaic", str(mission)])
     assert done.exit_code != 0
     assert "run syntopic triangulate first" in f"{done.output} {done.exception}"
+
+
+SHIFT_M = np.array([2.0, -3.0, 25.0])
+"""Of control against EXIF, such as that of heights above the geoid."""
+
+
+def control_from(block: PhotographBlock, count: int, *, views: int | None = None) -> GroundControl:
+    """Tie points far from each other as control, where the block has them, shifted."""
+    seen = np.bincount(block.tied.point, minlength=block.tied.points)
+    known = np.flatnonzero(seen >= 3)
+    place = block.xyz_m[known, :2]
+    chosen = [int(np.argmin(place.sum(axis=1)))]
+    while len(chosen) < count:
+        near = np.linalg.norm(place[:, None] - place[chosen][None], axis=2).min(axis=1)
+        chosen.append(int(np.argmax(near)))
+    rows = [
+        (point, row)
+        for point, k in enumerate(known[chosen])
+        for row in np.flatnonzero(block.tied.point == k)[:views]
+    ]
+    at = np.array([row for _, row in rows])
+    noise = np.random.default_rng(3).normal(0.0, 0.3, (len(rows), 2))
+    return GroundControl(
+        tuple(f"p{k}" for k in range(count)),
+        ("control",) * count,
+        block.xyz_m[known[chosen]] + SHIFT_M,
+        np.tile((0.02, 0.02, 0.03), (count, 1)),
+        block.tied.image[at],
+        np.array([point for point, _ in rows]),
+        block.tied.px[at] + noise,
+        np.full(len(rows), 0.5),
+    )
+
+
+def section_of(block: PhotographBlock, control: GroundControl) -> dict:
+    project = photograph_project(
+        block, control, position_sigma_m=(3.0, 3.0, 5.0), reject_beyond=3.5
+    )
+    result = adjust(completed(project.network), project.settings)
+    return photographs_section(block, control, result)
+
+
+@pytest.mark.parametrize(("count", "views"), [(1, None), (3, None), (3, 1)])
+def test_control_shifts_the_block_against_exif(block, count, views) -> None:
+    """Three points in one plane, one point alone, and points in one photograph each converge."""
+    control = control_from(block, count, views=views)
+    assert control_mistakes(block, control) == []
+    section = section_of(block, control)
+    assert section["control_points"] == count
+    assert -np.array(section["position_shift_m"]) == pytest.approx(SHIFT_M, abs=3.0)
+    assert max(section["position_rms_m"]) < 5.0
+    assert section["f_and_height_separated"] and section["ground_sigma_of_f_m"] < 0.05
+
+
+def test_control_that_no_photograph_shows_separates_nothing(block) -> None:
+    control = control_from(block, 3)
+    none = np.zeros(0, np.int64)
+    unseen = replace(control, image=none, point=none, px=control.px[:0], sigma_px=np.zeros(0))
+    section = section_of(block, unseen)
+    assert section["control_points"] == 0 and not section["f_and_height_separated"]
+    assert section["ground_sigma_of_f_m"] > 0.1
+    cautions = photograph_cautions(section)
+    assert any("not measured in the block: p0, p1, p2" in one for one in cautions)
+
+
+@pytest.mark.parametrize("views", [None, 1])
+def test_exchanged_control_points_are_named(block, views) -> None:
+    control = control_from(block, 3, views=views)
+    xyz = control.xyz_m[[2, 1, 0]]
+    (sentence,) = control_mistakes(block, replace(control, xyz_m=xyz))
+    assert "control points p0 and p2 are exchanged" in sentence
+
+
+def test_columns_for_rows_and_far_control_are_refused_with_the_reason(block) -> None:
+    control = control_from(block, 4)
+    (sentence,) = control_mistakes(block, replace(control, px=control.px[:, ::-1]))
+    assert "columns and rows appear exchanged" in sentence
+    inside = np.clip(control.px, 0, 600)
+    inside[:, 1] = control.px[:, 1]
+    turned = replace(control, px=inside[:, ::-1])
+    assert "columns and rows" in control_mistakes(block, turned)[0]
+    far = replace(control, xyz_m=control.xyz_m + np.array([0.0, 4.2e6, 0.0]))
+    (sentence,) = control_mistakes(block, far)
+    assert "p0 (4199.9 km)" in sentence and "order of east and north" in sentence
+
+
+def test_a_wrong_control_point_is_named_where_the_adjustment_fails(block) -> None:
+    control = control_from(block, 4)
+    assert doubtful_control(block, control) == []
+    xyz = control.xyz_m + np.array([[0, 0, 0], [0, 8.0, 0], [0, 0, 0], [0, 0, 0]])
+    (sentence,) = doubtful_control(block, replace(control, xyz_m=xyz))
+    assert re.search(r"p1 by [78]\.\d m;", sentence)
+
+
+def test_control_in_tables_is_refused_by_the_command(triangulated, block, tmp_path) -> None:
+    """A gcp_list.txt in degrees with two names exchanged; the command names them."""
+    mission, _ = triangulated
+    control = control_from(block, 3)
+    place = block.block.frame.to_geodetic(control.xyz_m[[2, 1, 0]])
+    lines = ["EPSG:4326"]
+    for image, point, (column, row) in zip(control.image, control.point, control.px, strict=True):
+        latitude, longitude, height = place[point]
+        file = block.files[block.block.names[image]]
+        lines.append(
+            f"{longitude:.9f} {latitude:.9f} {height:.3f} {column:.2f} {row:.2f} {file} p{point}"
+        )
+    path = tmp_path / "gcp_list.txt"
+    path.write_text("\n".join(lines) + "\n")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(photograph_block, "photograph_block_of", lambda *_a, **_n: block)
+        done = RUN.invoke(
+            app,
+            ["triangulate", str(mission), "--points", str(path), "--out", str(tmp_path / "out")],
+        )
+    assert done.exit_code != 0
+    assert "p0 and p2 are exchanged" in str(done.exception), done.output
 
 
 def test_unrelated_photographs_are_reported(photographs, tmp_path) -> None:
