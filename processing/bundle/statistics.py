@@ -20,6 +20,7 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 _PART_BYTES = 64_000_000
+_PART_ROWS = 200_000
 
 
 @dataclass(frozen=True)
@@ -60,30 +61,15 @@ def spread_of(
     points = len(reduced.point_factor)
     influence = np.zeros((len(equations.point), 3))
     through = np.zeros((points, 3, 3))
-    thin, dense = reduced.sparse_columns, reduced.dense_columns
     order = np.argsort(equations.point, kind="stable")
     begin = np.searchsorted(equations.point[order], np.arange(points + 1))
-    for low, high, spread, coupling, coupling_dense in _parts(reduced, cofactor):
-        in_thin, in_dense = spread[:, thin], spread[:, dense]
-        for axis in range(3):
-            own = coupling[axis::3].tocsr()
-            for other in range(3):
-                through[low:high, other, axis] = _row_products(own, in_thin[other::3])
-        through[low:high] += np.einsum(
-            "pic,pjc->pij",
-            in_dense.reshape(high - low, 3, -1),
-            coupling_dense.reshape(high - low, 3, -1),
-        )
+    for low, high in _point_ranges(begin):
         rows = order[begin[low] : begin[high]]
         local = equations.point[rows] - low
+        part, mixed = _through_columns(reduced, cofactor, rows, local, low, high)
+        through[low:high] = part
         b = reduced.point_rows[rows]
-        sparse_rows, dense_rows = reduced.design_sparse[rows], reduced.design_dense[rows]
-        mixed = np.zeros((len(rows), 3))
-        for axis in range(3):
-            at = 3 * local + axis
-            mixed[:, axis] = _row_products(sparse_rows, in_thin, at)
-            mixed[:, axis] += np.einsum("md,md->m", dense_rows, in_dense[at])
-        back = np.einsum("mij,mj->mi", through[equations.point[rows]], b)
+        back = np.einsum("mij,mj->mi", part[local], b)
         leverage[rows] += np.einsum("mi,mi->m", b, back - 2.0 * mixed)
         factor = reduced.point_factor[equations.point[rows]]
         influence[rows] = np.einsum("mij,mj->mi", factor, b + back - mixed)
@@ -91,6 +77,67 @@ def spread_of(
     factor = reduced.point_factor
     cofactors = np.einsum("pij,pjk,plk->pil", factor, inner, factor)
     return np.asarray(cofactors), np.asarray(np.clip(leverage, 0.0, 1.0)), influence
+
+
+def _point_ranges(begin: Indices) -> Iterator[tuple[int, int]]:
+    """Ranges of points of about `_PART_ROWS` rows; row `begin[k]` is the first of point k."""
+    low, points = 0, len(begin) - 1
+    while low < points:
+        high = int(np.searchsorted(begin, begin[low] + _PART_ROWS, side="right")) - 1
+        high = min(max(high, low + 1), points)
+        yield low, high
+        low = high
+
+
+def _through_columns(
+    reduced: ReducedEquations, cofactor: Array, rows: Indices, local: Indices, low: int, high: int
+) -> tuple[Array, Array]:
+    """W Q W' of the points low..high (n, 3, 3), and W Q a' of their rows (m, 3).
+
+    Only cofactors between a point's own columns are needed: those of the images that see it, and
+    dense ones.
+    """
+    thin, dense = reduced.sparse_columns, reduced.dense_columns
+    n, design, b = high - low, reduced.design_sparse[rows], reduced.point_rows[rows]
+    row = np.repeat(np.arange(len(rows)), np.diff(design.indptr))
+    width = max(len(thin), 1)
+    keys, place = np.unique(local[row] * width + design.indices, return_inverse=True)
+    coupling = np.stack(
+        [
+            np.bincount(place, weights=b[row, axis] * design.data, minlength=len(keys))
+            for axis in range(3)
+        ],
+        axis=1,
+    ).astype(np.float64)
+    columns = thin[keys % width]
+    first = np.searchsorted(keys // width, np.arange(n + 1))
+    count = np.diff(first)
+    of_dense = reduced.coupling_dense[3 * low : 3 * high].reshape(n, 3, -1)
+    among_dense = cofactor[np.ix_(dense, dense)]
+    spread, spread_dense = np.zeros((len(keys), 3)), np.zeros((n, 3, len(dense)))
+    through = np.zeros((n, 3, 3))
+    for size in np.unique(count):
+        of_size = np.flatnonzero(count == size)
+        step = max(1, _PART_BYTES // (8 * max(int(size), 1) * (int(size) + len(dense) + 1)))
+        for begin in range(0, len(of_size), step):
+            own = of_size[begin : begin + step]
+            at = first[own][:, None] + np.arange(size)
+            c, d, its = coupling[at].transpose(0, 2, 1), of_dense[own], columns[at]
+            across = cofactor[its[:, :, None], dense]
+            s = c @ cofactor[its[:, :, None], its[:, None, :]] + d @ across.transpose(0, 2, 1)
+            s_dense = c @ across + d @ among_dense
+            spread[at], spread_dense[own] = s.transpose(0, 2, 1), s_dense
+            through[own] = s @ c.transpose(0, 2, 1) + s_dense @ d.transpose(0, 2, 1)
+    mixed = np.stack(
+        [
+            np.bincount(row, weights=design.data * spread[place, axis], minlength=len(rows))
+            for axis in range(3)
+        ],
+        axis=1,
+    ).astype(np.float64)
+    if len(dense):
+        mixed += np.einsum("md,mid->mi", reduced.design_dense[rows], spread_dense[local])
+    return through, mixed
 
 
 def _own_products(reduced: ReducedEquations, cofactor: Array) -> Array:
@@ -210,25 +257,8 @@ def groups_of(
     return tuple(found)
 
 
-def _parts(
-    reduced: ReducedEquations, cofactor: Array
-) -> Iterator[tuple[int, int, Array, sparse.csr_array, Array]]:
-    """Points low..high, their coupling times the cofactors (3n, c), and the coupling itself."""
-    points = len(reduced.point_factor)
-    step = max(1, _PART_BYTES // (24 * max(len(cofactor), 1)))
-    thin, dense = cofactor[reduced.sparse_columns], cofactor[reduced.dense_columns]
-    for low in range(0, points, step):
-        high = min(low + step, points)
-        rows = slice(3 * low, 3 * high)
-        coupling_s, coupling_d = reduced.coupling_sparse[rows], reduced.coupling_dense[rows]
-        yield low, high, coupling_s @ thin + coupling_d @ dense, coupling_s, coupling_d
-
-
-def _row_products(
-    rows: sparse.csr_array, dense: Array, of: NDArray[np.int64] | None = None
-) -> Array:
-    """Scalar products of each sparse row with the dense row of its own number, or of `of`, (m,)."""
+def _row_products(rows: sparse.csr_array, dense: Array) -> Array:
+    """Scalar products of each sparse row with the dense row of its own number, (m,)."""
     row = np.repeat(np.arange(rows.shape[0]), np.diff(rows.indptr))
-    at = row if of is None else of[row]
-    products = np.asarray(rows.data * dense[at, rows.indices], dtype=np.float64)
+    products = np.asarray(rows.data * dense[row, rows.indices], dtype=np.float64)
     return np.bincount(row, weights=products, minlength=rows.shape[0]).astype(np.float64)
