@@ -386,6 +386,15 @@ def test_after_landing_the_summary_stays_without_an_alarm(cockpit: Cockpit) -> N
         assert expected in summary, expected
     csv = browser.evaluate("(async () => (await import('/landing.js')).textOf('fly-again.csv'))()")
     assert csv.startswith("line,strip,kind,from_m")
+    assert browser.text("#image-which") == "7", "the selection outlives a lost connection"
+    assert not browser.evaluate("document.querySelector('#quicklook').hidden")
+    assert browser.evaluate("document.querySelector('#guidance').hidden")
+    # Pictures show a path as it is on the computer of a camera.
+    path = "/srv/missions/20261121T101500Z-small"
+    browser.evaluate(
+        "document.querySelectorAll('#landing code').forEach((one) => {"
+        f" one.textContent = one.textContent.replace(/\\/\\S*/, '{path}'); }})"
+    )
     check(cockpit, "after-landing")
     browser.open(cockpit.service.address)
     cockpit.until("document.querySelector('#phase-button')?.innerText === 'Starting'")

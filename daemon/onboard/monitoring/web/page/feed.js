@@ -79,8 +79,16 @@ export function lastWhere(predicate) {
   return found;
 }
 
+let mission = null;
+
 onChange((record, isFirstRecord) => {
-  if (isFirstRecord) setSelected(null);
+  const id = flight.brief.mission?.id ?? null;
+  // After a reconnection to the same flight the selection stays; to another one, the page follows the latest exposure again.
+  if (isFirstRecord && (id !== mission || !flight.exposures.has(feed.selected))) {
+    feed.isFollowing = true;
+    setSelected(null);
+  }
+  mission = id;
   if (feed.isFollowing) {
     const latest = lastWhere((one) => one.step === "processed")?.number;
     if (latest != null && latest !== feed.selected) setSelected(latest);

@@ -31,6 +31,7 @@ export function start(root, feed) {
   };
   setInterval(() => { if (root.firstChild) drawAge(root, age, last); }, AGE_MS);
   feed.subscribe((record) => {
+    root.hidden = feed.flight.brief.phase === "landed";
     if (!record && last) draw();
     if (isConnected || !feed.flight.brief?.status?.lines) return;
     isConnected = true;

@@ -102,13 +102,14 @@ async function showImage(number, isFollowing = false) {
   const address = `/api/v1/exposures/${number}/quicklook.jpg`;
   if (shownAddress === address || (isFollowing && shownAddress === `thumbnail ${number}`)) return;
   shownAddress = address;
-  const refit = image.hidden;
+  const [isHidden, width] = [image.hidden, image.naturalWidth];
   const products = isFollowing && isSlow() ? Promise.resolve([null, null])
     : Promise.all(["histogram.json", "residuals.json"].map((name) => fetchJson(`/api/v1/exposures/${number}/${name}`)));
   image.onload = async () => {
     image.hidden = false;
     placeholder.hidden = true;
-    if (refit) fit();
+    // A thumbnail has another size than the quick look.
+    if (isHidden || image.naturalWidth !== width) fit();
     const [raw, vectors] = await products;
     if (shownAddress !== address && shownAddress !== `thumbnail ${number}`) return;
     if (raw) drawHistogram(canvas, raw);

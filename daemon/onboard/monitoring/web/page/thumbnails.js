@@ -19,6 +19,8 @@ export function thumbnailOf(number) {
 }
 
 const SLOW_BYTES_PER_S = 80000;
+// What TCP sends before the first acknowledgement, RFC 6928: a smaller file uses a part of what the link could carry.
+const FIRST_WINDOW_BYTES = 14600;
 let secondsPerByte = 0;
 let latencyMs = Infinity;
 
@@ -33,8 +35,9 @@ async function load(number) {
   if (picture) {
     // The latency of the link is the shortest seen; what an answer took longer is the work of the service.
     latencyMs = Math.min(latencyMs, answeredMs - sinceMs);
-    const transferMs = latencyMs + performance.now() - answeredMs;
-    secondsPerByte = 0.6 * secondsPerByte + 0.4 * transferMs / 1000 / Math.max(picture.size, 1);
+    const bodyMs = performance.now() - answeredMs;
+    const perByteMs = latencyMs / Math.max(picture.size, FIRST_WINDOW_BYTES) + bodyMs / Math.max(picture.size, 1);
+    secondsPerByte = 0.6 * secondsPerByte + 0.4 * perByteMs / 1000;
   }
   if (!picture) {
     known.delete(number);
