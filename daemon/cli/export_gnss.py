@@ -58,6 +58,7 @@ def rinex(
             "intervals_with_several_marks": done.crowded,
             "unknown_signals": done.counts.unknown_signals,
             "unreadable_messages": done.counts.unreadable,
+            "other_receivers": list(done.other_receivers),
             "failures": [failure.as_json() for failure in done.failures],
         }
         typer.echo(json.dumps(content))
@@ -69,6 +70,13 @@ def rinex(
         f"marks in {done.folder / done.name}",
         soft_wrap=True,
     )
+    if done.other_receivers:
+        console.print(
+            f"Receiver {done.folder.name} of several; "
+            f"{', '.join(done.other_receivers)} by --receiver",
+            style="yellow",
+            soft_wrap=True,
+        )
     for count, what in (
         (done.written.left_out, "values do not fit RINEX's columns and are left out"),
         (done.counts.unknown_signals, "signals have no RINEX code and are left out"),

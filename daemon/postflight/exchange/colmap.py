@@ -231,11 +231,15 @@ def read_colmap(folder: Path) -> Block:
             cameras[int(words[0])] = len(found)
             found.append(_camera(place, words))
     rows = list(_records(folder / "images.txt", keeps_empty=True))
+    if len(rows) % 2:
+        # An image without measurements at the end, its line of measurements lost by an editor.
+        place, words = rows[-1]
+        rows = [*rows, (place, [])] if words else rows[:-1]
     posed = _frame_poses(folder)
     images: list[BlockImage] = []
     index: dict[int, int] = {}
     seen: list[tuple[int, int, float, float]] = []
-    for (place, words), (where, measured) in zip(rows[::2], rows[1::2], strict=False):
+    for (place, words), (where, measured) in zip(rows[::2], rows[1::2], strict=True):
         with _reading(place):
             number, camera = int(words[0]), int(words[8])
             if camera not in cameras:

@@ -109,7 +109,10 @@ def geo_text(block: Block, suffix: str) -> str:
         if eo is None:
             raise BlockError(f"image {image.name} has no orientation in a coordinate system")
         yaw, pitch, roll = yaw_pitch_roll_deg(eo.enu_from_camera)
-        sigma = [f"{v:.4f}" for v in image.sigma_m[1:]] if image.sigma_m is not None else []
+        sigma = []
+        if image.sigma_m is not None:
+            east, north, up = image.sigma_m
+            sigma = [f"{max(east, north):.4f}", f"{up:.4f}"]
         place = f"{eo.longitude_deg:.10f} {eo.latitude_deg:.10f} {eo.height_m:.4f}"
         angles = f"{yaw:.6f} {pitch:.6f} {roll:.6f}"
         lines.append(" ".join([image.name + suffix, place, angles, *sigma]))

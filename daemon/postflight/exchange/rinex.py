@@ -20,6 +20,7 @@ KINDS = ("C", "L", "D", "S")
 TICK_NS = 100
 EPOCH_FLAG_EVENT = 5
 _GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC)
+_LOCK_ROUNDING_S = 0.1
 _LIMIT = {"C": 1e10, "L": 1e10, "D": 1e10, "S": 1e10}
 """A field is F14.3: what does not fit is left out and counted."""
 
@@ -79,7 +80,7 @@ def observation_text(
     types = _types(ordered.values())
     lines = _header(header, ordered, types, version)
     pending = sorted(_rounded(mark) for mark in marks_ns)
-    lock: dict[tuple[str, str], float] = {}
+    lock: dict[tuple[str, str], tuple[float, int]] = {}
     values = left_out = 0
     for instant in instants:
         while pending and pending[0] <= instant:
@@ -149,7 +150,8 @@ def _header(
             for code in codes
         ),
         *_glonass(epochs),
-        _line(" C1C    0.000 C1P    0.000 C2C    0.000 C2P    0.000", "GLONASS COD/PHS/BIS"),
+        # Blank: not known. Zeros would state that code and phase are aligned.
+        _line("", "GLONASS COD/PHS/BIS"),
         _line("", "END OF HEADER"),
     ]
     return lines
@@ -173,7 +175,9 @@ def _glonass(epochs: Mapping[int, ObservationEpoch]) -> list[str]:
 
 
 def _epoch(
-    epoch: ObservationEpoch, types: Mapping[str, Sequence[str]], lock: dict[tuple[str, str], float]
+    epoch: ObservationEpoch,
+    types: Mapping[str, Sequence[str]],
+    lock: dict[tuple[str, str], tuple[float, int]],
 ) -> tuple[list[str], int, int]:
     by_satellite: dict[str, dict[str, Observation]] = {}
     for one in epoch.observations:
@@ -184,7 +188,7 @@ def _epoch(
         for code in types[satellite[0]]:
             signal = by_satellite[satellite].get(code)
             values = _values(signal)
-            slip = _loss_of_lock(satellite, signal, lock)
+            slip = _loss_of_lock(satellite, signal, epoch.gps_ns, lock)
             for kind in KINDS:
                 value = values[kind]
                 if value is not None and abs(value) >= _LIMIT[kind] * (0.1 if value < 0 else 1.0):
@@ -209,14 +213,25 @@ def _values(one: Observation | None) -> dict[str, float | None]:
 
 
 def _loss_of_lock(
-    satellite: str, one: Observation | None, lock: dict[tuple[str, str], float]
+    satellite: str,
+    one: Observation | None,
+    gps_ns: int,
+    lock: dict[tuple[str, str], tuple[float, int]],
 ) -> int:
-    """1: the phase was lost since the epoch before; 2: it may be off by half a cycle."""
+    """1: the phase was lost since it was last seen; 2: it may be off by half a cycle.
+
+    It was lost where it is tracked for less time than before, or than has passed since: after a
+    gap of the recording, or behind the largest time that a receiver counts.
+    """
     if one is None or one.phase_cycles is None:
         return 0
     key = (satellite, one.code)
-    slipped = one.lock_s < lock.get(key, 0.0) or (key not in lock and one.lock_s == 0.0)
-    lock[key] = one.lock_s
+    slipped = one.lock_s == 0.0
+    if key in lock:
+        before_s, seen_ns = lock[key]
+        since_s = (gps_ns - seen_ns) * 1e-9
+        slipped = one.lock_s < before_s or one.lock_s < since_s - _LOCK_ROUNDING_S
+    lock[key] = one.lock_s, gps_ns
     return int(slipped) + 2 * one.half_cycle
 
 

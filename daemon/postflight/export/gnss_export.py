@@ -50,7 +50,10 @@ class GnssExportError(DaemonError):
 
 @dataclass(frozen=True)
 class GnssExport:
-    """The folder, the written file, its figures, and exposures without a mark of the receiver."""
+    """The folder, the written file, its figures, and exposures without a mark of the receiver.
+
+    `other_receivers` have observations, too, and were not asked for.
+    """
 
     folder: Path
     name: str
@@ -59,6 +62,7 @@ class GnssExport:
     without_mark: tuple[int, ...]
     crowded: int
     failures: tuple[ExposureFailure, ...]
+    other_receivers: tuple[str, ...] = ()
 
 
 def export_rinex(
@@ -83,7 +87,7 @@ def export_rinex(
     """
     if version not in VERSIONS:
         raise GnssExportError(f"RINEX {version} is not written; {' and '.join(VERSIONS)} are")
-    name, driver = _receiver_of(mission, receiver)
+    name, driver, others = _receiver_of(mission, receiver)
     counts = ObservationCounts()
     epochs = list(DECODERS[driver](_recorded(mission, name), counts))
     if not epochs:
@@ -108,14 +112,15 @@ def export_rinex(
     folder = mission.export_dir / "rinex" / name
     texts = {f"{name}.obs": written.text, "marks.csv": _marks_text(marked)}
     write_folder(folder, {file: [text.encode("utf-8")] for file, text in texts.items()})
-    without = tuple(e.number for e in exposures if e not in marked)
+    with_mark = {e.number for e in marked}
+    without = tuple(e.number for e in exposures if e.number not in with_mark)
     return GnssExport(
-        folder, f"{name}.obs", written, counts, without, crowded, tuple(sealed.failures)
+        folder, f"{name}.obs", written, counts, without, crowded, tuple(sealed.failures), others
     )
 
 
-def _receiver_of(mission: Mission, wanted: str | None) -> tuple[str, str]:
-    """Name and driver of the receiver."""
+def _receiver_of(mission: Mission, wanted: str | None) -> tuple[str, str, tuple[str, ...]]:
+    """Name and driver of the receiver, and the others where none was chosen."""
     flown = {
         section["name"]: section["driver"]
         for section in mission.flown_configuration().get("navigator", [])
@@ -132,7 +137,7 @@ def _receiver_of(mission: Mission, wanted: str | None) -> tuple[str, str]:
             "of others are exported by `syntopic export raw`"
         )
     name = wanted if wanted is not None else next(iter(known))
-    return name, known[name]
+    return name, known[name], tuple(known)[1:] if wanted is None else ()
 
 
 def _recorded(mission: Mission, receiver: str) -> bytes:

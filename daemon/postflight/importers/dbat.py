@@ -233,8 +233,11 @@ def _prior_orientations(
     if given.find("prior_eo") is None:
         return {}
     units = {(file.get("units") or "").strip() for file in given.findall("prior_eo/file")}
-    if units - {"degrees", "radians"}:
-        raise ProjectError([f"{script.name}: prior_eo in {units}; degrees or radians are right"])
+    if len(units) != 1 or units - {"degrees", "radians"}:
+        found = ", ".join(repr(unit) for unit in sorted(units))
+        raise ProjectError(
+            [f"{script.name}: prior_eo in {found}; degrees or radians, one of them, are right"]
+        )
     scale = math.pi / 180.0 if units == {"degrees"} else 1.0
     names = ("id", "x", "y", "z", "omega", "phi", "kappa")
     return {

@@ -108,6 +108,19 @@ def test_prior_orientations_begin_a_block_without_control(folder: Path) -> None:
     assert np.allclose(done.network.attitudes.rotation[0], expected)
 
 
+def test_prior_orientations_of_mixed_units_are_refused(folder: Path) -> None:
+    """Degrees would be taken for radians."""
+    files = "".join(
+        f'<file format="id,x,y,z,omega,phi,kappa" units="{unit}">eo.txt</file>'
+        for unit in ("degrees", "radians")
+    )
+    (folder / "eo.txt").write_text("1,1,2,3,10,-20,30\n")
+    text = SCRIPT.replace("    <images>", f"    <prior_eo>{files}</prior_eo><images>", 1)
+    (folder / "script.xml").write_text(text)
+    with pytest.raises(ProjectError, match="prior_eo in 'degrees', 'radians'"):
+        import_dbat(folder / "script.xml")
+
+
 @pytest.mark.parametrize(
     ("old", "new", "sentence"),
     [

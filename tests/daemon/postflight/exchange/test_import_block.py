@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from daemon.cli import app
 from daemon.postflight.adjustment.project import read_project
 from daemon.postflight.exchange.block import Block, BlockCamera, BlockImage, BlockPoints
-from daemon.postflight.exchange.colmap import colmap_texts
+from daemon.postflight.exchange.colmap import colmap_texts, read_colmap
 from processing.geometry.forward_distortion import ForwardDistortion
 
 RUN = CliRunner()
@@ -127,6 +127,16 @@ def test_an_imported_block_adjusts_to_the_truth(scene, tmp_path, program, write)
     assert report["sigma0"] == pytest.approx(1.0, abs=0.1), "0.3 px of noise, stated as 0.3 px"
     project = read_project(tmp_path / "project/project.toml")
     assert np.abs(project.network.stations.position_m - np.array(scene[1])).max() < 1e-6
+
+
+@pytest.mark.parametrize("end", ["", "\n", "\n\n", "\n\n\n"])
+def test_a_last_image_without_measurements_is_not_lost(tmp_path, end) -> None:
+    """Editors remove the empty line of measurements at the end of images.txt."""
+    (tmp_path / "cameras.txt").write_text("1 PINHOLE 100 80 50 50 50 40\n")
+    (tmp_path / "points3D.txt").write_text("")
+    rows = "1 1 0 0 0 0 0 0 1 a.jpg\n\n2 1 0 0 0 1 0 0 1 b.jpg"
+    (tmp_path / "images.txt").write_text(rows + end)
+    assert [image.name for image in read_colmap(tmp_path).images] == ["a.jpg", "b.jpg"]
 
 
 def test_all_three_give_the_same_project(scene, tmp_path) -> None:

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from xml.etree import ElementTree
 
 import numpy as np
@@ -16,11 +18,11 @@ import pyproj
 import pytest
 from scipy.spatial.transform import Rotation
 
-from daemon.postflight.exchange.block import BlockError, rig_of
+from daemon.postflight.exchange.block import Block, BlockError, rig_of
 from daemon.postflight.exchange.block_project import import_block
 from daemon.postflight.exchange.metashape import metashape_texts
 from daemon.postflight.exchange.metashape_reader import read_metashape
-from daemon.postflight.exchange.opensfm import read_opensfm
+from daemon.postflight.exchange.opensfm import geo_text, read_opensfm
 from tests.daemon.postflight.exchange.flown_block import (
     FLIGHT,
     SIGMA_M,
@@ -114,6 +116,16 @@ def test_geo_txt_has_place_attitude_and_accuracy_in_the_order_of_opendronemap(fl
     assert row[7:] == ["0.0500", "0.0800"]
     groups = [line.split() for line in (folder / "image_groups.txt").read_text().splitlines()]
     assert len(groups) == 20 and {g for _, g in groups} == {"line-1", "line-2"}
+
+
+def test_geo_txt_has_the_larger_of_the_horizontal_accuracies(flown) -> None:
+    _, folder = export(flown, to="opensfm")
+    (image, *_) = read_opensfm(folder).images
+    eo = SimpleNamespace(
+        longitude_deg=13.0, latitude_deg=52.0, height_m=100.0, enu_from_camera=np.eye(3)
+    )
+    block = Block("b", (), (replace(image, eo=eo, sigma_m=(0.2, 0.05, 0.08)),))
+    assert geo_text(block, "").split()[-2:] == ["0.2000", "0.0800"]
 
 
 def test_metashape_cameras_project_right_and_lie_on_the_earth(flown) -> None:
@@ -334,7 +346,7 @@ def test_chunk_units_are_no_metres(flown, tmp_path) -> None:
     assert block.is_metric and block.frame is None
 
 
-def test_a_project_without_image_measurements_says_so(flown, tmp_path) -> None:
+def test_a_project_without_image_measurements_has_a_note(flown, tmp_path) -> None:
     _, folder = export(flown, to="metashape")
     done = import_block(folder / "cameras.xml", "metashape", tmp_path / "p")
     assert any("no image measurements" in note for note in done.block.notes)

@@ -22,7 +22,9 @@ from daemon.orientation.rtklib_positions import read_positions
 from daemon.orientation.trajectory import TrajectoryError
 from daemon.postflight.exchange.rinex import RinexHeader, observation_text
 from drivers.receivers.observations import (
+    Observation,
     ObservationCounts,
+    ObservationEpoch,
     novatel_observations,
     ublox_observations,
 )
@@ -153,6 +155,34 @@ def test_range_of_novatel_gives_the_values_of_convbin(tmp_path: Path) -> None:
         assert known.any() and np.abs(a[known] - b[known]).max() < 0.0011, name
 
 
+def lock_flags(*seen: tuple[float, float]) -> list[str]:
+    """Loss-of-lock flags of one phase by (seconds, lock time in s)."""
+    epochs = [
+        ObservationEpoch(
+            round((1000.0 + second) * 1e9),
+            (Observation("G05", "1C", 2e7, 1e8, 0.0, 45.0, lock_s),),
+        )
+        for second, lock_s in seen
+    ]
+    text = observation_text(RinexHeader("m"), epochs, [], version="3.04").text
+    return [line[33:34].strip() for line in text.splitlines() if line.startswith("G05")]
+
+
+def test_the_phase_after_a_gap_of_the_recording_is_marked_unless_it_was_tracked_through() -> None:
+    assert lock_flags((0, 30.0), (1, 31.0), (60, 90.0), (61, 91.0)) == ["", "", "", ""]
+    assert lock_flags((0, 30.0), (1, 31.0), (60, 40.0), (61, 41.0)) == ["", "", "1", ""]
+    # A receiver that counts to 64.5 s only leaves it open after a longer gap.
+    assert lock_flags((0, 64.5), (1, 64.5), (200, 64.5)) == ["", "", "1"]
+
+
+def test_unknown_biases_of_glonass_are_blank() -> None:
+    """Zeros would state that its code and phase are aligned."""
+    epoch = ObservationEpoch(0, (Observation("R05", "1C", 2e7, 1e8, 0.0, 45.0, 9.0, channel=1),))
+    text = observation_text(RinexHeader("m"), [epoch], [], version="3.04").text
+    (line,) = (one for one in text.splitlines() if "GLONASS COD/PHS/BIS" in one)
+    assert line == f"{'':60}GLONASS COD/PHS/BIS"
+
+
 def test_damaged_messages_cost_themselves_only() -> None:
     good = [rawx(antenna_at(START_NS), START_NS + k * STEP_NS, TOE_S, np.random.default_rng(1))
             for k in range(3)]  # fmt: skip
@@ -204,6 +234,22 @@ def test_what_was_not_recorded_is_named(flown, tmp_path: Path) -> None:
     ):
         done = RUN.invoke(app, ["export", "rinex", str(mission), *options])
         assert done.exit_code != 0 and sentence in " ".join(str(done.exception).split())
+
+
+def test_the_first_of_several_receivers_is_exported_with_a_sentence(
+    flown, tmp_path: Path, monkeypatch
+) -> None:
+    mission = Path(shutil.copytree(flown, tmp_path / "mission"))
+    flew = Mission.open(mission).flown_configuration()
+    both = [*flew["navigator"], {"name": "spare", "driver": "novatel"}]
+    monkeypatch.setattr(Mission, "flown_configuration", lambda _: {**flew, "navigator": both})
+    done = RUN.invoke(app, ["export", "rinex", str(mission)])
+    assert done.exit_code == 0 and "spare by --receiver" in " ".join(done.output.split())
+    first = both[0]["name"]
+    found, _ = exported(mission)
+    assert found["other_receivers"] == ["spare"]
+    found, _ = exported(mission, "--receiver", first)
+    assert found["other_receivers"] == []
 
 
 @pytest.fixture(scope="module")
