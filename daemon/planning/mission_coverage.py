@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
 from typing import Any
 
 from daemon.mission.layout import Mission
 from daemon.orientation.exterior_orientation import mount_of
 from daemon.planning.exposure_footprints import exposure_footprints
 from daemon.planning.image_size import image_on_ground_m
-from daemon.planning.model import LocalPlane, Plan, Point
+from daemon.planning.model import Plan
 from daemon.planning.plan_readers import read_plan
 from daemon.planning.reflight_planning import ReflightPlan, reflights
 from daemon.planning.relief import relief_or_reason
 from processing.rig import load_rig
-
-WIDTH_PX = 560.0
 
 
 def advice_of(mission: Mission) -> tuple[Plan, ReflightPlan, str] | None:
@@ -44,7 +40,7 @@ def advice_of(mission: Mission) -> tuple[Plan, ReflightPlan, str] | None:
 
 
 def coverage_of(mission: Mission) -> dict[str, Any] | None:
-    """Segments with their reasons, and a drawing of lines and holes; None without a plan.
+    """Segments with their reasons; None without a plan.
 
     Raises:
         DaemonError, RigError, OSError: the mission's plan, rig or configuration cannot be used.
@@ -52,35 +48,11 @@ def coverage_of(mission: Mission) -> dict[str, Any] | None:
     found = advice_of(mission)
     if found is None:
         return None
-    plan, advice, level = found
+    _, advice, level = found
     return {
         "planned_km": advice.planned_m / 1000.0,
         "share": advice.covered_m / advice.planned_m if advice.planned_m else 1.0,
         "hole_ha": advice.hole_m2 / 1e4,
         "segments": advice.segments,
         "note": level,
-        "drawing": _drawing(plan, advice),
-    }
-
-
-def _drawing(plan: Plan, advice: ReflightPlan) -> dict[str, Any]:
-    """Lines and holes in pixels, north up."""
-    plane = LocalPlane(plan.lines[0].start)
-    rings = [ring for one in advice.segments for hole in one.holes for ring in hole.rings]
-    lines = [(line.start, line.end) for line in plan.lines]
-    east, north = zip(*(plane.flat(p) for shape in (*rings, *lines) for p in shape), strict=True)
-    scale = WIDTH_PX / max(max(east) - min(east), max(north) - min(north), 1.0)
-
-    def path(points: Sequence[Point]) -> str:
-        flat = [plane.flat(point) for point in points]
-        return " ".join(
-            f"{10 + (x - min(east)) * scale:.1f},{10 + (max(north) - y) * scale:.1f}"
-            for x, y in flat
-        )
-
-    return {
-        "width": math.ceil((max(east) - min(east)) * scale + 20),
-        "height": math.ceil((max(north) - min(north)) * scale + 20),
-        "lines": [path(line) for line in lines],
-        "holes": [path(ring) for ring in rings],
     }

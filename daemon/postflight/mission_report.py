@@ -24,6 +24,7 @@ from daemon.mission.store.durable import make_directories, replace_file
 from daemon.mission.store.level0_folder import read_sealed
 from daemon.mission.store.level2 import read_report
 from daemon.onboard.flight.flag_table import FLAG_TABLE
+from daemon.planning.flight_map import flight_map
 from daemon.planning.mission_coverage import coverage_of
 from daemon.postflight.displacements import flight_displacements, write_displacements
 from daemon.products.exposure_conditions import GPS_EPOCH
@@ -82,6 +83,7 @@ def write_report(
     displacements = (
         flight_displacements(mission) if out is not None else write_displacements(mission)
     )
+    coverage = _coverage(mission)
     loader = jinja2.FileSystemLoader(Path(__file__).parent / "templates")
     environment = jinja2.Environment(
         loader=loader,
@@ -91,7 +93,8 @@ def write_report(
     )
     html = environment.get_template("report.html").render(
         mission=mission.name,
-        coverage=_coverage(mission),
+        coverage=coverage,
+        flight_map=_flight_map(mission, exposures, coverage),
         exposures=exposures,
         simulated=any(exposure["record"].get("simulated") for exposure in exposures),
         displaced=_displaced(exposures),
@@ -134,6 +137,17 @@ def _coverage(mission: Path) -> dict[str, Any] | None:
     """Coverage of the plan; None without a plan, or one that cannot be used."""
     try:
         return coverage_of(Mission.open(mission))
+    except (OSError, DaemonError, RigError):
+        return None
+
+
+def _flight_map(
+    mission: Path, exposures: Sequence[Mapping[str, Any]], coverage: Mapping[str, Any] | None
+) -> dict[str, Any] | None:
+    """The map of lines, footprints and gaps; None where there is nothing to draw."""
+    verdicts = {one["number"]: one["verdict"] for one in exposures}
+    try:
+        return flight_map(Mission.open(mission), verdicts, (coverage or {}).get("segments", ()))
     except (OSError, DaemonError, RigError):
         return None
 
