@@ -17,6 +17,7 @@ from typing import Any
 import cv2
 import pytest
 
+from daemon.onboard.monitoring.web.page_files import PAGE
 from processing.rig import shipped_rigs
 from tests.daemon.onboard.monitoring import flight_events
 from tests.daemon.onboard.monitoring.cockpit import (
@@ -229,6 +230,11 @@ def test_each_language_fits_the_page(cockpit: Cockpit, language: str, stop: str)
     cockpit.until(f"document.querySelector('#phase-button')?.innerText === '{stop}'")
     assert browser.evaluate("document.documentElement.lang") == language
     cockpit.until("document.querySelector('.faults .active')?.innerText.length > 20")
+    item = "document.querySelector('[data-fault=\"device SU03\"]')"
+    catalog = json.loads((PAGE / f"messages/{language}/alarm.json").read_text("utf-8"))
+    for part in ("", ".cause", ".action"):
+        assert browser.evaluate(f"{item}.innerText").count(catalog[f"alarm.device/lost{part}"])
+    assert browser.text("[data-fault='device SU03'] code") == "device/lost"
     browser.evaluate(MEASURES.read_text())
     for width, height in (SIZES[0], SIZES[2]):
         cockpit.resize(width, height)

@@ -80,6 +80,10 @@ def test_every_alarm_and_flag_of_the_catalogs_is_known_to_explain() -> None:
             entry = entry_of(name.removesuffix(".action"))
             assert entry is not None
             assert text == entry.action, code
+        elif name.endswith(".cause"):
+            entry = entry_of(name.removesuffix(".cause"))
+            assert entry is not None
+            assert text == entry.cause, code
         else:
             assert entry_of(name) is not None, code
     assert {f"flag.{name}" for name in flags} <= set(english)
@@ -91,6 +95,7 @@ def test_every_event_that_latches_a_fault_has_a_name_in_every_language() -> None
     assert {"deviation", "decisions", "disk", "device/lost", "page-link"} <= latched
     for name in latched:
         assert f"alarm.{name}" in english, name
+        assert f"alarm.{name}.cause" in english, name
         assert f"alarm.{name}.action" in english, name
 
 

@@ -106,14 +106,20 @@ function shelfButtons(alarm, feed) {
     { className: "shelve" }));
 }
 
+// Cause and action of the code, in the language of the page, and the code itself, as `syntopic explain` takes it.
+function explanation(alarm) {
+  const known = ["cause", "action"].filter((part) => knows(`alarm.${alarm.code}.${part}`)).map((part) =>
+    element("div", { className: part }, element("span", { className: "part", textContent: t(`alarm.${part}`) }), " ",
+      t(`alarm.${alarm.code}.${part}`)));
+  return alarm.isService && alarm.code ? [...known, element("div", {}, element("code", { textContent: alarm.code, translate: false }))] : known;
+}
+
 function item(alarm, feed) {
   const created = element("li", { className: `${alarm.isActive ? "active" : "cleared"} ${alarm.severity}`, dataset: { fault: alarm.id } },
     element("div", {}, element("strong", { textContent: `${labelOf(alarm)} · ${titleOf(alarm)}` }),
       element("span", { className: "about", textContent: stateText(alarm) })),
     element("div", { lang: alarm.isService ? "en" : locale, textContent: alarm.detail }));
-  if (locale !== "en" && knows(`alarm.${alarm.code}.action`)) {
-    created.append(element("div", { textContent: t(`alarm.${alarm.code}.action`) }));
-  }
+  created.append(...explanation(alarm));
   const buttons = shelfButtons(alarm, feed);
   if (!alarm.isAcknowledged) {
     buttons.unshift(button(t("alarm.acknowledge"), () => acknowledge(alarm, feed), { className: "acknowledge" }));
