@@ -109,8 +109,10 @@ class DescribedHead:
 
     def line_pulse(self) -> None:
         """A pulse at the trigger input."""
-        if self._is_triggered_by("Line"):
+        if self.is_acquiring and self.registers.is_trigger_on("Line"):
             self._expose()
+        else:
+            self.counts["triggers_ignored"] += 1
 
     def _written(self, address: int) -> None:
         registers = self.registers

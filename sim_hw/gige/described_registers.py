@@ -221,6 +221,24 @@ class DescribedRegisters:
                     return True
             return False
 
+    def is_trigger_on(self, source: str) -> bool:
+        """Whether some trigger of the camera is on and waits for a source of this kind.
+
+        Which trigger the controller has selected is not known where the selector is its own.
+        """
+        with self.lock:
+            for choice in self._choices_of("TriggerMode") if self._has("TriggerMode") else ():
+                for selector, value in choice.items():
+                    self.nodes.set_local(selector, value)
+                if self.symbolic_or("TriggerMode", "Off") == "On" and self.symbolic_or(
+                    "TriggerSource", ""
+                ).startswith(source):
+                    return True
+            return False
+
+    def _has(self, name: str) -> bool:
+        return name in self.nodes.nodes
+
     def _find_choices(self) -> dict[str, list[dict[str, int]]]:
         """Values of the controller's selectors under which each command may be given."""
         return {name: self._choices_of(name) for name in COMMANDS if name in self.nodes.nodes}

@@ -188,6 +188,26 @@ def test_strobe_debouncer_delay_and_edge_are_written_and_a_line_triggers() -> No
         assert np.array_equal(pixels, emulated.last_image)
 
 
+@pytest.mark.parametrize(("wanted_us", "expected"), [(0.0, 4), (50.0, 50)])
+def test_a_head_that_needs_some_delay_gets_its_lowest(wanted_us: float, expected: int) -> None:
+    delay = number("TriggerDelayAbs", 0x10090, 1000).replace("<Min>0</Min>", "<Min>4</Min>")
+    text = with_nodes(delay, "TriggerDelayAbs")
+    with head(text, trigger_delay_us=wanted_us) as (emulated, driver, _):
+        assert f"TriggerDelayAbs = {expected}" in driver.bind()["features"]
+        assert emulated.registers.number_or("TriggerDelayAbs", -1) == expected
+
+
+def test_an_exposure_time_that_the_head_rounds_is_recorded_as_the_head_holds_it() -> None:
+    text = TEXT.replace("FROM / 2", "FROM / 17").replace("TO * 2", "TO * 17")
+    with head(text) as (emulated, driver, memory):
+        driver.bind()
+        held = emulated.registers.number_or("ExposureTimeAbs", -1)
+        frame, _ = first_frame(driver, memory)
+        assert frame.settings["ExposureTime"] == held
+        assert 950 <= held <= 1050
+        assert held % 17 == 0
+
+
 def test_an_output_of_allied_vision_is_active_during_the_exposure() -> None:
     nodes = enumeration("SyncOutSelector", 0x10080, "SyncOut1", "SyncOut2")
     nodes += enumeration("SyncOutSource", 0x10084, "GPO", "Exposing")

@@ -7,7 +7,7 @@ exception with the reason.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, Final
 
 from drivers import DriverError
@@ -16,6 +16,8 @@ from drivers.cameras.aravis.presets import FeatureValue
 
 RELATIVE_TOLERANCE: Final = 1e-3
 """Between a number that was written and the number read back; heads round to their steps."""
+UNITS_US: Final[Mapping[str, float]] = {"s": 1e6, "ms": 1e3, "ns": 1e-3}
+"""Units of durations other than microseconds, in microseconds."""
 CHAIN_MAX: Final = 50
 """Nodes between a feature and its register; a longer chain refers to itself."""
 
@@ -132,17 +134,19 @@ class Features:
         except self._failed:
             return False
 
-    def unit(self, name: str) -> str:
-        """The unit of a number.
+    def unit_us(self, name: str) -> float:
+        """The unit of a duration.
 
         Args:
             name: GenICam name.
 
         Returns:
-            As the description states it; empty if it states none.
+            The unit that the description states, us; 1 if it states none.
         """
+        # Quirk: the standard has microseconds; some heads state seconds or milliseconds.
+        # Upstream: manual: GenICam description of Hamamatsu C16240-20UP, ExposureTime.
         node = None if name in self.endless else self._device.get_feature(name)
-        return str(getattr(node, "get_unit", str)() or "").strip()
+        return UNITS_US.get(str(getattr(node, "get_unit", str)() or "").strip(), 1.0)
 
     def _chain(self, name: str) -> list[Any]:
         """A feature and the nodes that hold its value; empty if there is no such feature."""
@@ -290,7 +294,9 @@ class Features:
         except FeatureError:
             return ""
 
-    def set(self, name: str, value: FeatureValue) -> FeatureValue:
+    def set(
+        self, name: str, value: FeatureValue, *, tolerance: float = RELATIVE_TOLERANCE
+    ) -> FeatureValue:
         """Write a feature and read it back.
 
         A feature that already has the value is not written.
@@ -298,6 +304,7 @@ class Features:
         Args:
             name: GenICam name.
             value: in the type of the feature; any value executes a command.
+            tolerance: relative, between a number and the one that the head then holds.
 
         Returns:
             The value the head holds afterwards; a number may be rounded to the head's step.
@@ -327,7 +334,7 @@ class Features:
         except self._failed as error:
             raise FeatureError(f"{name} = {converted} is refused: {message_of(error)}") from None
         found = self.get(name)
-        if not _is_close(found, converted):
+        if not _is_close(found, converted, tolerance):
             raise FeatureError(f"{name} was set to {converted}, and the head holds {found}")
         return found
 
@@ -429,7 +436,7 @@ def _converted(name: str, kind: str | None, value: FeatureValue) -> FeatureValue
     raise FeatureError(f"{name} = {value!r}; {needed.get(kind, 'a text')} is needed")
 
 
-def _is_close(found: FeatureValue, wanted: FeatureValue) -> bool:
+def _is_close(found: FeatureValue, wanted: FeatureValue, tolerance: float) -> bool:
     if isinstance(found, str) or isinstance(wanted, str | bool):
         return found == wanted
-    return math.isclose(found, wanted, rel_tol=RELATIVE_TOLERANCE, abs_tol=1e-9)
+    return math.isclose(found, wanted, rel_tol=tolerance, abs_tol=1e-9)

@@ -5,7 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from drivers.cameras.aravis.feature_access import FeatureError, Features
+from drivers.cameras.aravis.feature_access import (
+    RELATIVE_TOLERANCE,
+    FeatureError,
+    Features,
+)
 from drivers.cameras.aravis.presets import FeatureValue
 
 
@@ -25,7 +29,15 @@ class FeatureWriter:
         self.refusals: list[str] = []
         self.missing: list[str] = []
 
-    def set(self, key: str, name: str, value: FeatureValue, hint: str) -> bool:
+    def set(
+        self,
+        key: str,
+        name: str,
+        value: FeatureValue,
+        hint: str,
+        *,
+        tolerance: float = RELATIVE_TOLERANCE,
+    ) -> bool:
         """Write a feature.
 
         Args:
@@ -33,12 +45,13 @@ class FeatureWriter:
             name: GenICam name.
             value: in the type of the feature.
             hint: what to do if it is refused.
+            tolerance: relative, between a number and the one that the head then holds.
 
         Returns:
             Whether the head holds the value.
         """
         try:
-            self.written[name] = self.features.set(name, value)
+            self.written[name] = self.features.set(name, value, tolerance=tolerance)
         except FeatureError as error:
             wanted = f"{key} = {value!r}" if isinstance(value, int | float) else key
             self.refusals.append(f"{wanted} is refused ({error}); {hint}")

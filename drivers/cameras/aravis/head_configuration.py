@@ -23,8 +23,8 @@ from drivers.cameras.aravis.trigger_configuration import write_strobe, write_tri
 EXPOSURE_TIMES: Final = ("ExposureTime", "ExposureTimeAbs", "ExposureTimeRaw", "ExposureValue")
 """Exposure time, in microseconds unless the head states another unit; the raw one in units of
 `ExposureTimeBaseAbs`."""
-UNITS_US: Final[Mapping[str, float]] = {"s": 1e6, "ms": 1e3, "ns": 1e-3}
-"""Units other than microseconds, in microseconds."""
+EXPOSURE_TOLERANCE: Final = 0.05
+"""Heads round an exposure time to rows of their sensor; what they hold is recorded."""
 PULSE_WIDTH_MODES: Final = ("Off", "TriggerWidth", "TriggerControlled")
 """Modes of exposure in which no exposure time is used."""
 GAINS_DB: Final = ("Gain", "GainAbs")
@@ -124,7 +124,8 @@ class HeadConfiguration:
             raise FeatureError(self._no_gain_in_db(gain_db))
         if tdi_shifts or features.is_available("TdiShifts"):
             features.set("TdiShifts", tdi_shifts)
-        features.set(self.exposure_feature, self._exposure_value(exposure_time_us))
+        value = self._exposure_value(exposure_time_us)
+        features.set(self.exposure_feature, value, tolerance=EXPOSURE_TOLERANCE)
 
     def exposure_time_us(self) -> float:
         """The exposure time that the head holds.
@@ -213,7 +214,8 @@ class HeadConfiguration:
                 if features.is_locked(name)
                 else f"its exposure time is fixed, set exposure_time_us = {held * unit_us:g}"
             )
-        self._writer.set("exposure_time_us", name, self._exposure_value(wanted_us), hint)
+        value = self._exposure_value(wanted_us)
+        self._writer.set("exposure_time_us", name, value, hint, tolerance=EXPOSURE_TOLERANCE)
 
     def _write_exposure_mode(self) -> None:
         """A mode in which the exposure time is the head's own; not the width of a pulse."""
@@ -235,10 +237,8 @@ class HeadConfiguration:
         )
 
     def _exposure_unit_us(self) -> float:
-        # Quirk: the standard has microseconds; some heads state seconds or milliseconds.
-        # Upstream: manual: GenICam description of Hamamatsu C16240-20UP, ExposureTime.
         if self.exposure_feature != "ExposureTimeRaw":
-            return UNITS_US.get(self._features.unit(self.exposure_feature), 1.0)
+            return self._features.unit_us(self.exposure_feature)
         return self._features.number("ExposureTimeBaseAbs") or 1.0
 
     def _exposure_value(self, exposure_time_us: float) -> FeatureValue:

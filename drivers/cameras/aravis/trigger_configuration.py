@@ -86,7 +86,11 @@ def write_trigger(writer: FeatureWriter, settings: AravisSettings) -> None:
         _write_line(writer, settings)
     delay = features.first_available(TRIGGER_DELAYS)
     if delay is not None:
-        writer.set("trigger_delay_us", delay, settings.trigger_delay_us, "choose another delay")
+        wanted = settings.trigger_delay_us / features.unit_us(delay)
+        low, high = features.bounds(delay)
+        # Heads that cannot start without any delay have a lowest one.
+        wanted = low if wanted == 0 and 0 < low <= high else wanted
+        writer.set("trigger_delay_us", delay, wanted, "choose another delay")
     elif settings.trigger_delay_us:
         writer.refusals.append(
             f"trigger_delay_us is {settings.trigger_delay_us:g}; the head has no trigger delay"
@@ -142,7 +146,8 @@ def _write_line(writer: FeatureWriter, settings: AravisSettings) -> None:
                 f"debounce_us is {settings.debounce_us:g}; the head has no debouncer"
             )
         else:
-            writer.set("debounce_us", name, settings.debounce_us, "choose another time")
+            wanted = settings.debounce_us / features.unit_us(name)
+            writer.set("debounce_us", name, wanted, "choose another time")
 
 
 def _write_action(writer: FeatureWriter, settings: AravisSettings) -> None:
