@@ -367,17 +367,11 @@ def _best_band(
     sums = np.concatenate([np.zeros((1, 2)), np.cumsum(medians * information[:, None], axis=0)])
     weight = np.concatenate([[0.0], np.cumsum(information)])
     best: tuple[Slip, float] | None = None
-    width = 2
-    while width <= (bins + 1) // 2:
-        held = weight[width:] - weight[:-width]
-        means = (sums[width:] - sums[:-width]) / held[:, None]
-        rest = (sums[-1] - (sums[width:] - sums[:-width])) / (weight[-1] - held)[:, None]
-        shifts = np.where(np.abs(means - level) > np.abs(means - rest), means - level, means - rest)
-        reach = np.abs(shifts).max(axis=1)
-        scores = reach * np.sqrt(held) / _MEDIAN_EFFICIENCY_FACTOR
-        at_bin = int(np.argmax(scores))
-        if scores[at_bin] > settings.limit and reach[at_bin] > settings.min_shift_px(width * per):
-            first, last = _extend_band(medians, shifts[at_bin], level, at_bin, at_bin + width)
+    for at_bin, width, score in _shifted_runs(sums, weight, level, settings.limit):
+        band = slice(at_bin, at_bin + width)
+        shift = _shift_of_run(sums, weight, level, band)
+        if np.abs(shift).max() > settings.min_shift_px(width * per):
+            first, last = _extend_band(medians, shift, level, at_bin, at_bin + width)
             band = slice(first * per, last * per)
             outside = _level_outside(residuals, band)
             dx, dy = np.median(residuals[band], axis=0) - outside
@@ -402,12 +396,53 @@ def _best_band(
                 start = 0 if first == 0 else int(at[band.start])
                 stop = size - 1 if last == bins else math.ceil(at[band.stop - 1])
                 share = (stop - start + 1) / size
-                score = float(scores[at_bin])
                 points = band.stop - band.start
                 slip = Slip(name, axis, start, stop, float(dx), float(dy), share, score, points)
                 best = slip, explained
-        width = max(width + 1, math.ceil(width * 1.2))
     return best
+
+
+def _shifted_runs(
+    sums: Array, weight: Array, level: Array, limit: float
+) -> list[tuple[int, int, float]]:
+    """First bin, width and score of the most shifted run of bins of each width, over a limit.
+
+    `sums` (bins + 1, 2) cumulates medians times information, `weight` (bins + 1,) information.
+    """
+    bins = len(weight) - 1
+    widths = [2] if bins > 2 else []
+    while widths and (width := max(widths[-1] + 1, math.ceil(widths[-1] * 1.2))) <= (bins + 1) // 2:
+        widths.append(width)
+    if not widths:
+        return []
+    # All runs of all widths at once: one array operation for each step.
+    counts = bins + 1 - np.array(widths)
+    first = np.concatenate([np.arange(count) for count in counts])
+    last = first + np.repeat(widths, counts)
+    held = weight[last] - weight[first]
+    reach = np.zeros(len(first))
+    for axis in (0, 1):
+        inside = sums[last, axis] - sums[first, axis]
+        means = inside / held
+        rest = (sums[-1, axis] - inside) / (weight[-1] - held)
+        np.maximum(reach, np.abs(means - level[axis]), out=reach)
+        np.maximum(reach, np.abs(means - rest), out=reach)
+    scores = reach * np.sqrt(held) / _MEDIAN_EFFICIENCY_FACTOR
+    starts = np.concatenate([[0], np.cumsum(counts)[:-1]])
+    runs = []
+    for k in np.flatnonzero(np.maximum.reduceat(scores, starts) > limit):
+        of_width = scores[starts[k] : starts[k] + counts[k]]
+        at_bin = int(np.argmax(of_width))
+        runs.append((at_bin, widths[k], float(of_width[at_bin])))
+    return runs
+
+
+def _shift_of_run(sums: Array, weight: Array, level: Array, run: slice) -> Array:
+    """Shift of a run of bins (2,) against the frame or against the rest, the larger of each."""
+    inside, held = sums[run.stop] - sums[run.start], weight[run.stop] - weight[run.start]
+    mean, rest = inside / held, (sums[-1] - inside) / (weight[-1] - held)
+    shifts = mean - level, mean - rest
+    return np.asarray(np.where(np.abs(shifts[0]) > np.abs(shifts[1]), *shifts))
 
 
 def _extend_band(
