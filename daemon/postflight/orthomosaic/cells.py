@@ -177,7 +177,8 @@ def _levels(place: tuple[int, int], cells: Array) -> ImageLevels:
 
 
 def _flat(gain: GainField) -> GainField:
-    return GainField(gain.row, gain.column, gain.step, np.zeros_like(gain.log_gain))
+    none = np.zeros_like(gain.log_gain)
+    return GainField(gain.row, gain.column, gain.step, none, none)
 
 
 def _seam_steps(

@@ -140,7 +140,7 @@ def render_tile(
         pixels = image_pixels(block, image, survey.bands, seen)
         found = resample_to_ground(pixels, image.pose.window(*seen), surface, wanted=wanted)
         filled = found > 0.0
-        found *= survey.gains[k].at(rows, columns)
+        found = survey.gains[k].levelled(found, rows, columns)
         words = np.clip(np.rint(found), 1.0, _WORD_MAX).astype(np.uint16)
         words[~filled] = 0
         # Where one band has no data, none has: colours of a pixel belong together.

@@ -1,8 +1,10 @@
-"""Radiometric levelling of a block: one smooth gain field for each image and band.
+"""Radiometric levelling of a block: smooth fields of gain and haze for each image and band.
 
 Where images show the same ground their signals shall agree; what light, haze, hot spot and
-exposure do to an image is smooth over it. The logarithm of the gain is bilinear on a few nodes of
-each image. The content of the ground cancels, for only the same ground is compared.
+exposure do to an image is smooth over it. Haze adds to the signal of dark ground as much as to that
+of bright ground, so it is subtracted before the gain. The logarithm of the gain and the haze are
+bilinear on a few nodes of each image. The content of the ground cancels, for only the same ground
+is compared.
 
 Source: docs/explanation/mathematics/orthomosaic.md#levelling.
 """
@@ -25,10 +27,17 @@ HOLD: Final = 1e-3
 """Weight of a gain of one at a node; an overlap has the weight 1."""
 STIFFNESS: Final = 0.02
 """Weight of equal gains at two neighbouring nodes."""
+HAZE_HOLD: Final = 0.1
+"""Weight of no haze at a node, haze in units of the mean signal."""
+HAZE_STIFFNESS: Final = 10.0
+"""Weight of equal haze at two neighbouring nodes."""
+HAZE_MAX: Final = 0.5
+"""Of the signal of a pixel; haze subtracts no more."""
 OUTLIER_LOG: Final = 0.3
 """Overlaps that disagree by more after a first solution show moving things; they are left out."""
 _TOLERANCE: Final = 1e-7
 _ITERATIONS: Final = 3000
+_ROUNDS: Final = 3
 
 
 @dataclass(frozen=True)
@@ -55,12 +64,40 @@ class GainField:
             centres of blocks.
         step: blocks from node to node, along rows and columns.
         log_gain: (bands, r, c), at the nodes.
+        haze: (bands, r, c), at the nodes, in units of the signal.
     """
 
     row: float
     column: float
     step: tuple[float, float]
     log_gain: Array
+    haze: Array
+
+    def levelled(self, signal: Array, rows: Array, columns: Array) -> Array:
+        """Signal without haze, times the gain.
+
+        Args:
+            signal: (bands, h, w).
+            rows: (h,), rows in the common grid, in blocks.
+            columns: (w,).
+
+        Returns:
+            (bands, h, w) float32.
+
+        Example:
+            >>> one = np.ones((1, 2, 2))
+            >>> field = GainField(0.0, 0.0, (2.0, 2.0), np.log(2.0) * one, 3.0 * one)
+            >>> field.levelled(np.array([[[10.0, 4.0]]]), np.array([0.0]), np.array([0.0, 1.0]))
+            array([[[14.,  4.]]], dtype=float32)
+        """
+        haze = self._on_grid(self.haze, rows, columns)
+        clear = np.maximum(signal - haze, (1.0 - HAZE_MAX) * signal)
+        return np.asarray(clear * self.at(rows, columns), dtype=np.float32)
+
+    def _on_grid(self, nodes: Array, rows: Array, columns: Array) -> Array:
+        first = _hats((rows - self.row) / self.step[0], nodes.shape[1])
+        last = _hats((columns - self.column) / self.step[1], nodes.shape[2])
+        return np.asarray(first @ nodes @ last.T)
 
     def at(self, rows: Array, columns: Array) -> Array:
         """Gains on a grid of places.
@@ -73,13 +110,13 @@ class GainField:
             (bands, h, w) float32.
 
         Example:
-            >>> field = GainField(0.0, 0.0, (2.0, 2.0), np.log([[[1.0, 4.0], [1.0, 4.0]]]))
+            >>> gains = np.log([[[1.0, 4.0], [1.0, 4.0]]])
+            >>> field = GainField(0.0, 0.0, (2.0, 2.0), gains, np.zeros((1, 2, 2)))
             >>> field.at(np.array([1.0]), np.array([0.0, 1.0, 2.0]))
             array([[[1., 2., 4.]]], dtype=float32)
         """
-        first = _hats((rows - self.row) / self.step[0], self.log_gain.shape[1])
-        last = _hats((columns - self.column) / self.step[1], self.log_gain.shape[2])
-        return np.asarray(np.exp(first @ self.log_gain @ last.T), dtype=np.float32)
+        gains = np.exp(self._on_grid(self.log_gain, rows, columns))
+        return np.asarray(gains, dtype=np.float32)
 
 
 def _hats(at: Array, count: int) -> Array:
@@ -89,7 +126,7 @@ def _hats(at: Array, count: int) -> Array:
 
 
 def level_block(images: Sequence[ImageLevels], owner: Array) -> tuple[GainField, ...]:
-    """Gain fields that make overlapping images agree.
+    """Fields of gain and haze that make overlapping images agree.
 
     Args:
         images: their signal on the common grid.
@@ -97,22 +134,26 @@ def level_block(images: Sequence[ImageLevels], owner: Array) -> tuple[GainField,
             other images of a block are compared with this one.
 
     Returns:
-        A field for each image. The mean logarithm of all gains is near zero.
+        A field for each image. The mean logarithm of all gains is near zero, the mean haze too:
+        only differences of haze between images are known.
     """
     nodes = [_nodes_of(levels) for levels in images]
     starts = np.cumsum([0, *(n.log_gain[0].size for n in nodes)])
     bands = images[0].log_signal.shape[0] if images else 0
-    design, observed = _overlaps(images, owner, nodes, starts)
+    pairs = _overlaps(images, owner, nodes, starts)
     held = _held(nodes, starts)
-    solution = np.zeros((bands, starts[-1]))
+    solution = np.zeros((bands, 2 * starts[-1]))
     for band in range(bands):
-        solution[band] = _solved(design, observed[band], held)
+        solution[band] = _solved(pairs, band, held)
     return tuple(
         GainField(
             node.row,
             node.column,
             node.step,
-            solution[:, start:end].reshape(bands, *node.log_gain.shape[1:]),
+            *(
+                solution[:, first + start : first + end].reshape(bands, *node.log_gain.shape[1:])
+                for first in (0, starts[-1])
+            ),
         )
         for node, start, end in zip(nodes, starts[:-1], starts[1:], strict=True)
     )
@@ -129,8 +170,8 @@ def levelled(levels: ImageLevels, field: GainField) -> Array:
         As `levels.log_signal`.
     """
     _, rows, columns = levels.log_signal.shape
-    gains = field.at(levels.row + np.arange(rows), levels.column + np.arange(columns))
-    return np.asarray(levels.log_signal + np.log(gains))
+    places = (levels.row + np.arange(rows), levels.column + np.arange(columns))
+    return np.asarray(np.log(field.levelled(np.exp(levels.log_signal), *places)))
 
 
 def _nodes_of(levels: ImageLevels) -> GainField:
@@ -139,51 +180,65 @@ def _nodes_of(levels: ImageLevels) -> GainField:
     step = max(max(rows, columns) - 1, 1) / (NODES_ALONG - 1)
     counts = [max(math.ceil((n - 1) / step) + 1, 2) for n in (rows, columns)]
     steps = [max(n - 1, 1) / (k - 1) for n, k in zip((rows, columns), counts, strict=True)]
-    return GainField(
-        levels.row, levels.column, (steps[0], steps[1]), np.zeros((1, counts[0], counts[1]))
-    )
+    zeros = np.zeros((1, counts[0], counts[1]))
+    return GainField(levels.row, levels.column, (steps[0], steps[1]), zeros, zeros)
+
+
+@dataclass(frozen=True)
+class _Pairs:
+    """Overlaps: weights of nodes of each side, sparse (n, nodes), and its signals (bands, n)."""
+
+    owner: Any
+    other: Any
+    owner_signal: Array
+    other_signal: Array
 
 
 def _overlaps(
     images: Sequence[ImageLevels], owner: Array, nodes: Sequence[GainField], starts: Array
-) -> tuple[Any, Array]:
-    """Equations gain of the owner less gain of another image = difference of their signals."""
+) -> _Pairs:
+    """The signals of the owner of a block and of another image that shows it."""
     from scipy import sparse
 
-    bands = images[0].log_signal.shape[0]
+    bands = images[0].log_signal.shape[0] if images else 0
     taken = np.full((bands, *owner.shape), np.nan, np.float32)
     for k, levels in enumerate(images):
         window = _window(levels)
         own = owner[window] == k
         taken[:, *window][:, own] = levels.log_signal[:, own]
-    entries: list[tuple[Array, Array, Array]] = []
-    observed: list[Array] = []
+    entries: tuple[list[tuple[Array, Array, Array]], ...] = ([], [])
+    signals: tuple[list[Array], ...] = ([], [])
     count = 0
     for k, levels in enumerate(images):
         window = _window(levels)
         own = owner[window]
-        difference = levels.log_signal - taken[:, *window]
+        there = taken[:, *window]
+        difference = levels.log_signal - there
         used = (own >= 0) & (own != k) & np.isfinite(difference).all(axis=0)
         r, c = np.nonzero(used)
         if not len(r):
             continue
         equations = count + np.arange(len(r))
         count += len(r)
-        observed.append(difference[:, r, c])
+        signals[0].append(np.exp(there[:, r, c]))
+        signals[1].append(np.exp(levels.log_signal[:, r, c]))
         rows, columns = levels.row + r, levels.column + c
-        entries.append(_weights(nodes[k], starts[k], equations, rows, columns, -1.0))
+        entries[1].append(_weights(nodes[k], starts[k], equations, rows, columns))
         for other in np.unique(own[r, c]):
             mine = own[r, c] == other
-            entries.append(
-                _weights(
-                    nodes[other], starts[other], equations[mine], rows[mine], columns[mine], 1.0
-                )
+            entries[0].append(
+                _weights(nodes[other], starts[other], equations[mine], rows[mine], columns[mine])
             )
-    if not count:
-        return sparse.csr_array((0, int(starts[-1]))), np.zeros((bands, 0))
-    i, j, w = (np.concatenate(part) for part in zip(*entries, strict=True))
     shape = (count, int(starts[-1]))
-    return sparse.coo_array((w, (i, j)), shape=shape).tocsr(), np.concatenate(observed, axis=1)
+    if not count:
+        empty, none = sparse.csr_array(shape), np.zeros((bands, 0))
+        return _Pairs(empty, empty, none, none)
+    sides = []
+    for side in entries:
+        i, j, w = (np.concatenate(part) for part in zip(*side, strict=True))
+        sides.append(sparse.coo_array((w, (i, j)), shape=shape).tocsr())
+    first, last = (np.concatenate(one, axis=1).astype(np.float64) for one in signals)
+    return _Pairs(sides[0], sides[1], first, last)
 
 
 def _window(levels: ImageLevels) -> tuple[slice, slice]:
@@ -195,7 +250,7 @@ def _window(levels: ImageLevels) -> tuple[slice, slice]:
 
 
 def _weights(
-    node: GainField, start: int, equations: Array, rows: Array, columns: Array, sign: float
+    node: GainField, start: int, equations: Array, rows: Array, columns: Array
 ) -> tuple[Array, Array, Array]:
     """Bilinear weights of the four nodes around each place."""
     _, height, width = node.log_gain.shape
@@ -206,11 +261,11 @@ def _weights(
     at = start + r * width + c
     index = np.concatenate([at, at + 1, at + width, at + width + 1])
     weight = np.concatenate([(1 - v) * (1 - u), (1 - v) * u, v * (1 - u), v * u])
-    return np.tile(equations, 4), index, sign * weight
+    return np.tile(equations, 4), index, weight
 
 
 def _held(nodes: Sequence[GainField], starts: Array) -> Any:
-    """Normal matrix of gains of one, and of equal gains at neighbouring nodes."""
+    """Normal matrix of gains of one, no haze, and equal values at neighbouring nodes."""
     from scipy import sparse
 
     pairs = []
@@ -225,17 +280,36 @@ def _held(nodes: Sequence[GainField], starts: Array) -> Any:
         (np.concatenate([one, -one]), (np.concatenate([k, k]), np.concatenate([a, b]))),
         shape=(len(a), n),
     ).tocsr()
-    return HOLD * sparse.eye_array(n, format="csr") + STIFFNESS * (steps.T @ steps)
+    one_each, smooth = sparse.eye_array(n, format="csr"), steps.T @ steps
+    gain = HOLD * one_each + STIFFNESS * smooth
+    haze = HAZE_HOLD * one_each + HAZE_STIFFNESS * smooth
+    return sparse.block_diag((gain, haze), format="csr")
 
 
-def _solved(design: Any, observed: Array, held: Any) -> Array:
-    """Least squares by conjugate gradients, once more without overlaps that disagree."""
+def _solved(pairs: _Pairs, band: int, held: Any) -> Array:
+    """Gains and haze of one band, least squares by conjugate gradients.
+
+    Linearized at the haze of the round before; after the first round without overlaps that
+    disagree.
+    """
     from scipy import sparse
     from scipy.sparse.linalg import cg
 
-    solution = np.zeros(held.shape[0])
-    weight = np.ones(len(observed))
-    for _ in range(2):
+    nodes = held.shape[0] // 2
+    owner, other = pairs.owner_signal[band], pairs.other_signal[band]
+    solution = np.zeros(2 * nodes)
+    if not len(owner):
+        return solution
+    unit = float(np.median(np.concatenate([owner, other])))
+    weight = np.ones(len(owner))
+    for _ in range(_ROUNDS):
+        haze = solution[nodes:] * unit
+        parts, observed = [], np.zeros(len(owner))
+        for side, signal, sign in ((pairs.owner, owner, 1.0), (pairs.other, other, -1.0)):
+            clear = np.maximum(signal - side @ haze, (1.0 - HAZE_MAX) * signal)
+            parts.append(sparse.diags_array(-sign * unit / clear) @ side)
+            observed -= sign * (np.log(clear) + (signal - clear) / clear)
+        design = sparse.hstack([pairs.owner - pairs.other, parts[0] + parts[1]], format="csr")
         normal = held + design.T @ (sparse.diags_array(weight) @ design)
         inverse = sparse.diags_array(1.0 / normal.diagonal())
         right = design.T @ (weight * observed)
@@ -243,4 +317,5 @@ def _solved(design: Any, observed: Array, held: Any) -> Array:
             normal, right, x0=solution, rtol=_TOLERANCE, maxiter=_ITERATIONS, M=inverse
         )
         weight = (np.abs(design @ solution - observed) < OUTLIER_LOG).astype(np.float64)
+    solution[nodes:] *= unit
     return np.asarray(solution)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -58,6 +60,29 @@ def test_exposure_haze_and_hot_spot_are_taken_out() -> None:
     after = _seams(images, [levelled(i, f) for i, f in zip(images, fields, strict=True)], owner)
     assert before > 0.1
     assert after < 0.005
+
+
+def test_light_that_haze_adds_is_taken_out_of_dark_ground_too() -> None:
+    """A gradient of a tenth of the mean signal, which turns with the line; ground of contrast."""
+    random = np.random.default_rng(4)
+    images, owner = _block(random, lambda k, v, u: 0.05 * np.sin(3 * k))
+    u = np.arange(SIZE) / (SIZE - 1)
+    added = []
+    for k, image in enumerate(images):
+        haze = 0.1 * (u if k // 4 % 2 else u[::-1])
+        added.append(haze)
+        image.log_signal[:] = np.log(np.exp(image.log_signal) + haze)
+    fields = level_block(images, owner)
+    before = _seams(images, [image.log_signal for image in images], owner)
+    after = _seams(images, [levelled(i, f) for i, f in zip(images, fields, strict=True)], owner)
+    flat = [replace(field, haze=np.zeros_like(field.haze)) for field in fields]
+    gain_only = _seams(images, [levelled(i, f) for i, f in zip(images, flat, strict=True)], owner)
+    assert before > 0.05 and gain_only > 0.02
+    assert after < 0.006
+    for field, haze in zip(fields, added, strict=True):
+        slope = field.haze[..., -1].mean() - field.haze[..., 0].mean()
+        # Images of one line share their gradient: overlaps show a part of it only.
+        assert 0.2 < slope / (haze[-1] - haze[0]) < 1.1
 
 
 def test_a_block_without_differences_stays_as_it_is() -> None:
