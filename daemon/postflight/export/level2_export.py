@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import uuid
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -37,7 +37,7 @@ from daemon.products.level3 import IMAGES as LEVEL3_IMAGES
 from daemon.products.level3 import level3_root
 from processing.geometry.orientation import BODY_FROM_CAMERA, ENU_FROM_NED, on_level_ground
 from processing.geometry.rotation import omega_phi_kappa, roll_pitch_heading, rotation_matrix
-from processing.rig import Rig
+from processing.rig import Rig, load_rig
 
 KINDS = tuple(SUFFIXES)
 GRID = 5
@@ -108,6 +108,12 @@ def export_pictures(
         if exposure.mark_gps_ns is not None and (not only or number in only)
     }
     unreadable = [f for f in read.failures if not only or f.exposure in only]
+    if level == 2 and (bands := _single_bands(mission, exposures)):
+        raise PictureError(
+            f"{mission.path}: Level-2 has registered bands as single rasters, which this command "
+            f"does not export; take L2/<exposure>/{bands[0]}.tif as it is, or heads with "
+            "orientation by `syntopic export block --images raw`"
+        )
     inputs = read_orientation_inputs(
         mission,
         list(exposures.values()),
@@ -146,6 +152,19 @@ def export_pictures(
             f"{causes}"
         )
     return files, failures
+
+
+def _single_bands(mission: Mission, exposures: Iterable[int]) -> list[str]:
+    """Bands that Level-2 has as a raster each, in the geometry of one; empty with other rasters."""
+    rig = load_rig(mission.rig_path)
+    if rig.virtual_image is not None:
+        return []
+    cones = {cone.name for cone in rig.cones}
+    bands = [band for cone in rig.cones for band in cone.bands if band not in cones]
+    folders = [mission.level2(number) for number in exposures]
+    if any((folder / f"{cone}.tif").exists() for folder in folders for cone in cones):
+        return []
+    return [b for b in bands if any((folder / f"{b}.tif").exists() for folder in folders)]
 
 
 def _pictures(

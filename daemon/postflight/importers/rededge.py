@@ -324,7 +324,9 @@ def _cone_of(cone: Cone, image: RedEdgeImage | None, fit: dict[str, float]) -> C
         y_mm=(row - (image.height_px - 1) / 2.0) * image.pitch_mm,
         black_dn=image.black / cone.sensors[0].raw_units_per_dn,
     )
-    return replace(cone, lens=lens, sensors=(sensor,))
+    wavelength_nm = image.calibration.wavelength_nm
+    known = (wavelength_nm,) if wavelength_nm > 0.0 and len(cone.bands) == 1 else ()
+    return replace(cone, lens=lens, sensors=(sensor,), wavelengths_nm=known)
 
 
 def _write_exposure(

@@ -69,9 +69,21 @@ def test_the_mission_holds_the_camera_s_words_and_its_calibration(processed):
             reference = tifffile.imread(RECORDED / "0000SET" / "000" / f"{image}_{head}.tif")
             undistorted = tifffile.imread(mission.level0(number) / f"{sensor}.tif")
             assert np.array_equal(undistorted, reference)
+    wavelengths = {c.bands[0]: c.wavelengths_nm for c in rig.cones}
+    assert wavelengths == {
+        "blue": (475.0,), "green": (560.0,), "red": (668.0,), "nir": (840.0,), "red_edge": (717.0,)
+    }  # fmt: skip
     blue = rig.cone("B")
     assert blue.sensors[0].justified == "left" and blue.sensors[0].black_dn == 300.0
     assert blue.lens.f_mm == pytest.approx(1449.3582467 * 0.00375, rel=1e-6)
+
+
+@needs_recording
+def test_pictures_of_registered_bands_are_refused_with_the_files_to_take(processed):
+    mission, *_ = processed
+    done = CliRunner().invoke(app, ["export", "pictures", str(mission.path), "--as", "tiff"])
+    sentence = " ".join(str(done.exception).split())
+    assert done.exit_code != 0 and "L2/<exposure>/blue.tif" in sentence, sentence
 
 
 @needs_recording
