@@ -128,11 +128,11 @@ def test_a_measured_rate_excludes_the_work_of_the_service(browser: Browser) -> N
           };
           const { isSlow, thumbnailOf } = await import('/thumbnails.js');
           await thumbnailOf(1001);
-          waitMs = 400;
-          for (let k = 2; k < 10; k += 1) await thumbnailOf(1000 + k);
+          waitMs = 150;
+          for (let k = 2; k < 18; k += 1) await thumbnailOf(1000 + k);
           const busy = isSlow();
           [waitMs, bodyMs] = [1, 500];
-          for (let k = 10; k < 18; k += 1) await thumbnailOf(1000 + k);
+          for (let k = 18; k < 22; k += 1) await thumbnailOf(1000 + k);
           window.fetch = real;
           return [busy, isSlow()];
         })()"""
