@@ -129,6 +129,8 @@ def iterate(run: Run) -> tuple[Equations, ReducedEquations]:
             trial.refuse_moving(step.dpoints)
         elif not trial.take(step, damping):
             break
+        # Not held while the next are computed: they are the largest arrays of an adjustment.
+        del rows, trial, reduced, step
     raise NetworkError(
         [
             f"no convergence after {len(run.history) - 1} iterations; starting values are "

@@ -155,12 +155,10 @@ def reduced_equations(
         own = np.einsum("mi,mij->mj", equations.point_part, factor[at])
     else:
         own = np.zeros_like(equations.point_part)
-    rows = np.repeat(np.arange(len(at)), 3)
-    wide = (3 * at[:, None] + np.arange(3)).ravel()
-    there = np.repeat(equations.point >= 0, 3)
-    orthonormal = sparse.coo_array(
-        (own.ravel()[there], (rows[there], wide[there])), shape=(len(at), 3 * points)
-    ).tocsr()
+    there = equations.point >= 0
+    wide = (3 * equations.point[there, None] + np.arange(3)).ravel()
+    begin = np.concatenate([[0], np.cumsum(3 * there)])
+    orthonormal = sparse.csr_array((own[there].ravel(), wide, begin), shape=(len(at), 3 * points))
     coupling_sparse = (orthonormal.T @ design_sparse).tocsr()
     coupling_dense = np.asarray(orthonormal.T @ design_dense)
     point_right = np.asarray(orthonormal.T @ equations.misclosure)
