@@ -150,7 +150,8 @@ def dbat(
 
 BLOCK_HELP = """Import cameras, orientations and points of another program for `syntopic adjust`.
 
-Programs: colmap (folder of a text model), opensfm (reconstruction.json), metashape (cameras.xml),
+Programs: colmap (folder of a text model), opensfm (reconstruction.json
+and tracks.csv), metashape (cameras.xml),
 bundler (bundle.out) and bal (problem file). Distortion is converted to the ten parameters by fit
 and refused above 0.02 px. Without --position-sigma the project is a free network.
 

@@ -26,10 +26,12 @@ from daemon.postflight.exchange.block import (
     BlockCamera,
     BlockError,
     BlockImage,
+    BlockPoints,
     BlockRig,
     fitted,
 )
 from daemon.postflight.exchange.colmap import camera_pose, rig_pose, vision_pose
+from daemon.postflight.exchange.opensfm_tracks import TRACKS_FILE, read_tracks
 from processing.geometry.forward_distortion import ForwardDistortion
 from processing.geometry.orientation import BODY_FROM_CAMERA, ENU_FROM_NED
 from processing.geometry.rotation import roll_pitch_heading
@@ -182,7 +184,7 @@ def _rigs(block: Block, rig: BlockRig, suffix: str) -> tuple[dict[str, Any], dic
 
 
 def read_opensfm(path: Path) -> Block:
-    """Read the one reconstruction of a `reconstruction.json`.
+    """Read the one reconstruction of a `reconstruction.json`, measurements of `tracks.csv` there.
 
     Raises:
         BlockError: not such a file, several reconstructions, or a camera model not carried.
@@ -230,7 +232,13 @@ def _block_of(file: Path, content: Mapping[str, Any]) -> Block:
             frame = LocalFrame(lla["latitude"], lla["longitude"])
         else:
             notes.append(f"heights count from {lla['altitude']} m above the ellipsoid")
-    return Block(file.parent.name, cameras, tuple(images), frame, notes=tuple(notes))
+    tracks = file.parent / TRACKS_FILE
+    points = BlockPoints()
+    if tracks.exists():
+        points = read_tracks(tracks, content.get("points", {}), images, cameras)
+    else:
+        notes.append(f"no {TRACKS_FILE} next to {file.name}, which has the image measurements")
+    return Block(file.parent.name, cameras, tuple(images), frame, points=points, notes=tuple(notes))
 
 
 def _camera(file: Path, name: str, content: Mapping[str, Any]) -> BlockCamera:

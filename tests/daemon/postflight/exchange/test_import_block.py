@@ -13,8 +13,15 @@ from typer.testing import CliRunner
 
 from daemon.cli import app
 from daemon.postflight.adjustment.project import read_project
-from daemon.postflight.exchange.block import Block, BlockCamera, BlockImage, BlockPoints
+from daemon.postflight.exchange.block import (
+    Block,
+    BlockCamera,
+    BlockError,
+    BlockImage,
+    BlockPoints,
+)
 from daemon.postflight.exchange.colmap import colmap_texts, read_colmap
+from daemon.postflight.exchange.opensfm import read_opensfm
 from processing.geometry.forward_distortion import ForwardDistortion
 
 RUN = CliRunner()
@@ -108,8 +115,53 @@ def bal(scene, folder: Path) -> Path:
     return folder / "problem.txt"
 
 
+def opensfm(scene, folder: Path) -> Path:
+    """Written here by the format of OpenSfM: shares of the longer side about the middle."""
+    points, centres, turns, seen = scene
+    camera = {
+        "projection_type": "perspective", "width": SIZE[0], "height": SIZE[1],
+        "focal": F / SIZE[0], "k1": K1, "k2": K2,
+    }  # fmt: skip
+    shots = {
+        f"{k}.jpg": {
+            "rotation": Rotation.from_matrix(turn.T).as_rotvec().tolist(),
+            "translation": (-turn.T @ centre).tolist(),
+            "camera": "camera1",
+        }
+        for k, (centre, turn) in enumerate(zip(centres, turns, strict=True))
+    }
+    found = {str(7 + p): {"coordinates": xyz.tolist()} for p, xyz in enumerate(points)}
+    content = [{"cameras": {"camera1": camera}, "shots": shots, "points": found}]
+    rows = ["OPENSFM_TRACKS_VERSION_v2"]
+    for k, p, u, v in [*seen, (0, 9000, 1.0, 1.0)]:
+        place = f"{u / SIZE[0]!r}\t{v / SIZE[0]!r}"
+        rows.append(f"{k}.jpg\t{7 + p}\t{p}\t{place}\t0.001\t1\t2\t3\t-1\t-1")
+    folder.mkdir()
+    (folder / "reconstruction.json").write_text(json.dumps(content))
+    (folder / "tracks.csv").write_text("\n".join(rows) + "\n")
+    return folder
+
+
 @pytest.mark.parametrize(
-    ("program", "write"), [("colmap", colmap), ("bundler", bundler), ("bal", bal)]
+    ("old", "new", "sentence"),
+    [
+        ("VERSION_v2", "VERSION_v7", "tracks of version 7"),
+        ("\t-1\t-1\n", "\n", "line 2: no line of OpenSfM's tracks \\(9 columns"),
+        ("0.jpg\t", "0.jpg\t1\t", "12 columns"),
+    ],
+)
+def test_damaged_tracks_of_opensfm_are_refused(scene, tmp_path, old, new, sentence) -> None:
+    path = opensfm(scene, tmp_path / "in")
+    text = (path / "tracks.csv").read_text()
+    assert old in text
+    (path / "tracks.csv").write_text(text.replace(old, new, 1))
+    with pytest.raises(BlockError, match=sentence):
+        read_opensfm(path)
+
+
+@pytest.mark.parametrize(
+    ("program", "write"),
+    [("colmap", colmap), ("bundler", bundler), ("bal", bal), ("opensfm", opensfm)],
 )
 def test_an_imported_block_adjusts_to_the_truth(scene, tmp_path, program, write) -> None:
     path = write(scene, tmp_path / "in")
