@@ -1,0 +1,46 @@
+"""Files for clusters: no root, no compiler, TLS everywhere, options that the commands have."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from daemon.cli import app
+
+FOLDER = Path(__file__).parents[4] / "systemd/cluster"
+
+
+def test_the_image_has_no_root_and_no_compiler() -> None:
+    text = (FOLDER / "Containerfile").read_text()
+    final = text.rpartition("\nFROM ")[2]
+    assert "\nUSER 10001\n" in final and "USER root" not in text
+    assert final.index("USER 10001") < final.index("syntopic kernels")
+    assert not re.search(r"\b(gcc|g\+\+|build-essential|python3-dev)\b", text)
+    assert "--only-binary=:all:" in text and "requirements.lock" in text
+
+
+def test_pods_have_no_root_and_every_connection_has_tls() -> None:
+    yaml = pytest.importorskip("yaml")
+    parts = list(yaml.safe_load_all((FOLDER / "kubernetes.yaml").read_text()))
+    pods = [part["spec"]["template"]["spec"] for part in parts if "template" in part["spec"]]
+    assert len(pods) == 3
+    for pod in pods:
+        assert pod["securityContext"]["runAsNonRoot"]
+        (container,) = pod["containers"]
+        words = [str(word) for word in [*container.get("command", []), *container.get("args", [])]]
+        assert "tls" in words or any(word.startswith("tls://") for word in words)
+        assert not any(word.startswith("tcp://") for word in words)
+
+
+@pytest.mark.parametrize(("file", "command"), [("slurm.sh", "worker"), ("slurm.sh", "process")])
+def test_the_options_exist(file: str, command: str) -> None:
+    path = FOLDER / file
+    subprocess.run(["sh", "-n", str(path)], check=True)
+    text = path.read_text()
+    shown = CliRunner().invoke(app, [command, "--help"], env={"COLUMNS": "200"}).output
+    for option in ("--tls-ca", "--tls-certificate", "--tls-key"):
+        assert f"{option} " in text and option in shown
