@@ -2,7 +2,9 @@
 
 Crosswise overlapping lines, 80 % along and 60 % across, of a camera of 100 mm with square images.
 Observations have normal errors of 0.3 px, starting values errors of 1 m and 1 mrad. The datum is
-that of control points, or free.
+that of control points, or free. `--peer` adjusts the block around a building of `blunder_search`
+with three held points, here and by Ceres as pycolmap calls it (SPARSE_SCHUR, one thread, C++
+residuals), from the same starting values.
 """
 
 from __future__ import annotations
@@ -11,13 +13,16 @@ import argparse
 import json
 import math
 import resource
+import tempfile
 import time
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, Final, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.blunder_search import LARGE, around_building
 from daemon.cli.benchmark.measurement import machine
 from processing.bundle.adjust import AdjustmentSettings, adjust
 from processing.bundle.free_datum import FreeDatum
@@ -119,6 +124,116 @@ def measured(network: Network, datum: str) -> dict[str, Any]:
     }
 
 
+def building(seed: int = 4) -> Network:
+    """128,000 image points of 60 images around a building, three held points, normal errors."""
+    random = np.random.default_rng(seed)
+    network = around_building(points=LARGE).network
+    table, points = network.image_points, network.points
+    rays = np.bincount(table.point, minlength=len(points.names))
+    held = np.flatnonzero(rays >= 4)[[0, 700, 1400]]
+    start = points.xyz_m + random.normal(0.0, 0.02, points.xyz_m.shape)
+    start[held] = points.xyz_m[held]
+    sigma = np.full_like(points.sigma_m, np.nan)
+    sigma[held] = 0.0
+    stations, attitudes = network.stations, network.attitudes
+    turned = rotations_from_vectors(random.normal(0.0, 1e-3, (len(stations.names), 3)))
+    moved = stations.position_m + random.normal(0.0, 0.02, stations.position_m.shape)
+    noise = random.normal(0.0, NOISE_PX * PIXEL_MM, table.xy_mm.shape)
+    return replace(
+        network,
+        stations=replace(stations, position_m=moved),
+        attitudes=replace(attitudes, rotation=attitudes.rotation @ turned),
+        points=replace(points, xyz_m=start, sigma_m=sigma),
+        image_points=replace(table, xy_mm=table.xy_mm + noise),
+    )
+
+
+def compared(network: Network) -> list[dict[str, Any]]:
+    """The same block here and by Ceres: CPU time to convergence, and of covariances in addition."""
+    at: dict[str, float] = {}
+
+    def note(what: str, _number: int, _squares: float) -> None:
+        at.setdefault(what, time.process_time())
+
+    begun = time.process_time()
+    result = adjust(network, progress=note)
+    rows = result.equations
+    own = rows.group < 2
+    squares = float(((result.residual[own] * rows.sigma[own]) ** 2).sum()) / PIXEL_MM**2
+    here = {
+        "program": "here",
+        "image_points": len(network.image_points.image),
+        "iterations": len(result.iterations) - 1,
+        "squares_px2": squares,
+        "cpu_s": round(at["covariances"] - begun, 2),
+        "cpu_s_with_covariances": round(time.process_time() - begun, 2),
+    }
+    return [here, *(_by_ceres(network, tolerance) for tolerance in (1e-6, 1e-8))]
+
+
+def _by_ceres(network: Network, tolerance: float) -> dict[str, Any]:
+    import pycolmap
+
+    with tempfile.TemporaryDirectory() as folder:
+        _write_colmap(Path(folder), network)
+        block = pycolmap.Reconstruction(folder)
+    config = pycolmap.BundleAdjustmentConfig()
+    for image in block.images:
+        config.add_image(image)
+    config.set_constant_cam_intrinsics(1)
+    for point in np.flatnonzero((network.points.sigma_m == 0.0).all(axis=1)):
+        config.add_constant_point(int(point) + 1)
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    ceres = options.ceres
+    ceres.auto_select_solver_type = False
+    solver = ceres.solver_options
+    solver.linear_solver_type = type(solver.linear_solver_type).SPARSE_SCHUR
+    solver.num_threads, solver.max_num_iterations = 1, 50
+    solver.function_tolerance, solver.gradient_tolerance = tolerance, 1e-14
+    begun = time.process_time()
+    adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, block)
+    summary = adjuster.solve()
+    converged = time.process_time()
+    pycolmap.estimate_ba_covariance(pycolmap.BACovarianceOptions(), block, adjuster)
+    found = summary.ceres_summary
+    return {
+        "program": f"pycolmap {pycolmap.__version__}",
+        "function_tolerance": tolerance,
+        "iterations": found.num_successful_steps,
+        "squares_px2": 2.0 * found.final_cost,
+        "cpu_s": round(converged - begun, 2),
+        "cpu_s_with_covariances": round(time.process_time() - begun, 2),
+    }
+
+
+def _write_colmap(folder: Path, network: Network) -> None:
+    """The network as a text model: y of its images points down, z forward."""
+    from scipy.spatial.transform import Rotation
+
+    camera, table = network.cameras[0], network.image_points
+    f, middle = camera.f_mm / PIXEL_MM, 5000.0
+    (folder / "cameras.txt").write_text(f"1 PINHOLE 10000 10000 {f!r} {f!r} {middle} {middle}\n")
+    pixel = middle + table.xy_mm / PIXEL_MM * np.array([1.0, -1.0])
+    rotation = np.diag([1.0, -1.0, -1.0]) @ network.attitudes.rotation.transpose(0, 2, 1)
+    shift = -np.einsum("nij,nj->ni", rotation, network.stations.position_m)
+    tracks: list[list[str]] = [[] for _ in network.points.names]
+    with (folder / "images.txt").open("w") as file:
+        for k, name in enumerate(network.images.names):
+            x, y, z, w = Rotation.from_matrix(rotation[k]).as_quat()
+            pose = " ".join(repr(float(v)) for v in (w, x, y, z, *shift[k]))
+            own = np.flatnonzero(table.image == k)
+            seen = [f"{pixel[m, 0]:.9f} {pixel[m, 1]:.9f} {table.point[m] + 1}" for m in own]
+            file.write(f"{k + 1} {pose} 1 {name}\n{' '.join(seen)}\n")
+            for index, m in enumerate(own):
+                tracks[table.point[m]].append(f"{k + 1} {index}")
+    with (folder / "points3D.txt").open("w") as file:
+        for k, track in enumerate(tracks):
+            if track:
+                place = " ".join(repr(float(v)) for v in network.points.xyz_m[k])
+                file.write(f"{k + 1} {place} 0 0 0 0 {' '.join(track)}\n")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.adjustment_speed", description=__doc__
@@ -134,9 +249,14 @@ def main() -> None:
         default=("control",),
         help="Datum of each adjustment; memory is the largest so far (default: control).",
     )
+    parser.add_argument("--peer", action="store_true", help="Comparison with Ceres.")
     options = parser.parse_args()
-    network = block_of(options.images, options.image_points)
     print(json.dumps({"machine": machine()}), flush=True)
+    if options.peer:
+        for found in compared(building()):
+            print(json.dumps(found), flush=True)
+        return
+    network = block_of(options.images, options.image_points)
     for datum in options.datum:
         print(json.dumps(measured(network, datum)), flush=True)
 
