@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import base64
 import json
+import os
 import time
 from pathlib import Path
 from typing import Any
@@ -132,3 +134,12 @@ def axe(browser: Browser) -> list[Any]:
         for one in (*found["violations"], *found["incomplete"])
         if one in found["violations"] or one["id"] not in DECIDED
     ]
+
+
+def save_picture(browser: Browser, name: str) -> None:
+    if folder := os.environ.get("SYNTOPIC_PICTURES"):
+        browser.evaluate("new Promise((resolve) => setTimeout(resolve, 250))")
+        message = browser.call("Page.captureScreenshot", format="webp", quality=55)
+        path = Path(folder) / f"{name}.webp"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(base64.b64decode(message["data"]))

@@ -6,12 +6,10 @@ pictured there.
 
 from __future__ import annotations
 
-import base64
 import json
 import os
 import signal
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -30,6 +28,7 @@ from tests.daemon.onboard.monitoring.cockpit import (
     axe,
     lines,
     picture_of,
+    save_picture,
 )
 from tests.daemon.onboard.monitoring.guidance_frames import aerial_map, vector_map
 from tests.daemon.onboard.monitoring.test_page import WITHIN_S, Service
@@ -108,15 +107,6 @@ def check(cockpit: Cockpit, state: str, *, east_deg: float | None = None) -> Non
         cockpit.guide(east_deg)
         save_picture(browser, f"{state}-{width}")
     cockpit.resize(1280, 800)
-
-
-def save_picture(browser: Browser, name: str) -> None:
-    if folder := os.environ.get("SYNTOPIC_PICTURES"):
-        browser.evaluate("new Promise((resolve) => setTimeout(resolve, 250))")
-        message = browser.call("Page.captureScreenshot", format="webp", quality=55)
-        path = Path(folder) / f"{name}.webp"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(base64.b64decode(message["data"]))
 
 
 def test_before_arming(cockpit: Cockpit) -> None:

@@ -22,6 +22,7 @@ from tests.daemon.onboard.monitoring.cockpit import (
     SIZES,
     THEMES,
     axe,
+    save_picture,
 )
 from tests.daemon.onboard.monitoring.guidance_frames import guidance_frame
 from tests.daemon.onboard.monitoring.test_fleet import checksum, member
@@ -74,6 +75,17 @@ def test_the_view_of_a_pilot_is_whole(browser: Browser, tmp_path: Path, language
         )
         send()
         check(browser, send, THEMES if language == "en" else THEMES[:1])
+        if language == "en":
+            browser.call(
+                "Emulation.setDeviceMetricsOverride",
+                width=1280,
+                height=800,
+                deviceScaleFactor=1,
+                mobile=False,
+            )
+            browser.evaluate("document.documentElement.dataset.theme = ''")
+            send()
+            save_picture(browser, "pilot-1280")
     finally:
         service.end()
 
