@@ -37,6 +37,12 @@ def flight(
         int | None,
         typer.Option(help="Number of exposures (default: 120 frames of all heads).", min=6),
     ] = None,
+    trajectory: Annotated[
+        Path | None,
+        typer.Option(
+            help="Post-processed positions: SBET, CSV or RTKLIB's .pos (default: in-flight ones)."
+        ),
+    ] = None,
     previous: Annotated[
         Path | None, typer.Option(help="Calibration from a flight to compare with.")
     ] = None,
@@ -46,7 +52,7 @@ def flight(
     from daemon.cli.calibration_output import publish_calibration
     from daemon.postflight.calibration.calibration_report import calibration_folder, read_previous
     from daemon.postflight.calibration.flight.findings import findings_of
-    from daemon.postflight.calibration.flight.frames import read_flight
+    from daemon.postflight.calibration.flight.frames import FlightFramesError, read_flight
     from daemon.postflight.calibration.flight.report import (
         KIND,
         calibrated_rig,
@@ -55,6 +61,7 @@ def flight(
     )
     from daemon.postflight.calibration.head_parameters import covariance_bytes
     from processing.calibration.flight.adjustment import calibrate_flight
+    from processing.calibration.flight.images import FlightCalibrationError
 
     before = None if previous is None else read_previous(previous, kind=KIND)
     today = f"{datetime.now(UTC):%Y-%m-%d}"
@@ -64,9 +71,17 @@ def flight(
         def show_progress(what: str, done: int, total: int) -> None:
             progress.update(task, description=what, completed=done, total=total or None)
 
-        frames = read_flight(missions, exposures_max=exposures, progress=show_progress)
+        frames = read_flight(
+            missions,
+            exposures_max=exposures,
+            trajectory_file=trajectory,
+            progress=show_progress,
+        )
         place = calibration_folder(out, f"{frames.rig.name}-flight", today, next_to=missions[0])
-        found = calibrate_flight(frames.rig, frames.images, progress=show_progress)
+        try:
+            found = calibrate_flight(frames.rig, frames.images, progress=show_progress)
+        except FlightCalibrationError as error:
+            raise FlightFramesError(f"{frames.rig.name}: {error}") from error
     findings = findings_of(found, frames)
     made = calibrated_rig(found, frames, findings, date=today)
     report = flight_report(

@@ -389,6 +389,9 @@ def _position_factors(result: Adjustment) -> tuple[float, float]:
 def spread_images(cones: list[Cone], images: FlightImages) -> FlightImages:
     """Keep the longest tracks in every part of every image.
 
+    Tracks through several lines, and through several heads, are shorter, and join the block; the
+    longest of these are kept as well.
+
     Args:
         cones: heads, one sensor each.
         images: with all tracks.
@@ -401,10 +404,26 @@ def spread_images(cones: list[Cone], images: FlightImages) -> FlightImages:
         [(cone.sensors[0].width_px, cone.sensors[0].height_px) for cone in cones], float
     )
     place = tracks.px / size[images.head[tracks.image]] * _UNIT_PX
-    kept = spread_tracks(tracks.image, tracks.point, place, (_UNIT_PX, _UNIT_PX))
+    kept = np.zeros(len(tracks.image), bool)
+    for group in (None, images.line[images.exposure], images.head):
+        rows = np.arange(len(tracks.image))
+        if group is not None:
+            rows = np.flatnonzero(_has_several(tracks, group[tracks.image]))
+        kept[rows] |= spread_tracks(
+            tracks.image[rows], tracks.point[rows], place[rows], (_UNIT_PX, _UNIT_PX)
+        )
     _, point = np.unique(tracks.point[kept], return_inverse=True)
     spread = Tracks(tracks.image[kept], point, tracks.px[kept], int(point.max(initial=-1)) + 1)
     return replace(images, tracks=spread)
+
+
+def _has_several(tracks: Tracks, group: Indices) -> NDArray[np.bool_]:
+    """Image points of tracks through more than one line or head."""
+    least = np.full(tracks.points, np.iinfo(np.int64).max)
+    most = np.full(tracks.points, -1)
+    np.minimum.at(least, tracks.point, group)
+    np.maximum.at(most, tracks.point, group)
+    return np.asarray((most > least)[tracks.point])
 
 
 def _lever_m(base: Cone, antenna_m: Array) -> Array:

@@ -37,6 +37,7 @@ class FlightImages:
     Attributes:
         head: (n,) index of each image's cone in the rig.
         exposure: (n,) index of its exposure.
+        line: (exposures,) index of the line of each exposure.
         tracks: image points of all images, by image index.
         position_m: (exposures, 3) of the antenna at the exposure of the reference head, NaN where
             there is none.
@@ -46,6 +47,7 @@ class FlightImages:
 
     head: Indices
     exposure: Indices
+    line: Indices
     tracks: Tracks
     position_m: Array
     position_sigma_m: Array

@@ -36,6 +36,8 @@ _PARALLAX_MIN_RAD: Final = np.radians(1.0)
 _RESIDUAL_MIN_PX: Final = 4.0
 _RESIDUAL_MAX_PX: Final = 60.0
 _PASSES: Final = 3
+_BENT_SHARE: Final = 0.1
+"""Residual of positions over their spread above which a block is broken, not bent."""
 
 
 @dataclass(frozen=True)
@@ -216,6 +218,13 @@ def _orient_together(
         fit = fit_positions(block.station[placed], position[placed])
     except NotPlacedError as error:
         raise FlightCalibrationError(f"{names}: {error}") from error
+    size = np.linalg.norm(position[placed].std(axis=0))
+    away = np.sqrt(np.mean(np.sum(fit.residual_m**2, axis=1)))
+    if away > _BENT_SHARE * size:
+        raise FlightCalibrationError(
+            f"{names}: images and positions contradict each other by {away:.1f} m. Lines that "
+            "hardly overlap do not hang together, or times of positions and frames do not match"
+        )
     new = own[block.oriented]
     found.station_m[new] = fit.applied(block.station[block.oriented])
     found.rotation[new] = fit.rotation @ block.rotation[block.oriented]

@@ -119,6 +119,7 @@ def flown(rig: Rig, plan: FlightPlan, seed: int, *, relief_m: float = 3.0) -> Fl
     return FlightImages(
         np.array(heads),
         np.array(exposures),
+        np.repeat(np.arange(len(plan.lines)), plan.exposures),
         tracks,
         position + sigma * random.standard_normal(position.shape),
         sigma,

@@ -101,6 +101,15 @@ def test_one_line_does_not_calibrate() -> None:
         calibrate_flight(ONE_HEAD, flown(true_rig(ONE_HEAD, 4), plan, 4))
 
 
+def test_positions_of_another_flight_are_refused() -> None:
+    images = flown(true_rig(ONE_HEAD, 4), TWO_HEIGHTS, 4)
+    other = images.position_m.copy()
+    other[:4] = other[3::-1]
+    other[:4, 0] += 200.0
+    with pytest.raises(FlightCalibrationError, match="contradict each other"):
+        calibrate_flight(ONE_HEAD, replace(images, position_m=other))
+
+
 def test_positions_worse_than_stated_are_not_believed() -> None:
     truth = true_rig(ONE_HEAD, 5)
     images = flown(truth, replace(TWO_HEIGHTS, gnss_sigma_m=0.5), 5)

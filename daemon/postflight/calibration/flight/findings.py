@@ -102,8 +102,9 @@ def _positions(found: FlightCalibration, frames: FlightFrames) -> list[str]:
     sentences = []
     if frames.without_sigma:
         sentences.append(
-            f"{frames.without_sigma} positions have no standard deviation; 3 m and 5 m in height "
-            "are taken"
+            f"{frames.without_sigma} positions have no standard deviation; "
+            f"{frames.default_sigma_m[0]:g} m, and {frames.default_sigma_m[1]:g} m in height, are "
+            "taken"
         )
     used = found.adjustment.network.gnss.sigma_m
     factor = float(np.median(used) / np.median(frames.images.position_sigma_m))

@@ -6,7 +6,7 @@ Which exposures are used, which images are compared, and tracks of features thro
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -19,6 +19,8 @@ from daemon.mission.layout import Mission
 from daemon.mission.store.level0 import RasterError, read_tiff
 from daemon.orientation.exterior_orientation import mount_of, sealed_exposures
 from daemon.orientation.local_frame import LocalFrame
+from daemon.orientation.rtklib_positions import SUFFIX, read_positions
+from daemon.orientation.trajectory import read_trajectory, trajectory_of_samples
 from processing.calibration.flight.images import FlightImages
 from processing.matching.board_corners import grey_picture
 from processing.matching.photograph_tracks import (
@@ -38,6 +40,8 @@ EXPOSURES_MIN: Final = 6
 FEATURES_MAX: Final = 3000
 POSITION_SIGMA_M: Final = (3.0, 5.0)
 """Horizontal and vertical, of a receiver that states none."""
+TRAJECTORY_SIGMA_M: Final = (0.05, 0.08)
+"""Of a post-processed trajectory that states none."""
 _SAME_LINE: Final = 6
 _OTHER_LINES: Final = 8
 """Exposures, nearest first, that the images of one are compared with."""
@@ -52,7 +56,8 @@ class FlightFrames:
     """Images with tracks and positions, and what they are of.
 
     `apart_m` is the largest distance flown between frames of one exposure; `temperature_c` the mean
-    of each probe; `without_sigma` counts positions whose receiver stated none.
+    of each probe; `without_sigma` counts positions without a standard deviation, for which
+    `default_sigma_m` is taken, horizontal and vertical.
     """
 
     rig: Rig
@@ -63,6 +68,7 @@ class FlightFrames:
     apart_m: float
     temperature_c: dict[str, float]
     without_sigma: int
+    default_sigma_m: tuple[float, float]
     unreadable: tuple[str, ...]
 
 
@@ -80,6 +86,7 @@ def read_flight(
     missions: Sequence[Path],
     *,
     exposures_max: int | None = None,
+    trajectory_file: Path | None = None,
     progress: Progress = lambda _what, _done, _total: None,
 ) -> FlightFrames:
     """Read frames of the exposures that lie closest together, over all lines and heights.
@@ -87,14 +94,16 @@ def read_flight(
     Args:
         missions: flown with one rig file.
         exposures_max: number of exposures; None: so that there are 120 frames at most.
+        trajectory_file: post-processed positions; None: those of the flight.
         progress: called with what is done, and counts.
 
     Raises:
         FlightFramesError: another kind of rig, different rigs, or too few frames with a position.
+        TrajectoryError: as `daemon.orientation.trajectory`.
     """
     held = [Mission.open(path) for path in missions]
     rig = _common_rig(held)
-    candidates = [found for mission in held for found in _candidates(mission, rig)]
+    candidates = [found for mission in held for found in _candidates(mission, rig, trajectory_file)]
     if len(candidates) < EXPOSURES_MIN:
         raise FlightFramesError(
             f"{', '.join(str(mission.path) for mission in held)}: {len(candidates)} sealed "
@@ -107,7 +116,8 @@ def read_flight(
     kept = _closest(position, limit)
     chosen = [candidates[k] for k in kept]
     moved, apart_m = _at_exposure(chosen, rig, frame)
-    sigma, without = _sigmas(chosen)
+    default_m = POSITION_SIGMA_M if trajectory_file is None else TRAJECTORY_SIGMA_M
+    sigma, without = _sigmas(chosen, default_m)
     head, exposure, features, unreadable = _features(chosen, rig, progress)
     pairs = _pairs(position[kept], [one.line for one in chosen], head, exposure)
     matches = match_photographs(
@@ -116,6 +126,7 @@ def read_flight(
     images = FlightImages(
         head,
         exposure,
+        np.unique([one.line for one in chosen], return_inverse=True)[1].astype(np.int64),
         join_tracks(features, matches),
         position[kept] + moved,
         sigma,
@@ -130,6 +141,7 @@ def read_flight(
         apart_m,
         _temperatures(chosen),
         without,
+        default_m,
         tuple(unreadable),
     )
 
@@ -157,10 +169,13 @@ def _common_rig(missions: Sequence[Mission]) -> Rig:
     return rig
 
 
-def _candidates(mission: Mission, rig: Rig) -> list[_Candidate]:
+def _candidates(mission: Mission, rig: Rig, trajectory_file: Path | None) -> list[_Candidate]:
     sensors = {sensor.name for sensor in rig.sensors}
     found = []
-    for exposure in sealed_exposures(mission).results.values():
+    exposures = list(sealed_exposures(mission).results.values())
+    if trajectory_file is not None:
+        exposures = _along_trajectory(exposures, rig, trajectory_file)
+    for exposure in exposures:
         navigation = exposure.navigation
         if navigation is None or navigation.height_m is None:
             continue
@@ -169,6 +184,34 @@ def _candidates(mission: Mission, rig: Rig) -> list[_Candidate]:
         place = (navigation.latitude_deg, navigation.longitude_deg, navigation.height_m)
         found.append(_Candidate(mission, exposure, place, f"{mission.id} {exposure.line_id}"))
     return found
+
+
+def _along_trajectory(
+    exposures: Sequence[Exposure], rig: Rig, trajectory_file: Path
+) -> list[Exposure]:
+    """Exposures with the positions of a file, at the exposure of the reference head."""
+    times = {one.number: _instant_ns(one, rig) for one in exposures}
+    known = [gps_ns for gps_ns in times.values() if gps_ns is not None]
+    if not known:
+        return []
+    if trajectory_file.suffix.lower() == SUFFIX:
+        samples = read_positions(trajectory_file)
+        trajectory = trajectory_of_samples(trajectory_file.stem, samples)
+    else:
+        trajectory = read_trajectory(trajectory_file, around_gps_ns=known[0])
+    return [
+        replace(one, navigation=trajectory.at(gps_ns))
+        for one in exposures
+        if (gps_ns := times[one.number]) is not None
+    ]
+
+
+def _instant_ns(exposure: Exposure, rig: Rig) -> int | None:
+    """Mid-exposure of the reference head, or the mark."""
+    reference = rig.cone(rig.master_cone) if rig.master_cone else rig.cones[0]
+    frame = exposure.frame(reference.sensors[0].name)
+    own = None if frame is None else frame.mid_exposure_gps_ns
+    return exposure.mark_gps_ns if own is None else own
 
 
 def _closest(position: Array, count: int) -> NDArray[np.int64]:
@@ -185,7 +228,6 @@ def _at_exposure(chosen: Sequence[_Candidate], rig: Rig, frame: LocalFrame) -> t
 
     Returns also the largest distance flown between frames of one exposure.
     """
-    reference = rig.cone(rig.master_cone) if rig.master_cone else rig.cones[0]
     moved, apart = np.zeros((len(chosen), 3)), 0.0
     for k, one in enumerate(chosen):
         navigation = one.exposure.navigation
@@ -197,7 +239,7 @@ def _at_exposure(chosen: Sequence[_Candidate], rig: Rig, frame: LocalFrame) -> t
             for frame in one.exposure.frames
             if frame.mid_exposure_gps_ns is not None
         }
-        own = times.get(reference.sensors[0].name, one.exposure.mark_gps_ns)
+        own = _instant_ns(one.exposure, rig)
         if own is None:
             continue
         enu = np.array([east, north, -down]) * ((own - navigation.gps_ns) * 1e-9)
@@ -208,15 +250,15 @@ def _at_exposure(chosen: Sequence[_Candidate], rig: Rig, frame: LocalFrame) -> t
     return moved, apart
 
 
-def _sigmas(chosen: Sequence[_Candidate]) -> tuple[Array, int]:
+def _sigmas(chosen: Sequence[_Candidate], default_m: tuple[float, float]) -> tuple[Array, int]:
     sigma, without = np.empty((len(chosen), 3)), 0
     for k, one in enumerate(chosen):
         navigation = one.exposure.navigation
         plan = None if navigation is None else navigation.horizontal_sigma_m
         height = None if navigation is None else navigation.vertical_sigma_m
         without += not plan or not height
-        sigma[k, :2] = plan or POSITION_SIGMA_M[0]
-        sigma[k, 2] = height or POSITION_SIGMA_M[1]
+        sigma[k, :2] = plan or default_m[0]
+        sigma[k, 2] = height or default_m[1]
     return sigma, without
 
 

@@ -120,6 +120,27 @@ def _misfit_px(rig: Rig, truth: Rig) -> float:
     return float(np.sqrt(np.mean(np.sum(away**2, axis=1)))) / (PITCH_UM * 1e-3)
 
 
+def test_positions_come_from_a_post_processed_trajectory(
+    flown: tuple[Path, Rig, Rig], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(frames, "FEATURES_MAX", 40)
+    in_flight = frames.read_flight([flown[0]])
+    mission = Path(shutil.copytree(flown[0], tmp_path / "mission"))
+    rows = ["gps_ns,latitude_deg,longitude_deg,height_m,roll_deg,pitch_deg,heading_deg"]
+    for path in sorted((mission / "L0").glob("*/exposure.json")):
+        record = json.loads(path.read_text())
+        own = record.pop("navigation")
+        path.write_text(json.dumps(record))
+        place = f"{own['latitude_deg']:.12f},{own['longitude_deg']:.12f},{own['height_m'] + 5.0}"
+        rows.append(f"{own['gps_ns']},{place},0,0,0")
+    (tmp_path / "ppk.csv").write_text("\n".join(rows) + "\n")
+    found = frames.read_flight([mission], trajectory_file=tmp_path / "ppk.csv")
+    moved = found.images.position_m - in_flight.images.position_m
+    assert np.abs(moved - [0.0, 0.0, 5.0]).max() < 1e-3
+    assert found.without_sigma == 12
+    assert found.images.position_sigma_m[0].tolist() == [0.05, 0.05, 0.08]
+
+
 def test_flights_that_cannot_calibrate_are_refused(
     flown: tuple[Path, Rig, Rig], tmp_path: Path
 ) -> None:
