@@ -24,6 +24,10 @@ from daemon.onboard.monitoring.previews import Preview
 PHASES = frozenset(phase.value for phase in Phase)
 EXPOSURES_MAX = 2000
 """In the snapshot; earlier ones are on disk, and `/exposures` reports them."""
+FOOTPRINTS_MAX = 50_000
+"""Exposures before those of the snapshot, of which footprint and verdict are kept."""
+FOOTPRINT_DIGITS = 6
+"""Decimals of a degree: 0.1 m."""
 EVENTS_MAX = 500
 HISTORY_MAX = 7200
 FIGURES_REPORTED = (
@@ -82,6 +86,7 @@ class FlightState:
         self._exposures: dict[int, Json] = {}
         self._dropped_verdicts = dict.fromkeys(VERDICT_RANK, 0)
         """Counts of verdicts of dropped exposures, so that totals do not decrease."""
+        self._dropped: dict[int, Json] = {}
         self._temperatures: dict[int, Any] = {}
         self._events: deque[Json] = deque(maxlen=EVENTS_MAX)
         self._history: deque[Json] = deque(maxlen=HISTORY_MAX)
@@ -177,7 +182,16 @@ class FlightState:
         return found[:limit]
 
     def exposure(self, number: int) -> Json | None:
-        return self._exposures.get(number)
+        """One exposure; one before those of the snapshot has only what the map shows of it."""
+        found = self._exposures.get(number)
+        if found is None and (dropped := self._dropped.get(number)) is not None:
+            step = "lost" if dropped["verdict"] == "lost" else "processed"
+            return {**dropped, "sequence": 0, "step": step, "flags": [], "findings": []}
+        return found
+
+    def dropped_footprints(self) -> list[Json]:
+        """Number, verdict and footprint of exposures beyond `EXPOSURES_MAX`, oldest first."""
+        return [self._dropped[number] for number in sorted(self._dropped)]
 
     def retakes(self) -> list[Json]:
         """Lines that were added to be flown again."""
@@ -388,10 +402,21 @@ class FlightState:
         record = self._exposures.setdefault(number, {"number": number, "step": "triggered"})
         record["sequence"] = self.sequence
         while len(self._exposures) > EXPOSURES_MAX:
-            verdict = self._exposures.pop(min(self._exposures)).get("verdict")
-            if verdict in self._dropped_verdicts:
-                self._dropped_verdicts[verdict] += 1
+            self._drop(min(self._exposures))
         return record
+
+    def _drop(self, number: int) -> None:
+        """Reduce an exposure to what the map shows of it."""
+        dropped = self._exposures.pop(number)
+        verdict = dropped.get("verdict")
+        if verdict in self._dropped_verdicts:
+            self._dropped_verdicts[verdict] += 1
+        if dropped.get("footprint"):
+            corners = [[round(x, FOOTPRINT_DIGITS) for x in one] for one in dropped["footprint"]]
+            shown = "lost" if dropped.get("step") == "lost" else verdict
+            self._dropped[number] = {"number": number, "verdict": shown, "footprint": corners}
+        while len(self._dropped) > FOOTPRINTS_MAX:
+            del self._dropped[next(iter(self._dropped))]
 
     def _verdict_counts(self) -> dict[str, int]:
         counts = dict(self._dropped_verdicts)

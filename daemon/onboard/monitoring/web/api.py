@@ -321,6 +321,11 @@ def _add_products(app: FastAPI, state: FlightState, access: _AccessControl) -> N
         """Exposures by number."""
         return state.exposures(after, limit)
 
+    @app.get("/api/v1/footprints", dependencies=[watcher], tags=["exposures"])
+    async def footprints() -> list[dict[str, Any]]:
+        """Number, verdict and footprint of the exposures before those of the state."""
+        return state.dropped_footprints()
+
     @app.get("/api/v1/exposures/{number}", dependencies=[watcher], tags=["exposures"])
     async def exposure(number: Number) -> dict[str, Any]:
         """One exposure: frames, time, verdict."""

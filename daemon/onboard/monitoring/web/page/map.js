@@ -1,8 +1,9 @@
 // The map: lines, track and footprints, coloured by verdict and marked by shape, over offline base maps.
 
-import { flight } from "./telemetry.js";
+import { flight, restore } from "./telemetry.js";
 import { onGuidance } from "./guidance.js";
 import { startLayers } from "./map_layers.js";
+import { OlderLayer } from "./map_older.js";
 import { isMeasuring, startMeasuring } from "./map_measure.js";
 
 const COLOURS = { good: "--good", usable: "--caution", refly: "--warning", lost: "--warning" };
@@ -20,8 +21,10 @@ const footprints = new Map();
 const follow = document.getElementById("map-follow");
 let isFollowing = true;
 let isProgrammatic = false;
+let framedKey = "";
 
 function setFollowing(wanted) {
+  framedKey = "";
   isFollowing = wanted;
   follow.setAttribute("aria-pressed", String(wanted));
 }
@@ -37,15 +40,22 @@ function colour(name) {
   return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 }
 
+const styleOfVerdict = (verdict) => ({
+  color: colour(COLOURS[verdict] || "--soft"),
+  dashArray: DASHES[verdict] || null,
+  fillOpacity: !verdict || verdict === "lost" ? 0.03 : 0.12,
+});
+
 function styleOf(one) {
   const verdict = one.verdict || (one.step === "lost" ? "lost" : null);
-  return {
-    color: colour(COLOURS[verdict] || "--soft"),
-    dashArray: DASHES[verdict] || null,
-    weight: one.number === flight.brief?.last_number ? 4 : 2,
-    fillOpacity: !verdict || verdict === "lost" ? 0.03 : 0.12,
-  };
+  return { ...styleOfVerdict(verdict), weight: one.number === flight.brief?.last_number ? 4 : 2 };
 }
+
+const older = new OlderLayer(flight.older, styleOfVerdict).addTo(map);
+
+// Number of exposures whose footprint is on the map.
+export const footprintCount = () => footprints.size + flight.older.size;
+export const footprintLayers = () => [...footprints.values()];
 
 const plan = L.layerGroup().addTo(map);
 const gaps = L.layerGroup().addTo(map);
@@ -115,10 +125,8 @@ export function drawGaps(segments) {
   gaps.clearLayers();
   for (const one of segments) {
     if (one.kind !== "hole") continue;
-    for (const ring of one.holes.flatMap((gap) => gap.rings)) {
-      L.polygon(ring, { color: colour("--warning"), weight: 1, fillOpacity: 0.6, className: "gap-area", interactive: false })
-        .addTo(gaps);
-    }
+    const rings = one.holes.flatMap((gap) => gap.rings).map((ring) => [ring]);
+    L.polygon(rings, { color: colour("--warning"), weight: 1, fillOpacity: 0.6, className: "gap-area", interactive: false }).addTo(gaps);
     L.polyline(one.at, { color: colour("--warning"), weight: 12, opacity: 0.55, dashArray: "2 6", lineCap: "butt" })
       .bindTooltip(label(`✖ ${one.line}`),
         { permanent: true, direction: "right", className: "gap-label" }).addTo(gaps);
@@ -148,6 +156,7 @@ function drawMap(choose) {
     if (drawn.key !== key) drawn.setStyle(style);
     drawn.key = key;
   }
+  older.update(document.documentElement.dataset.theme || "");
   for (const number of footprints.keys()) {
     if (!flight.exposures.has(number)) {
       footprints.get(number).remove();
@@ -160,12 +169,22 @@ function drawMap(choose) {
 // Fit the map to the footprints or the plan, and to the camera position.
 function frame() {
   if (!isFollowing) return;
-  const bounds = L.featureGroup([...footprints.values()]).getBounds();
+  // Not by a group of layers: each of them would keep every group that it was in.
+  const bounds = L.latLngBounds([]);
+  for (const one of footprints.values()) bounds.extend(one.getBounds());
+  if (flight.older.bounds) {
+    const [south, west, north, east] = flight.older.bounds;
+    bounds.extend([[south, west], [north, east]]);
+  }
   if (planBounds && (!bounds.isValid() || !planBounds.intersects(bounds))) bounds.extend(planBounds);
   const isSomewhere = map.hasLayer(marker);
+  if (bounds.isValid() && isSomewhere) bounds.extend(marker.getLatLng());
+  // Each fit draws every path again.
+  const key = bounds.isValid() ? `${bounds.toBBoxString()} ${map.getSize()}` : "";
+  if (key && key === framedKey) return;
+  framedKey = key;
   isProgrammatic = true;
   if (bounds.isValid()) {
-    if (isSomewhere) bounds.extend(marker.getLatLng());
     map.fitBounds(bounds, { padding: [20, 20], maxZoom: 17, animate: false });
   } else if (isSomewhere) map.setView(marker.getLatLng(), 14, { animate: false });
   isProgrammatic = false;
@@ -183,6 +202,11 @@ export function start(root, feed) {
     if (!record && planned) drawPlan(planned);
     updateLines();
     if (isFirstRecord || !record || record.exposures || record.track) drawMap(feed.select);
+  });
+  // A click on an older footprint; those of the newest exposures take their own.
+  map.on("click", async ({ latlng }) => {
+    const number = isMeasuring() ? null : flight.older.numberAt(latlng.lat, latlng.lng);
+    if (number != null && await restore(number)) feed.select(number);
   });
   feed.key("f", "map.follow", () => follow.click());
   new ResizeObserver(() => {

@@ -56,6 +56,8 @@ async function updateAdvice() {
     found.length ? t("lines.gaps", { n: found.length, ha: number(advice.hole_m2 / 1e4, 2) }) : t("lines.no_gap"),
     ...advice.notes,
   ].join(". ");
+  // Unchanged gaps are not drawn again.
+  if (gapsFound && JSON.stringify(gapsFound) === JSON.stringify(found)) return;
   rows.replaceChildren(...found.map(row));
   rows.closest(".scroll").hidden = !found.length;
   gapsFound = found;

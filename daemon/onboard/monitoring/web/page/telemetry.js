@@ -1,10 +1,14 @@
 // State of the flight, merged from telemetry records. Notifies listeners of each record.
 
-import { isRefused } from "./http.js";
+import { fetchJson, isRefused } from "./http.js";
+import { OlderExposures } from "./older_exposures.js";
 
 export const flight = {
   brief: null,
+  // The newest exposures, whole, and one that was selected; of those before them footprint and verdict.
   exposures: new Map(),
+  older: new OlderExposures(),
+  restoredNumber: null,
   devices: new Map(),
   track: [],
   history: [],
@@ -12,6 +16,9 @@ export const flight = {
 };
 
 const SILENCE_MS = 5000;
+const EXPOSURES_MAX = 300;
+const TRACK_MAX = 2000;
+const HISTORY_MAX = 1000;
 const listeners = new Set();
 
 export function onChange(listener) {
@@ -20,10 +27,55 @@ export function onChange(listener) {
 
 function clear() {
   flight.exposures.clear();
+  flight.older.clear();
+  flight.restoredNumber = null;
   flight.devices.clear();
   flight.track.length = 0;
   flight.history.length = 0;
   flight.settings = null;
+}
+
+// Drop every second item of the older half, so that the length stays bounded and the end detailed.
+function thin(items, maximum) {
+  if (items.length <= maximum) return;
+  const half = items.length >> 1;
+  const kept = items.filter((_, k) => k >= half || k % 2 === 0);
+  items.length = 0;
+  for (const one of kept) items.push(one);
+}
+
+// Reduce the oldest exposures to footprint and verdict.
+function prune() {
+  const excess = flight.exposures.size - EXPOSURES_MAX;
+  if (excess <= 0) return;
+  const oldest = [...flight.exposures.keys()].filter((one) => one !== flight.restoredNumber).sort((a, b) => a - b);
+  for (const number of oldest.slice(0, excess)) {
+    const one = flight.exposures.get(number);
+    flight.older.add(number, one.verdict ?? (one.step === "lost" ? "lost" : null), one.footprint);
+    flight.exposures.delete(number);
+  }
+}
+
+// Footprints of exposures that the service no longer sends, after a connection late in a flight.
+async function loadOlder(exposures) {
+  if (!exposures.some((one) => one.number > 1)) return;
+  const mission = flight.brief.mission?.id;
+  const listed = await fetchJson("/api/v1/footprints");
+  if (!listed?.length || flight.brief?.mission?.id !== mission) return;
+  for (const { number, verdict, footprint } of listed) {
+    if (!flight.exposures.has(number) && !flight.older.index.has(number)) flight.older.add(number, verdict, footprint);
+  }
+  for (const listener of listeners) listener(null, false);
+}
+
+// Make a reduced exposure whole again; false if the service does not have it.
+export async function restore(number) {
+  if (flight.exposures.has(number)) return true;
+  const one = await fetchJson(`/api/v1/exposures/${number}`);
+  if (!one) return false;
+  flight.restoredNumber = number;
+  flight.exposures.set(number, one);
+  return true;
 }
 
 function merge(record, isFirstRecord) {
@@ -32,9 +84,13 @@ function merge(record, isFirstRecord) {
   for (const one of exposures) flight.exposures.set(one.number, one);
   for (const one of devices) flight.devices.set(one.name, one);
   flight.settings = settings.at(-1) || flight.settings;
-  flight.track.push(...track);
-  flight.history.push(...history);
+  for (const one of track) flight.track.push(one);
+  for (const one of history) flight.history.push(one);
+  thin(flight.track, TRACK_MAX);
+  thin(flight.history, HISTORY_MAX);
+  prune();
   for (const listener of listeners) listener(record, isFirstRecord);
+  if (isFirstRecord) loadOlder(exposures);
 }
 
 // Receive telemetry and reconnect for ever. `onLinkChange(isLinked)` is called when the connection

@@ -1,0 +1,213 @@
+"""Memory of the operator's page over a replay of thousands of exposures, in headless Chromium.
+
+The events of the service go to the real process of the page, without a pipeline. Memory is that of
+the renderer: heap of JavaScript after a collection of garbage, PSS, and PSS after the browser has
+emptied its caches, as it does when memory is short. Run: `python -m
+benchmarks.page_memory --exposures 5000`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import json
+import os
+import shutil
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Final
+
+LINE_EXPOSURES: Final = 50
+SPACING_DEG: Final = 6e-4
+RATE_MAX_HZ: Final = 40.0
+SEEN_TIMEOUT_S: Final = 120.0
+VERDICTS: Final = ("good",) * 90 + ("usable",) * 9 + ("refly",)
+
+
+def lines(count: int) -> dict[str, Any]:
+    """A plan of parallel lines for so many exposures."""
+    length_deg = SPACING_DEG * LINE_EXPOSURES
+    features = [
+        {
+            "type": "Feature",
+            "properties": {"id": f"A{k}", "strip": f"S{k}"},
+            "geometry": {
+                "type": "LineString",
+                "coordinates": [
+                    [15.43 + 0.003 * k, 47.07],
+                    [15.43 + 0.003 * k, 47.07 + length_deg],
+                ],
+            },
+        }
+        for k in range(-(-count // LINE_EXPOSURES))
+    ]
+    return {"type": "FeatureCollection", "features": features}
+
+
+def events_of(number: int, flight_events: Any) -> Iterator[dict[str, Any]]:
+    """An exposure from its trigger to its verdict, and the status after it."""
+    line, index = divmod(number - 1, LINE_EXPOSURES)
+    along = index if line % 2 == 0 else LINE_EXPOSURES - 1 - index
+    here = {
+        "latitude_deg": 47.07 + SPACING_DEG * along,
+        "longitude_deg": 15.43 + 0.003 * line,
+    }
+    verdict = VERDICTS[number % len(VERDICTS)]
+    for event in flight_events.exposure(number, verdict, line=f"A{line}"):
+        if event["event"] == "sealed":
+            event["navigation"] = flight_events.NAVIGATION | here
+        if event["event"] == "processed":
+            figures = {"sigma0_px": 0.01 + 0.001 * (number % 7), "dc_estimated_k": 11.7}
+            event["report"]["figures"] |= figures
+            event["report"]["valid_area"] = {"share": 0.99, "rings": []}
+        yield event
+    status = flight_events.status("flying", number, 10_000 - number)
+    yield status | {"position": here | {"age_s": 0.1, "satellites": 17, "fix": "3d"}}
+
+
+def pss_mb(pid: int) -> float:
+    """Proportional set size of a process, MB."""
+    for line in Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines():
+        if line.startswith("Pss:"):
+            return int(line.split()[1]) * 1024 / 1e6
+    return 0.0
+
+
+def processes_below(pid: int) -> dict[int, str]:
+    """Process ids of the children of a process, and theirs, with their command lines."""
+    parents: dict[int, tuple[int, str]] = {}
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdecimal():
+            try:
+                parent = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
+                command = (entry / "cmdline").read_bytes().replace(b"\0", b" ").decode()
+            except OSError:
+                continue
+            parents[int(entry.name)] = parent, command
+    found, frontier = {pid: parents[pid][1]}, {pid}
+    while frontier:
+        frontier = {child for child, (parent, _) in parents.items() if parent in frontier}
+        found |= {child: parents[child][1] for child in frontier}
+    return found
+
+
+def sample(browser: Any, number: int) -> dict[str, Any]:
+    """Memory of the page after a collection of garbage."""
+    for _ in range(2):
+        browser.call("HeapProfiler.collectGarbage")
+    metrics = browser.call("Performance.getMetrics")["metrics"]
+    values = {one["name"]: one["value"] for one in metrics}
+    below = processes_below(browser._process.pid)
+    renderers = [pid for pid, command in below.items() if "--type=renderer" in command]
+    as_is_mb = max(pss_mb(pid) for pid in renderers)
+    # Caches of pictures and of the allocator, which the browser empties when memory is short.
+    browser.call("Memory.simulatePressureNotification", level="critical")
+    time.sleep(1.0)
+    return {
+        "exposures": number,
+        "heap_mb": round(values["JSHeapUsedSize"] / 1e6, 1),
+        "nodes": int(values["Nodes"]),
+        "renderer_mb": round(as_is_mb, 1),
+        "renderer_purged_mb": round(max(pss_mb(pid) for pid in renderers), 1),
+        "browser_mb": round(sum(pss_mb(pid) for pid in below), 1),
+    }
+
+
+def measure(exposures: int, samples: int) -> dict[str, Any]:
+    """Replay and sample; afterwards the page is loaded again from the state of the service."""
+    from daemon.configuration.model import WatchSection
+    from daemon.onboard.service.messages import ServiceEvent
+    from daemon.onboard.service.processes import ChildProcess
+
+    # The types of tests are checked on their own.
+    browser_of = importlib.import_module("tests.support.browser").Browser
+    flight_events = importlib.import_module("tests.daemon.onboard.monitoring.flight_events")
+    scene = importlib.import_module("tests.daemon.onboard.monitoring.test_page_guidance")
+    folder = Path(tempfile.mkdtemp(prefix="page-memory"))
+    mission = folder / "mission"
+    (mission / "L0").mkdir(parents=True)
+    scene.write_products(mission)
+    names = ("thumbnail.jpg", "quicklook.jpg", "residuals.json", "histogram.json")
+    for number in range(7, exposures + 1):
+        copied = mission / f"L2/{number:06d}"
+        copied.mkdir()
+        for name in names:
+            product = mission / f"L2/{1 + number % 6:06d}" / name
+            if product.exists():
+                os.link(product, copied / name)
+    rig = scene.shipped_rigs()["ultracam-x-mini"].read_bytes()
+    (mission / "rig.toml").write_bytes(rig)
+    (mission / "plan.geojson").write_text(json.dumps(lines(exposures)))
+    (mission / "service.toml").write_text("[plan]\nground_height_m = 395.0\n")
+    child = ChildProcess(
+        "watch",
+        "daemon.onboard.monitoring.monitoring_process:main",
+        (WatchSection(host="127.0.0.1", port=0, announce=False),),
+        {},
+    )
+    address = ""
+    while not address:
+        message = child.connection.recv()
+        if isinstance(message, ServiceEvent) and message.event.get("event") == "watching":
+            address = f"http://127.0.0.1:{message.event['port']}/"
+
+    def emit(event: dict[str, Any]) -> None:
+        while not child.try_send(ServiceEvent(event)):
+            time.sleep(0.005)
+
+    seen = "document.querySelector('#verdict .which')?.textContent.match(/\\d+/)?.[0] === '{}'"
+    found: list[dict[str, Any]] = []
+    emit(flight_events.mission(str(mission)))
+    try:
+        with browser_of(folder / "profile", width=1280, height=800) as browser:
+            for domain in ("Performance", "HeapProfiler"):
+                browser.call(f"{domain}.enable")
+            # The protocol's network domain keeps every response in the renderer.
+            browser.call("Network.disable")
+            browser.open(address)
+            browser.wait_for("document.querySelector('#link')?.className.includes('good')", 60)
+            step = max(1, exposures // samples)
+            for number in range(1, exposures + 1):
+                begin_s = time.monotonic()
+                for event in events_of(number, flight_events):
+                    emit(event)
+                time.sleep(max(0.0, 1.0 / RATE_MAX_HZ - (time.monotonic() - begin_s)))
+                if number % step == 0:
+                    browser.wait_for(seen.format(number), SEEN_TIMEOUT_S)
+                    time.sleep(2.0)
+                    found.append(sample(browser, number))
+                    print(json.dumps(found[-1]), file=sys.stderr, flush=True)
+            browser.requested.clear()
+            browser.open(address)
+            browser.wait_for(seen.format(exposures), SEEN_TIMEOUT_S)
+            time.sleep(5.0)
+            again = sample(browser, exposures)
+            again["footprints"] = browser.evaluate(
+                "import('/map.js').then((map) => map.footprintCount?.() ?? null)"
+            )
+    finally:
+        child.end(1.0)
+        shutil.rmtree(folder, ignore_errors=True)
+    half = next(one for one in found if one["exposures"] >= exposures // 2)
+    growth = {
+        key: round(100 * (found[-1][key] / half[key] - 1), 1)
+        for key in ("heap_mb", "renderer_mb", "renderer_purged_mb")
+    }
+    return {"samples": found, "growth_second_half_percent": growth, "loaded_again": again}
+
+
+def main() -> int:
+    """Measure and print JSON."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--exposures", type=int, default=5000, help="default: 5000")
+    parser.add_argument("--samples", type=int, default=10, help="default: 10")
+    given = parser.parse_args()
+    print(json.dumps(measure(given.exposures, given.samples), indent=1))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,117 @@
+"""The page of a long flight: old exposures stay on the map at little memory."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from daemon.onboard.monitoring import flight_state
+from daemon.onboard.monitoring.flight_state import FlightState
+from tests.daemon.onboard.monitoring import flight_events
+from tests.daemon.onboard.monitoring.test_page import WITHIN_S, Service
+from tests.support.browser import Browser, chromium
+
+OLDER = """(async () => {{
+  const {{ OlderExposures }} = await import('/older_exposures.js');
+  const older = new OlderExposures();
+  const square = (k) => [[k, 0], [k, 1], [k + 1, 1], [k + 1, 0]];
+  for (let k = 0; k < 3000; k += 1) older.add(k + 1, k % 2 ? 'good' : 'refly', square(k));
+  older.add(7, 'lost', square(6));
+  older.add(9000, 'good', null);
+  return {};
+}})()"""
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Service, Browser]]:
+    chromium()
+    folder = tmp_path_factory.mktemp("long")
+    mission = folder / "mission"
+    (mission / "L0").mkdir(parents=True)
+    from processing.rig import shipped_rigs
+
+    (mission / "rig.toml").write_bytes(shipped_rigs()["ultracam-x-mini"].read_bytes())
+    (mission / "service.toml").write_text("[plan]\nground_height_m = 395.0\n")
+    service = Service(folder)
+    service.emit(flight_events.mission(str(mission)))
+    with Browser(folder / "profile") as browser:
+        browser.open(service.address)
+        browser.wait_for("document.querySelector('#link')?.innerText === 'connected'", WITHIN_S)
+        yield service, browser
+    service.end()
+
+
+def emit_patiently(service: Service, event: dict[str, object]) -> None:
+    from daemon.onboard.service.messages import ServiceEvent
+
+    service.until(lambda: service.child.try_send(ServiceEvent(event)))
+
+
+def test_older_exposures_are_drawn_and_found_and_the_rest_is_dropped(
+    page: tuple[Service, Browser],
+) -> None:
+    service, browser = page
+    for number in range(1, 341):
+        for event in flight_events.exposure(number, "good", north_m=60.0 * number):
+            emit_patiently(service, event)
+    service.emit(flight_events.status(triggers=340))
+    shown = "import('/map.js').then((map) => map.footprintCount())"
+    browser.wait_for(f"{shown}.then((count) => count === 340)", WITHIN_S)
+    whole = browser.evaluate("import('/telemetry.js').then(({ flight }) => flight.exposures.size)")
+    assert whole == 300
+    assert (
+        browser.evaluate("document.querySelectorAll('#map path.leaflet-interactive').length") < 310
+    )
+    found = browser.evaluate(
+        "import('/telemetry.js').then(async ({ flight, restore }) => [flight.older.verdictAt(0),"
+        " await restore(5), flight.exposures.get(5).number, await restore(4711)])"
+    )
+    assert found == ["good", True, 5, False]
+
+
+def test_footprints_do_not_keep_what_was_removed_alive(page: tuple[Service, Browser]) -> None:
+    """A group of layers, even one that is never shown, is kept by each of its layers."""
+    _, browser = page
+    parents = browser.evaluate(
+        "import('/map.js').then((map) => Math.max(...map.footprintLayers()"
+        ".map((one) => Object.keys(one._eventParents || {}).length)))"
+    )
+    assert parents == 0
+
+
+@pytest.mark.parametrize(
+    ("expression", "expected"),
+    [
+        ("older.size", 3000),
+        ("older.verdictAt(6)", "lost"),
+        (
+            "[older.numberAt(0.5, 0.5), older.numberAt(2999.5, 0.5), older.numberAt(5, 2)]",
+            [1, 3000, None],
+        ),
+        ("older.bounds", [0, 0, 3000, 1]),
+    ],
+)
+def test_numbers_of_older_exposures_are_packed(
+    page: tuple[Service, Browser], expression: str, expected: object
+) -> None:
+    assert page[1].evaluate(OLDER.format(expression)) == expected
+
+
+def test_exposures_beyond_the_snapshot_keep_footprint_and_verdict(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(flight_state, "EXPOSURES_MAX", 3)
+    monkeypatch.setattr(flight_state, "FOOTPRINTS_MAX", 4)
+    state = FlightState("syntopic test", lambda _: [[47.0, 15.0]] * 4)
+    for number in range(1, 9):
+        for event in flight_events.exposure(number, "refly" if number == 4 else "good"):
+            state.apply(event)
+    assert [one["number"] for one in state.exposures()] == [6, 7, 8]
+    dropped = state.dropped_footprints()
+    assert [one["number"] for one in dropped] == [2, 3, 4, 5]
+    assert dropped[2] == {"number": 4, "verdict": "refly", "footprint": [[47.0, 15.0]] * 4}
+    found = state.exposure(4)
+    assert found is not None and (found["step"], found["verdict"]) == ("processed", "refly")
+    assert state.exposure(1) is None
+    assert state.brief()["verdicts"] == {"good": 7, "usable": 0, "refly": 1}
