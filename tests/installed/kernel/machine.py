@@ -1,7 +1,8 @@
 """`python -m tests.installed.kernel.machine`: the tests of this folder inside a virtual machine.
 
 The machine runs Debian's own kernel, whose vivid driver emulates capture devices and their faults,
-and has a parallel port, which takes pulses per second; build machines seldom have these. Its root
+and has a parallel port, which takes pulses per second; build machines seldom have these. The vimc
+driver, a sensor with its pipeline, is built for that kernel. Its root
 file system is this host's, read-only.
 """
 
@@ -22,6 +23,8 @@ import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Final
+
+from tests.installed.kernel.vimc_module import ModuleBuildError, build_vimc
 
 HERE: Final = Path(__file__).parent
 REPOSITORY: Final = HERE.parents[2]
@@ -70,7 +73,7 @@ def main() -> None:
         type=Path,
         action="append",
         default=[],
-        help="a further kernel module that the tests may load, such as vimc.ko for this kernel",
+        help="a further kernel module that the tests may load",
     )
     parser.add_argument("--command", help="a shell command to run instead of pytest")
     parser.add_argument("pytest", nargs="*", help="arguments for pytest, after --")
@@ -162,7 +165,8 @@ def prepare() -> Path:
     if missing:
         raise CannotRunError(f"install Debian's {' '.join(missing)}")
     kernel = _kernel_package()
-    digest = hashlib.sha256(Path(__file__).read_bytes() + (HERE / "guest.sh").read_bytes())
+    texts = (Path(__file__), HERE / "guest.sh", HERE / "vimc_module.py")
+    digest = hashlib.sha256(b"".join(path.read_bytes() for path in texts))
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     image = cache / "syntopic" / "kernel-machine" / f"{kernel}-{digest.hexdigest()[:12]}"
     if (image / "initrd.cpio").exists():
@@ -251,6 +255,11 @@ def _build(place: Path, kernel: str) -> None:
             }
         return list(found)
 
+    try:
+        (place / "vimc").mkdir()
+        vimc = build_vimc(place / "vimc", kernel)
+    except ModuleBuildError as error:
+        raise CannotRunError(str(error)) from error
     boot, tested = needed(BOOT_MODULES), needed(TESTED_MODULES)
     load = dict.fromkeys(_plain_name(m) for m in (*boot, *tested))
     for name in TESTED_MODULES:
@@ -262,6 +271,7 @@ def _build(place: Path, kernel: str) -> None:
         ("bin/busybox", Path(busybox).read_bytes(), 0o755),
         ("modules.load", "\n".join(load).encode(), 0o644),
         *((f"modules/{_plain_name(m)}", _module(m), 0o644) for m in {*boot, *tested}),
+        ("modules/vimc.ko", vimc.read_bytes(), 0o644),
     ]
     (image / "initrd.cpio").write_bytes(_archive(files))
 
