@@ -168,6 +168,11 @@ def photographs_section(
         "position_rms_m": [float(v) for v in np.sqrt(np.mean(away**2, axis=0))],
         "control_points": controls,
         "control_not_measured": unmeasured(control),
+        "control_rejected": [
+            name
+            for name, axes in zip(result.network.points.names, result.excluded.control, strict=True)
+            if axes.any()
+        ],
         "f_ground_correlation": correlation,
         "ground_sigma_of_f_m": ground_sigma_m,
         "f_and_height_separated": ground_sigma_m <= height_m * pitch / f_mm,
@@ -178,6 +183,11 @@ def photograph_cautions(section: Mapping[str, Any]) -> list[str]:
     """What a reader has to know about the result, one sentence each."""
     found = list(section["left_out"])
     found += section["control_not_measured"]
+    if section["control_rejected"]:
+        found.append(
+            f"control rejected by the adjustment: {', '.join(section['control_rejected'])}; check "
+            "coordinates and measurements of these points"
+        )
     if not section["f_and_height_separated"]:
         used = section["control_points"]
         how = f"by {used} control points" if used else "without control"

@@ -333,6 +333,15 @@ def test_a_wrong_control_point_is_named_where_the_adjustment_fails(block) -> Non
     assert re.search(r"p1 by [78]\.\d m;", sentence)
 
 
+def test_a_control_point_that_the_adjustment_rejects_is_named(block) -> None:
+    control = control_from(block, 6)
+    xyz = control.xyz_m.copy()
+    xyz[1, 1] += 2.0
+    section = section_of(block, replace(control, xyz_m=xyz))
+    assert section["control_rejected"] == ["p1"]
+    assert any("control rejected by the adjustment: p1;" in s for s in photograph_cautions(section))
+
+
 def test_control_in_tables_is_refused_by_the_command(triangulated, block, tmp_path) -> None:
     """A gcp_list.txt in degrees with two names exchanged; the command names them."""
     mission, _ = triangulated
