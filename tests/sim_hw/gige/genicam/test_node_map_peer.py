@@ -27,8 +27,6 @@ pytestmark = [needs_descriptions, pytest.mark.peer]
 
 DIFFERENCES_MAX = 5
 """Features per description in which the two may differ."""
-NOT_COMPARED = {"Allied_Vision_1800_U-811m"}
-"""A USB3 camera, of which the reference implementation reports every node as not implemented."""
 ACCESS = {
     genapi.EAccessMode.RW: Access.READ_WRITE,
     genapi.EAccessMode.RO: Access.READ_ONLY,
@@ -44,7 +42,7 @@ def is_same(theirs: Any, ours: float) -> bool:
     return math.isclose(float(theirs), float(ours), rel_tol=1e-9, abs_tol=1e-12)
 
 
-@pytest.mark.parametrize("name", [name for name in names() if name not in NOT_COMPARED])
+@pytest.mark.parametrize("name", names())
 @pytest.mark.parametrize("state", [InitialState.FACTORY, InitialState.USER_SET])
 def test_access_and_values_are_those_of_the_reference(name: str, state: InitialState) -> None:
     found = read_description(description(name))
