@@ -187,16 +187,27 @@ def test_steps_of_frames_are_named_the_largest_first() -> None:
         "signal_step_axis": "rows",
         "signal_step_at": FIRST + SIDE - 2,
         "signal_step_lines": 1,
+        "signal_step_frames": 2,
     }
     assert set(step_figures(()).as_json().values()) == {None}
 
 
-@pytest.mark.parametrize(("count", "found"), [(2, 2), (3, 0)])
-def test_steps_in_three_frames_are_the_ground_s(count: int, found: int) -> None:
+@pytest.mark.parametrize(("count", "found"), [(2, 2), (3, 0), (4, 0)])
+def test_steps_at_different_lines_of_three_frames_are_the_ground_s(count: int, found: int) -> None:
+    line_values = frames(4)
+    for number, frame in enumerate(list(line_values.values())[:count]):
+        frame[FIRST + 100 + 7 * number : FIRST + SIDE] = 4400
+    assert len(steps_of(line_values)) == found
+
+
+@pytest.mark.parametrize("count", [3, 4])
+def test_steps_at_the_same_line_of_three_frames_that_share_no_ground_are_read_out(
+    count: int,
+) -> None:
     line_values = frames(4)
     for frame in list(line_values.values())[:count]:
         frame[FIRST + 100 : FIRST + SIDE] = 4400
-    assert len(steps_of(line_values)) == found
+    assert len(steps_of(line_values)) == count
 
 
 @pytest.mark.parametrize(("step_dn", "found"), [(5.75, 0), (6.25, 1)])
