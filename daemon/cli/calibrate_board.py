@@ -68,7 +68,11 @@ def board(
     from daemon.cli.calibration_output import publish_calibration
     from daemon.initialization.answers import lengths
     from daemon.postflight.calibration.board.findings import findings_of
-    from daemon.postflight.calibration.board.pictures import picture_files, read_views
+    from daemon.postflight.calibration.board.pictures import (
+        board_refusals,
+        picture_files,
+        read_views,
+    )
     from daemon.postflight.calibration.board.report import (
         KIND,
         board_report,
@@ -82,7 +86,8 @@ def board(
     from processing.matching.calibration_board import parse_board
     from processing.rig import find_rig
 
-    old, drawn = find_rig(rig), parse_board(board)
+    with board_refusals():
+        old, drawn = find_rig(rig), parse_board(board)
     (tolerance_mm,) = lengths(board_tolerance, "mm", 1)
     focused_m = None if focused_at is None else lengths(focused_at, "m", 1)[0]
     today = f"{datetime.now(UTC):%Y-%m-%d}"
@@ -90,8 +95,9 @@ def board(
     before = None if previous is None else read_previous(previous, kind=KIND)
     console = Console(stderr=True)
     if watch:
-        watch_pictures(folder, old, drawn, console=console, timeout_s=watch_timeout)
-    with Progress(console=console, transient=True) as progress:
+        with board_refusals():
+            watch_pictures(folder, old, drawn, console=console, timeout_s=watch_timeout)
+    with board_refusals(), Progress(console=console, transient=True) as progress:
         task = progress.add_task("reading", total=None)
 
         def show_progress(what: str, done: int, total: int) -> None:

@@ -9,7 +9,8 @@ from __future__ import annotations
 import hashlib
 import re
 from collections import Counter, defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -18,6 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from daemon import DaemonError
 from daemon.mission.store.level0 import read_description
 from processing.calibration.board.adjustment import LEAST_VIEWS
 from processing.calibration.board.views import BoardView, same_views
@@ -32,6 +34,23 @@ _BLUR_PX: Final = 2.4
 _MAX_LISTED: Final = 12
 
 Progress = Callable[[str, int, int], None]
+
+
+class BoardCalibrationError(DaemonError, ValueError):
+    """A calibration from a board that is refused; the message states what is missing."""
+
+
+@contextmanager
+def board_refusals() -> Iterator[None]:
+    """Make a board or pictures that cannot be used a refusal of the command.
+
+    Raises:
+        BoardCalibrationError: in place of BoardError, with its sentences.
+    """
+    try:
+        yield
+    except BoardError as error:
+        raise BoardCalibrationError(str(error)) from error
 
 
 @dataclass(frozen=True)

@@ -236,3 +236,12 @@ def test_watching_prints_requests_until_no_picture_arrives(pictures: Path, tmp_p
     assert "convergent views" in done.stderr
     assert "No new picture for 3 s" in done.stderr
     assert done.exit_code != 0
+
+
+def test_a_refusal_is_a_sentence_and_no_traceback(tmp_path: Path) -> None:
+    from tests.daemon.diverging_camera import syntopic
+
+    board = ("--rig", "dmc", "--board", "bad:1")
+    done = syntopic("calibrate", "board", str(tmp_path), *board)
+    assert done.returncode == 1
+    assert "is of no known kind" in done.stderr and "Traceback" not in done.stderr
