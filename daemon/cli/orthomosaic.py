@@ -34,7 +34,9 @@ Examples: `syntopic orthomosaic MISSION --elevation dtm.tif`,
 
 
 def orthomosaic(
-    mission: Annotated[Path, typer.Argument(help="Mission folder with Level-2, or of photographs.")],
+    mission: Annotated[
+        Path, typer.Argument(help="Mission folder with Level-2, or of photographs.")
+    ],
     triangulation: Annotated[
         Path | None,
         typer.Option(help="Folder of a triangulation (default: the only one in the export)."),

@@ -16,8 +16,8 @@ HELP = """Send a command to a running service.
 
 Commands are those of the API (docs/how-to/flight/watching.md): arm, start, stop, trigger, interval,
 distance, land, acknowledge, exposure, reject, accept, withdraw, retake,
-new-mission, release-disk, accept-disk, verify, copy, report, shutdown. They go over the service's Unix socket (`[watch] control`)
-and need no token: the service authorizes them by user and group.
+new-mission, release-disk, accept-disk, verify, copy, report, shutdown. They go over the service's
+Unix socket (`[watch] control`) and need no token: the service authorizes them by user and group.
 
 Examples: `syntopic send start`,
 `syntopic send arm --override --set reason="probe 3 is known to be broken"`,

@@ -287,8 +287,8 @@ def _shares_of_heads(steps: Sequence[LineStep], view: GroundView) -> dict[str, f
     reach = view.reach_px(steps[0].sensor) + 1.0
     lines = np.array([step.at for step in steps])
     # Between lines that step near each other, the sides of one lie beyond the next.
-    lone = [s for s in steps if np.count_nonzero(np.abs(lines - s.at) < reach) == 1]
-    for step in sorted(lone, key=lambda step: -abs(step.relative))[:LINES]:
+    separate = [s for s in steps if np.count_nonzero(np.abs(lines - s.at) < reach) == 1]
+    for step in sorted(separate, key=lambda step: -abs(step.relative))[:LINES]:
         for head, share in _shares(step, view).items():
             by_head.setdefault(head, []).append(share)
     return {head: float(np.median(some)) for head, some in by_head.items()}

@@ -99,7 +99,7 @@ def changed_bands(
         moves = {
             number: move
             for number, old in earlier.items()
-            if number < exposure and (move := _lone_change(band, old, levels)) is not None
+            if number < exposure and (move := _single_change(band, old, levels)) is not None
         }
         changed = [number for number, move in moves.items() if abs(move) >= MIN_CHANGE]
         if changed and 2 * len(changed) >= len(moves):
@@ -122,7 +122,7 @@ def level_steps(levels: Mapping[int, Levels]) -> tuple[LevelStep, ...]:
     return tuple(step for number in sorted(levels) for step in history.add(number, levels[number]))
 
 
-def _lone_change(band: str, old: Levels, new: Levels) -> float | None:
+def _single_change(band: str, old: Levels, new: Levels) -> float | None:
     """Natural logarithm of a band's change; None where other bands changed too, or are too few."""
     change = {
         name: math.log(new[name] / old[name])

@@ -19,7 +19,7 @@ Array = NDArray[Any]
 TURN_DEG: Final = 45.0
 """Change of heading, from the first image of a line, that begins another."""
 ASIDE_SHARE: Final = 0.3
-"""Of the width of an image on the ground: an image farther to the side of the line begins another."""
+"""Of the width of an image on the ground: an image farther aside begins another line."""
 
 
 class FlownLines:

@@ -137,7 +137,7 @@ def _line(
     for k in range(plan.exposures):
         along = (k - (plan.exposures - 1) / 2.0) * base_m
         across = 20.0 * (number - (len(plan.lines) - 1) / 2.0)
-        # A line flown the other way lies beside the others, not upon them.
+        # A line flown the other way lies next to the others, not upon them.
         side = across if heading_deg in (0.0, 90.0) else -across
         place = np.append(along * forward + side * right, height_m)
         place += random.normal(0.0, 1.0, 3) * plan.wander_m

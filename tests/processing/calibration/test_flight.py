@@ -76,7 +76,7 @@ def test_errors_of_lenses_and_mountings_agree_with_their_covariance(
         for head in found.heads:
             assert max(found.shares_of_prior(head).values()) < 0.5
             assert found.distortion_sigma_px(head) < 0.7
-    # Priors are wider than the lenses drawn: the lower limit says little.
+    # Priors are wider than the lenses drawn: the lower limit is wide.
     assert chi2.ppf(1e-4, count) < squares < chi2.ppf(1 - 1e-4, count)
     assert max(sizes) < 4.5
 

@@ -98,7 +98,7 @@ def test_a_certificate_of_another_authority_is_refused(
     encrypted: ClusterAddress, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(dask_executor, "CONNECT_TIMEOUT_S", 3.0)
-    address = cluster_address(encrypted.url, *authority(tmp_path / "other", "stranger"))
+    address = cluster_address(encrypted.url, *authority(tmp_path / "other", "unknown"))
     with pytest.raises(ClusterError, match=r"certificate.*signed by the authority of --tls-ca"):
         DaskExecutor(address).start(ToyWork(tmp_path))
 
