@@ -55,6 +55,8 @@ def two_hosts() -> Iterator[tuple[Host, Host]]:
         _ip("-n", names[0], "link", "set", links[1], "netns", names[1])
         hosts = []
         for i, (name, link) in enumerate(zip(names, links, strict=True), start=1):
+            # Chromium gives requests up when an address appears, as one of IPv6 does later.
+            _ip("-n", name, "link", "set", link, "addrgenmode", "none")
             _ip("-n", name, "address", "add", f"10.209.77.{i}/30", "dev", link)
             for one in ("lo", link):
                 _ip("-n", name, "link", "set", one, "up")

@@ -398,4 +398,4 @@ def test_the_report_lists_and_draws_the_hole(tmp_path: Path) -> None:
     assert f"too few images see {output['hole_m2'] / 1e4:.2f} ha" in page
     assert "exposures 5 to 9: no image of SU00" in page
     drawn = sum(len(hole["rings"]) for hole in output["segments"][0]["holes"])
-    assert page.count('fill="#b3261e"') == drawn > 0
+    assert page.count('<polygon class="hole"') == drawn > 0

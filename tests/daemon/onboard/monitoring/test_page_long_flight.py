@@ -63,11 +63,13 @@ def test_older_exposures_are_drawn_and_found_and_the_rest_is_dropped(
     assert (
         browser.evaluate("document.querySelectorAll('#map path.leaflet-interactive').length") < 310
     )
+    # The page gives a request up after some seconds; a busy machine may need longer.
+    browser.wait_for("import('/telemetry.js').then(({ restore }) => restore(5))", WITHIN_S)
     found = browser.evaluate(
         "import('/telemetry.js').then(async ({ flight, restore }) => [flight.older.verdictAt(0),"
-        " await restore(5), flight.exposures.get(5).number, await restore(4711)])"
+        " flight.exposures.get(5).number, await restore(4711)])"
     )
-    assert found == ["good", True, 5, False]
+    assert found == ["good", 5, False]
 
 
 def test_footprints_do_not_keep_what_was_removed_alive(page: tuple[Service, Browser]) -> None:
