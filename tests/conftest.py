@@ -23,6 +23,9 @@ FLIGHTS = Path(__file__).parent / "system"
 PAGES = Path(__file__).parent / "repository" / "test_document_examples.py"
 NICENESS = 10
 
+# A command in this process would set it for itself, and the threads of all later tests with it.
+os.environ.setdefault("NUMBA_NUM_THREADS", str(len(os.sched_getaffinity(0))))
+
 settings.register_profile("patient", settings.default, deadline=None)
 settings.load_profile("patient")
 

@@ -57,7 +57,8 @@ async def follow(port: int, until: int) -> set[int]:
     from websockets.asyncio.client import connect
 
     seen: set[int] = set()
-    async with connect(f"ws://127.0.0.1:{port}/api/v1/telemetry?form=json", max_size=None) as link:
+    address = f"ws://127.0.0.1:{port}/api/v1/telemetry?form=json"
+    async with connect(address, max_size=None, open_timeout=90) as link:
         while len(seen) < until:
             record = json.loads(await asyncio.wait_for(link.recv(), 90))
             seen |= {one["number"] for one in record.get("exposures", []) if "verdict" in one}
