@@ -24,7 +24,6 @@ from typing import Any
 
 import numpy as np
 import tifffile
-from rich.console import Console
 from rich.table import Table
 
 from benchmarks.ring_heads import RING, build_ring, is_intact, number_of
@@ -33,6 +32,7 @@ from daemon.cli.benchmark import pipeline
 from daemon.cli.benchmark.measurement import machine
 from daemon.cli.sim import free_first_address
 from daemon.mission.store.level0_folder import read_sealed
+from daemon.terminal.console import Console
 from processing.rig import Rig, find_rig
 
 RETAINED_EXPOSURES = 6

@@ -23,7 +23,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
 from rich.table import Table
 
 from benchmarks import gate
@@ -35,6 +34,7 @@ from daemon.mission.layout import Mission
 from daemon.mission.store.store import Level0Writer, load_level0
 from daemon.products.exposure_conditions import conditions_of
 from daemon.products.processing_threads import configure_threads, thread_counts
+from daemon.terminal.console import Console
 from processing.pipelines.stitched import Pipeline, PipelineSettings
 from processing.quality.report import Flag
 from processing.radiometry.calibration import load_radiometry

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from daemon.cli.options import AsJson
+from daemon.terminal.console import Console
 
 HELP = """Create a local authority and a TLS certificate for this machine.
 

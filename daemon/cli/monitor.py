@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from pydantic import BaseModel, Field, FiniteFloat, ValidationError
-from rich.console import Console, Group
+from rich.console import Group
 from rich.live import Live
 from rich.panel import Panel
 from rich.table import Table
@@ -19,7 +19,7 @@ from rich.text import Text
 from daemon import DaemonError
 from daemon.cli.exit_status import ExitStatus
 from daemon.onboard.monitoring.flight_state import EXPOSURES_MAX, PARTS, PREVIEW_PARTS
-from daemon.terminal.console import light_table
+from daemon.terminal.console import Console, light_table
 from processing.rig.problem_sentences import findings_of, sentences
 
 if TYPE_CHECKING:

@@ -35,7 +35,7 @@ def visible_value(value: Any) -> Any:
     return visible(value) if type(value) is str else value
 
 
-class Console(rich_console.Console):
+class Console(rich_console.Console):  # noqa: TID251
     """A terminal for text of others: without markup, and without what cannot be seen.
 
     Example:

@@ -130,6 +130,10 @@ class MissionTriangulation:
         """Where its files are."""
         return self.mission.export_dir / FOLDER
 
+    def has(self, number: int) -> bool:
+        """True if the exposure is in the block."""
+        return self.live is not None and any(one.number == number for one in self.live.images)
+
     def add(self, exposure: Exposure) -> ExposureTriangulated:
         """Add an exposure that has its products; a new line first adjusts the block.
 
@@ -138,7 +142,7 @@ class MissionTriangulation:
         begun = time.perf_counter()
         number = exposure.number
         self.is_simulated |= exposure.simulated
-        if self.live is not None and any(one.number == number for one in self.live.images):
+        if self.has(number):
             return ExposureTriangulated(number, None, "came before", 0.0)
         if exposure.state == "lost" or not exposure.frames:
             return self._skip(number, LOST, begun)

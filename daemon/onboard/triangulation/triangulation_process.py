@@ -147,7 +147,8 @@ class _Work:
 
     def _triangulate(self, done: MissionTriangulation, number: int) -> None:
         if self._landing.is_over:
-            done.skipped.setdefault(number, CUT_OFF)
+            if not done.has(number):
+                done.skipped.setdefault(number, CUT_OFF)
             return
         try:
             exposure = sealed_exposure(done.mission, number)

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import io
 
-from rich.console import Console
-
 from daemon.cli.level2_tables import print_reports
+from daemon.terminal.console import Console
 
 
 def test_reasons_of_exposures_that_are_not_good_follow_the_table() -> None:

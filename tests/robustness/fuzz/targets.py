@@ -175,10 +175,10 @@ def telemetry() -> Target:
 def monitor() -> Target:
     """What `syntopic monitor` receives over its WebSocket, until it is drawn and printed."""
     import msgpack
-    from rich.console import Console
 
     from daemon.cli.monitor import MonitorError, _MonitorState
     from daemon.onboard.monitoring.client.telemetry_client import _record
+    from daemon.terminal.console import Console
 
     console = Console(file=io.StringIO(), width=100)
 

@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 
 from daemon.cli import app
 from daemon.configuration.model import WatchSection
+from daemon.onboard.monitoring.access import certificate_authority
 from daemon.onboard.monitoring.access.certificate_authority import issue_certificate
 from daemon.onboard.monitoring.access.certificates import (
     Certificate,
@@ -268,6 +269,14 @@ def test_a_renewed_certificate_is_used_and_a_damaged_one_reported_once(tls: Path
     pem.write_bytes(good)
     assert files.renewed()
     assert read_certificate(pem, files.context).names >= {"camera1.example.org"}
+
+
+def test_a_fingerprint_is_printed_digit_by_digit(tmp_path: Path, monkeypatch) -> None:
+    """`:CD:` and `:AB:` are names of pictures in a terminal library."""
+    digits = "4E:CD:97:AB:12"
+    monkeypatch.setattr(certificate_authority, "fingerprint_of", lambda _path: digits)
+    printed = CliRunner().invoke(app, ["certificate", "--folder", str(tmp_path / "tls")])
+    assert digits in printed.output
 
 
 def test_the_command_makes_what_the_configuration_names(tmp_path: Path) -> None:

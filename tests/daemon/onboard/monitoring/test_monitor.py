@@ -7,11 +7,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from rich.console import Console
 from typer.testing import CliRunner
 
 from daemon.cli import app
 from daemon.cli.monitor import _MonitorState
+from daemon.terminal.console import Console
 from tests.daemon.onboard.monitoring import flight_events
 from tests.daemon.onboard.monitoring.test_page import Service
 

@@ -13,7 +13,6 @@ from typing import Any
 
 import msgpack
 import pytest
-from rich.console import Console
 from typer.testing import CliRunner, Result
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
@@ -31,6 +30,7 @@ from daemon.onboard.monitoring.client.telemetry_client import (
     check_token_transport,
     parse_service_address,
 )
+from daemon.terminal.console import Console
 from daemon.terminal.printable import printable, printable_tree
 
 pytestmark = pytest.mark.trust

@@ -157,11 +157,12 @@ def _until_finished(child: ChildProcess, limit_s: float) -> list[object]:
     pytest.fail(f"not finished in {limit_s} s: {received}")
 
 
+@pytest.mark.timeout(300)
 def test_the_process_takes_in_a_mission_in_flight_and_one_started_again_all_of_it(tmp_path) -> None:
     flown = flown_block(tmp_path, 3, 1)
     image = flown.mission / "L2/000003/pan.tif"
     image.rename(tmp_path / "later.tif")
-    section = TriangulationSection(enabled=True)
+    section = TriangulationSection(enabled=True, landing_timeout_s=240.0)
     child = ChildProcess("triangulation", TARGET, (flown.mission, section), thread_counts(1))
     try:
         child.send(Ping())
@@ -169,7 +170,7 @@ def test_the_process_takes_in_a_mission_in_flight_and_one_started_again_all_of_i
         for number in (3, 3, 77):
             child.send(TriangulateExposure(number))
         child.send(FinishTriangulation())
-        received = _until_finished(child, 120.0)
+        received = _until_finished(child, 240.0)
         pid = child.process.pid
         assert os.getpriority(os.PRIO_PROCESS, pid) == 19
         assert os.sched_getscheduler(pid) == os.SCHED_IDLE
