@@ -15,8 +15,8 @@ from daemon.terminal.console import Console
 
 RINEX_HELP = """Export a receiver's observations as RINEX with the event marks of the exposures.
 
-Reads the recorded RXM-RAWX of u-blox and RANGE of NovAtel receivers. Each event mark is an epoch of
-flag 5, rounded to 100 ns; `marks.csv` keeps nanoseconds and standard deviations. A position file of
+Reads the recorded RXM-RAWX of u-blox, RANGE of NovAtel and MeasEpoch of Septentrio receivers. Each
+event mark is an epoch of flag 5, rounded to 100 ns; `marks.csv` keeps nanoseconds and standard deviations. A position file of
 RTKLIB comes back with `syntopic orient --trajectory`.
 
 Examples: `syntopic export rinex MISSION`,
@@ -58,6 +58,7 @@ def rinex(
             "intervals_with_several_marks": done.crowded,
             "unknown_signals": done.counts.unknown_signals,
             "unreadable_messages": done.counts.unreadable,
+            "signals_of_other_antennas": done.counts.other_antennas,
             "other_receivers": list(done.other_receivers),
             "failures": [failure.as_json() for failure in done.failures],
         }
@@ -81,6 +82,7 @@ def rinex(
         (done.written.left_out, "values do not fit RINEX's columns and are left out"),
         (done.counts.unknown_signals, "signals have no RINEX code and are left out"),
         (done.counts.unreadable, "messages could not be decoded"),
+        (done.counts.other_antennas, "signals are of other antennas and are left out"),
         (len(done.without_mark), "exposures have no event mark of the receiver"),
         (done.crowded, "intervals between epochs hold several marks, of which RTKLIB reads one"),
     ):

@@ -29,18 +29,20 @@ from daemon.postflight.exchange.rinex import (
     RinexText,
     observation_text,
 )
-from drivers.receivers.observations import (
-    ObservationCounts,
-    ObservationEpoch,
-    novatel_observations,
-    ublox_observations,
-)
+from drivers.receivers.novatel.observations import novatel_observations
+from drivers.receivers.observations import ObservationCounts, ObservationEpoch
+from drivers.receivers.septentrio.observations import septentrio_observations
+from drivers.receivers.ublox.observations import ublox_observations
 
 Decoder = Callable[[bytes, ObservationCounts], Iterator[ObservationEpoch]]
 
-DECODERS: Mapping[str, Decoder] = {"ublox": ublox_observations, "novatel": novatel_observations}
+DECODERS: Mapping[str, Decoder] = {
+    "ublox": ublox_observations,
+    "novatel": novatel_observations,
+    "septentrio": septentrio_observations,
+}
 """Decoders of raw observations by driver."""
-MESSAGES = {"ublox": "RXM-RAWX", "novatel": "RANGE"}
+MESSAGES = {"ublox": "RXM-RAWX", "novatel": "RANGE", "septentrio": "MeasEpoch"}
 MARK_SOURCE = "event-mark"
 
 

@@ -1,4 +1,4 @@
-"""A small GPS constellation, and what receivers measure of it: RXM-RAWX, RANGE, navigation file.
+"""A small GPS constellation, and what receivers measure of it: RXM-RAWX, RANGE, MeasEpoch.
 
 Satellites follow the broadcast ephemeris model (IS-GPS-200, table 20-IV) with the elements that the
 navigation file states; signals travel in vacuum, clocks are perfect. Carrier phases have an
@@ -7,6 +7,7 @@ arbitrary whole number of cycles.
 
 from __future__ import annotations
 
+import binascii
 import struct
 import zlib
 from datetime import UTC, datetime, timedelta
@@ -116,6 +117,64 @@ def novatel_range(at: np.ndarray, gps_ns: int, toe_s: float) -> bytes:
     )  # fmt: skip
     data = head + body
     return data + struct.pack("<I", zlib.crc32(data, 0xFFFFFFFF) ^ 0xFFFFFFFF)
+
+
+SBF_SIGNALS = (
+    (0, 0, L1_HZ, 40.25), (2, 0, 1_227_600_000.0, 31.5), (4, 0, 1_176_450_000.0, 44.0),
+    (8, 1, 1_602_000_000.0, 43.75), (11, 1, 1_246_000_000.0, 38.0),
+)  # fmt: skip
+"""Signal number, whether of GLONASS, frequency without its channel, and strength."""
+
+
+def meas_epoch(at: np.ndarray, gps_ns: int, toe_s: float, *, signals=SBF_SIGNALS) -> bytes:
+    """One MeasEpoch of three signals of GPS and two of GLONASS with the same ranges.
+
+    The ranges of a signal exceed those of the one before it by 12.345 m; phases have a whole number
+    of cycles of their own, Dopplers come from the ranges half a second later.
+    """
+    week, rest = divmod(gps_ns, WEEK_NS)
+    tow_s = rest * 1e-9
+    seen = ranges(at, tow_s, toe_s)
+    later = ranges(at, tow_s + 0.5, toe_s)
+    body = b""
+    count = 0
+    for prn, distance in seen.items():
+        rate = (later.get(prn, distance) - distance) / 0.5
+        for glonass in (0, 1):
+            rows = [one for one in signals if one[1] == glonass]
+            if not rows:
+                continue
+            channel = prn % 14 - 7 if glonass else 0
+            first_code = first_doppler = first_hertz = 0.0
+            for k, (number, _, middle_hz, strength) in enumerate(rows):
+                step = 562_500.0 if number == 8 else 437_500.0 if number == 11 else 0.0
+                hertz = middle_hz + channel * step
+                code = round((distance + 12.345 * k) * 1000)
+                doppler = round(-rate * hertz / C * 1e4)
+                cycles = round((distance * hertz / C + 100 + prn - code / 1000 * hertz / C) * 1000)
+                info = (channel + 8) << 3 if glonass else 0
+                level = round((strength - (0 if number in (1, 2) else 10)) * 4)
+                if k == 0:
+                    first_code, first_doppler, first_hertz = code, doppler, hertz
+                    body += struct.pack(
+                        "<BBBBIiHbBHBB", prn, number, 37 + prn % 24 + 1 if glonass else prn,
+                        code >> 32, code & 0xFFFFFFFF, doppler, cycles & 0xFFFF, cycles >> 16,
+                        level, 60, info, len(rows) - 1,
+                    )  # fmt: skip
+                    continue
+                offset = code - first_code
+                change = round(doppler - first_doppler * hertz / first_hertz)
+                upper = offset >> 16 & 7 | (change >> 16 & 31) << 3
+                body += struct.pack(
+                    "<BBBBbBHHH", number, 60, level, upper, cycles >> 16, info,
+                    offset & 0xFFFF, cycles & 0xFFFF, change & 0xFFFF,
+                )  # fmt: skip
+            count += 1
+    head = struct.pack("<IHBBBBBB", rest // 1_000_000, week, count, 20, 12, 0, 0, 0)
+    content = head + body
+    content += bytes(-len(content) % 4)
+    checked = struct.pack("<HH", 4027 | 1 << 13, 8 + len(content)) + content
+    return b"$@" + struct.pack("<H", binascii.crc_hqx(checked, 0)) + checked
 
 
 def navigation_text(gps_ns: int, toe_s: float) -> str:

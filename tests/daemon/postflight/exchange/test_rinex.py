@@ -21,13 +21,9 @@ from daemon.mission.log.log_records import Message, message_of
 from daemon.orientation.rtklib_positions import read_positions
 from daemon.orientation.trajectory import TrajectoryError
 from daemon.postflight.exchange.rinex import RinexHeader, observation_text
-from drivers.receivers.observations import (
-    Observation,
-    ObservationCounts,
-    ObservationEpoch,
-    novatel_observations,
-    ublox_observations,
-)
+from drivers.receivers.novatel.observations import novatel_observations
+from drivers.receivers.observations import Observation, ObservationCounts, ObservationEpoch
+from drivers.receivers.ublox.observations import ublox_observations
 from tests.daemon.orientation.test_orientation import sample_at
 from tests.daemon.postflight.exchange.emulated_gnss import (
     WEEK_NS,

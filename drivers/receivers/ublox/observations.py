@@ -1,0 +1,92 @@
+"""Raw observations of u-blox receivers: RXM-RAWX.
+
+Source: u-blox F9 interface description, UBX-18010854, RXM-RAWX; RINEX 3.04, tables 9 to 15.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator, Mapping
+from typing import Final
+
+from drivers.receivers.observations import (
+    WEEK_NS,
+    Observation,
+    ObservationCounts,
+    ObservationEpoch,
+    present,
+)
+from drivers.receivers.ublox.framing import UbxFramer
+
+RAWX: Final = (0x02, 0x15)
+_HEAD: Final = struct.Struct("<dHbBBB2x")
+_SIGNAL: Final = struct.Struct("<ddfBBBBHBBBBBx")
+
+_CODES: Final[Mapping[tuple[int, int], tuple[str, str]]] = {
+    (0, 0): ("G", "1C"), (0, 3): ("G", "2L"), (0, 4): ("G", "2S"),
+    (0, 6): ("G", "5I"), (0, 7): ("G", "5Q"),
+    (1, 0): ("S", "1C"),
+    (2, 0): ("E", "1C"), (2, 1): ("E", "1B"), (2, 3): ("E", "5I"), (2, 4): ("E", "5Q"),
+    (2, 5): ("E", "7I"), (2, 6): ("E", "7Q"),
+    (3, 0): ("C", "2I"), (3, 1): ("C", "2I"), (3, 2): ("C", "7I"), (3, 3): ("C", "7I"),
+    (3, 5): ("C", "1P"), (3, 6): ("C", "1D"), (3, 7): ("C", "5P"), (3, 8): ("C", "5D"),
+    (5, 0): ("J", "1C"), (5, 1): ("J", "1Z"), (5, 4): ("J", "2S"), (5, 5): ("J", "2L"),
+    (5, 8): ("J", "5I"), (5, 9): ("J", "5Q"),
+    (6, 0): ("R", "1C"), (6, 2): ("R", "2C"),
+    (7, 0): ("I", "5A"),
+}  # fmt: skip
+"""RINEX system and code of (gnssId, sigId)."""
+_NUMBER_OFFSETS: Final = {"S": 100, "J": 0}
+
+
+def ublox_observations(data: bytes, counts: ObservationCounts) -> Iterator[ObservationEpoch]:
+    """Epochs of RXM-RAWX in a recording.
+
+    Args:
+        data: bytes as received.
+        counts: are counted up.
+
+    Yields:
+        Epochs in the order received.
+    """
+    for frame in UbxFramer().feed(data):
+        if (frame[2], frame[3]) != RAWX:
+            continue
+        epoch = _rawx(frame[6:-2], counts)
+        if epoch is None:
+            counts.unreadable += 1
+        else:
+            counts.epochs += 1
+            yield epoch
+
+
+def _rawx(payload: bytes, counts: ObservationCounts) -> ObservationEpoch | None:
+    if len(payload) < _HEAD.size:
+        return None
+    tow_s, week, _, count, _, _ = _HEAD.unpack_from(payload)
+    if len(payload) != _HEAD.size + count * _SIGNAL.size or not 0.0 <= tow_s < 604_800.0:
+        return None
+    found = []
+    for at in range(_HEAD.size, len(payload), _SIGNAL.size):
+        values = _SIGNAL.unpack_from(payload, at)
+        pseudorange, phase, doppler, system, number, signal, frequency, lock_ms, cno = values[:9]
+        status = values[12]
+        known = _CODES.get((system, signal))
+        offset = _NUMBER_OFFSETS.get(known[0], 0) if known else 0
+        if known is None or not 1 <= number - offset <= 99:
+            counts.unknown_signals += 1
+            continue
+        found.append(
+            Observation(
+                f"{known[0]}{number - offset:02d}",
+                known[1],
+                present(pseudorange) if status & 1 else None,
+                present(phase) if status & 2 else None,
+                present(doppler),
+                float(cno) if cno else None,
+                lock_ms * 1e-3,
+                half_cycle=bool(status & 2 and not status & 4),
+                channel=frequency - 7 if known[0] == "R" else None,
+            )
+        )
+    return ObservationEpoch(week * WEEK_NS + round(tow_s * 1e9), tuple(found))
