@@ -76,7 +76,9 @@ def _print_refusal(error: Exception) -> NoReturn:
     from daemon import DaemonError
     from daemon.configuration.model import ConfigurationError
     from daemon.terminal.console import Console
-    from drivers.base.extras import MissingExtraError, missing_module
+    from drivers import DriverError
+    from drivers.base.extras import missing_module
+    from processing import ProcessingError
     from processing.rig import RigError
 
     console = Console(stderr=True, soft_wrap=True)
@@ -91,7 +93,7 @@ def _print_refusal(error: Exception) -> NoReturn:
         refusal = missing_module(error)
     elif isinstance(error, OSError):
         refusal = _disk_refusal(error)
-    if not isinstance(refusal, DaemonError | MissingExtraError):
+    if not isinstance(refusal, DaemonError | DriverError | ProcessingError):
         raise error
     console.print(str(refusal), style="red", markup=False)
     sys.exit(ExitStatus.PROBLEM)

@@ -21,8 +21,12 @@ def usable_count(count: int) -> int:
     """Exposures that one process can have in work: one if numba has only its own thread pool.
 
     Args:
-        count: as requested. Call it after the first kernel ran.
+        count: as requested.
+
+    Returns:
+        `count`, or 1. Where no parallel kernel ran yet, numba's thread pool is started.
     """
+    numba.get_num_threads()
     return 1 if numba.threading_layer() == "workqueue" else count
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import threading
 from concurrent.futures import wait
 from types import SimpleNamespace
@@ -87,8 +89,18 @@ def test_a_task_that_fails_raises_and_frees_its_pipeline(pipeline: Pipeline) -> 
 def test_a_threading_layer_for_one_thread_gets_one_pipeline(
     pipeline: Pipeline, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    only_numbas_own = SimpleNamespace(threading_layer=lambda: "workqueue")
+    only_numbas_own = SimpleNamespace(
+        get_num_threads=lambda: 2, threading_layer=lambda: "workqueue"
+    )
     monkeypatch.setattr("daemon.products.pipeline_pool.numba", only_numbas_own)
     pool = PipelinePool(pipeline, 2)
     assert pool.count == 1
     pool.end()
+
+
+def test_the_count_is_known_before_a_kernel_ran() -> None:
+    code = "from daemon.products.pipeline_pool import usable_count; print(usable_count(2))"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=False
+    )
+    assert done.stdout.strip() in {"1", "2"}, done.stderr
