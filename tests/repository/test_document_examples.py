@@ -23,11 +23,13 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final
 
 import pytest
 
 from benchmarks import first_exposure
+from tests.daemon.mission.stores.faulty_s3 import REGION, Faults, serving
 from tests.daemon.rededge_data import RECORDED
 
 ROOT: Final = Path(__file__).parents[2]
@@ -56,6 +58,9 @@ FLIGHTS: Final = {
 """Pages that fly. They have a network of their own where the kernel allows it, as other flights of
 the tests may run at the same time."""
 
+STORES: Final = {"how-to/processing/object-stores.md"}
+"""Pages that write to an object store: a server on a loopback port with one empty bucket."""
+
 NOT_RUN: Final[Mapping[tuple[str, str], str]] = {
     ("tutorials/getting-started.md", "clone"): "installs the system; the tests run after it",
     (
@@ -69,6 +74,26 @@ NOT_RUN: Final[Mapping[tuple[str, str], str]] = {
     ("how-to/flight/tls.md", "camera"): "needs a camera computer on the network",
     ("how-to/flight/watching.md", "service"): "needs a service that is armed, with a fault",
     ("how-to/flight/watching.md", "aircraft"): "needs two services; test_fleet.py gathers several",
+    (
+        "how-to/processing/calibration-board.md",
+        "camera",
+    ): "follows pictures as they are taken; test_calibrate_board.py makes them",
+    (
+        "how-to/processing/calibration-flight.md",
+        "flight",
+    ): "needs a flight at two heights; test_calibrate_flight.py renders one",
+    (
+        "how-to/processing/common-image.md",
+        "rig",
+    ): "needs a service with heads, and its missions; test_propose_image.py has a flight",
+    (
+        "how-to/processing/many-exposures.md",
+        "cluster",
+    ): "runs until stopped on fixed ports; test_cluster.py starts one on free ports",
+    (
+        "how-to/processing/orthomosaic.md",
+        "photographs",
+    ): "needs photographs of a flight; test_import_photographs.py has some",
     ("how-to/processing/midas.md", "block"): "needs a measured block; its tests make one",
     (
         "how-to/processing/midas.md",
@@ -114,9 +139,15 @@ class Session:
     Args:
         folder: where the commands run.
         inside: command that runs others in a network of their own.
+        variables: what the reader has set before, such as credentials.
     """
 
-    def __init__(self, folder: Path, inside: tuple[str, ...] = ()) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        inside: tuple[str, ...] = (),
+        variables: Mapping[str, str] = MappingProxyType({}),
+    ) -> None:
         self._folder = folder
         self._inside = inside
         self._environment = {
@@ -124,6 +155,7 @@ class Session:
             "PATH": ":".join((str(folder / "bin"), str(ROOT / ".venv/bin"), SYSTEM_PATH)),
             "COLUMNS": "120",
             "PYTHONUNBUFFERED": "1",
+            **variables,
         }
         self._terminals: list[tuple[subprocess.Popen[bytes], str]] = []
 
@@ -203,6 +235,22 @@ def network_of(name: str) -> Iterator[tuple[str, ...]]:
     finally:
         holder.kill()
         holder.wait(END_TIMEOUT_S)
+
+
+@contextmanager
+def store_of(name: str) -> Iterator[Mapping[str, str]]:
+    """The credentials that a page asks its reader to set, of a server that runs meanwhile."""
+    if name not in STORES:
+        yield {}
+        return
+    with serving(Faults()) as endpoint:
+        yield {
+            "AWS_ENDPOINT_URL": endpoint,
+            "AWS_ALLOW_HTTP": "true",
+            "AWS_REGION": REGION,
+            "AWS_ACCESS_KEY_ID": "test",
+            "AWS_SECRET_ACCESS_KEY": "test",
+        }
 
 
 def allow_as_root(folder: Path) -> None:
@@ -304,7 +352,8 @@ def test_the_blocks_of_a_page_run_in_their_order(
         inside = stack.enter_context(network_of(name))
         if inside:
             allow_as_root(tmp_path)
-        session = stack.enter_context(Session(tmp_path, inside))
+        variables = stack.enter_context(store_of(name))
+        session = stack.enter_context(Session(tmp_path, inside, variables))
         for number, block in enumerate(listed):
             session.enter(block.section)
             if block.language != "sh":
@@ -335,6 +384,8 @@ def test_every_block_is_fenced_and_states_its_language(name: str) -> None:
     fenced = re.sub(r"^```.*?^```$", "", page, flags=re.MULTILINE | re.DOTALL)
     assert re.findall(r"\n\n(?: {4}|\t)(?![-*\d ])[^\n]+", fenced) == []
     assert {block.language for block in blocks(page)} <= {"sh", *RUNNERS}
+    printed = "".join(block.text for block in blocks(page) if block.language == "text")
+    assert re.findall(r"^(?:syntopic|make|sudo|pip|python|dask) .*", printed, re.MULTILINE) == []
 
 
 def test_a_block_that_fails_is_found(tmp_path: Path) -> None:
