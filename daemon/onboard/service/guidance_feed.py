@@ -22,8 +22,6 @@ from daemon.planning.steering import PlanTrigger
 from drivers.contract import NavSample
 from processing.rig import Rig
 
-PERIOD_S: Final = 0.05
-"""Interval at which a new sample is looked for; frames come at the rate of the receiver."""
 FRAME_INTERVAL_NS: Final = 90_000_000
 """Shortest interval between two frames: 10 Hz pass, faster receivers are thinned."""
 LEAVING_DEG: Final = 45.0
@@ -71,6 +69,20 @@ class GuidanceFeed:
         """Number of reported deviations."""
         self.lines: dict[str, Any] = {}
         """Ids of the lines that are flown, of the current one and of the next, for the status."""
+
+    def advance(self, now_ns: int | None = None) -> int | None:
+        """Handle the newest sample; call it after every message.
+
+        Args:
+            now_ns: the host's monotonic time, ns; default: now.
+
+        Returns:
+            The monotonic instant at which a sample is due that came too soon after the last frame,
+            ns; None for none.
+        """
+        self.step(now_ns)
+        is_handled = self._position() is self._last
+        return None if is_handled else self._sent_ns + FRAME_INTERVAL_NS
 
     def step(self, now_ns: int | None = None) -> Guidance | None:
         """Handle the newest sample, if it has not been handled.

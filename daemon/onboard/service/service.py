@@ -44,7 +44,6 @@ from daemon.onboard.preflight.preparation import Preparation
 from daemon.onboard.service.command_execution import CommandHandlers
 from daemon.onboard.service.exposure_sequence import ExposureSequence
 from daemon.onboard.service.flight_line import FlightLine, Order
-from daemon.onboard.service.guidance_feed import PERIOD_S as GUIDANCE_PERIOD_S
 from daemon.onboard.service.guidance_feed import GuidanceFeed
 from daemon.onboard.service.landed_stage import LandedStage
 from daemon.onboard.service.message_dispatcher import MessageDispatcher
@@ -142,7 +141,6 @@ class Service:
             tasks = [
                 loop.create_task(self._run_sequence()),
                 loop.create_task(self._monitor_processes()),
-                loop.create_task(self._guide()),
                 loop.create_task(self._fly()),
             ]
             for task in tasks:
@@ -298,17 +296,14 @@ class Service:
     async def _run_sequence(self) -> None:
         """Carry out what is due after every message, and when a time-out expires."""
         while True:
-            next_ns = self.sequence.advance()
+            due_ns = [self.sequence.advance()]
+            if self.guidance is not None:
+                due_ns.append(self.guidance.advance())
             if self.exposure.apply():
                 self.line.set_exposure_times(self.exposure.times_ns)
+            next_ns = min((one for one in due_ns if one is not None), default=None)
             wait_s = PING_S if next_ns is None else (next_ns - time.monotonic_ns()) * 1e-9
             await self._wait(min(max(wait_s, WAIT_MIN_S), PING_S))
-
-    async def _guide(self) -> None:
-        """Send guidance for every navigation sample."""
-        while self.guidance is not None:
-            self.guidance.step()
-            await asyncio.sleep(GUIDANCE_PERIOD_S)
 
     async def _monitor_processes(self) -> None:
         while True:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import asyncio
 from dataclasses import replace
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 
 from daemon.configuration.model import PlanSection
 from daemon.onboard.flight.fault_latches import FaultLatches
-from daemon.onboard.service.guidance_feed import GuidanceFeed, planned_height_m
+from daemon.onboard.service.guidance_feed import FRAME_INTERVAL_NS, GuidanceFeed, planned_height_m
+from daemon.onboard.service.service import Service
 from drivers.contract import NavSample
 from processing.rig import load_rig, shipped_rigs
 from tests.daemon.onboard.flight.test_flight import nav as any_sample
@@ -67,6 +70,49 @@ def test_every_sample_is_one_frame_with_line_limits_and_turn() -> None:
     assert (frame["turn"]["line"], frame["turn"]["side"]) == ("A2", "right")
     assert rehearsal.feed.lines == {"flown": ["A1"], "current": None, "next": "A2"}
     assert rehearsal.faults == []
+
+
+def test_a_sample_that_comes_too_soon_is_due_when_the_interval_has_passed() -> None:
+    rehearsal = Rehearsal()
+    rehearsal.fly(0.0, 12.0, 0.0)
+    assert rehearsal.feed.advance(rehearsal.now_ns) is None, "the sample has been handled"
+    assert rehearsal.sample is not None
+    rehearsal.sample = replace(rehearsal.sample, mono_ns=rehearsal.now_ns + NS // 20)
+    due_ns = rehearsal.feed.advance(rehearsal.now_ns + NS // 20)
+    assert due_ns == rehearsal.now_ns + FRAME_INTERVAL_NS
+    assert len(rehearsal.frames) == 1
+    assert rehearsal.feed.advance(due_ns) is None
+    assert len(rehearsal.frames) == 2
+
+
+def test_the_service_handles_guidance_after_every_message() -> None:
+    steps = 0
+
+    def advance() -> None:
+        nonlocal steps
+        steps += 1
+
+    async def run() -> list[int]:
+        service = Service.__new__(Service)
+        service.sequence = cast("Any", SimpleNamespace(advance=lambda: None))
+        service.exposure = cast("Any", SimpleNamespace(apply=lambda: False))
+        service.guidance = cast("Any", SimpleNamespace(advance=advance))
+        service.dispatcher = cast("Any", SimpleNamespace(dispatch=lambda _: None))
+        service.changed = asyncio.Event()
+        task = asyncio.create_task(service._run_sequence())
+        counts = []
+        for _ in range(3):
+            await settle()
+            counts.append(steps)
+            service._dispatch("message")
+        task.cancel()
+        return counts
+
+    async def settle() -> None:
+        for _ in range(10):
+            await asyncio.sleep(0)
+
+    assert asyncio.run(run()) == [1, 2, 3]
 
 
 def test_a_deviation_is_reported_once_with_its_correction_and_ends() -> None:
