@@ -16,8 +16,9 @@ from daemon.terminal.console import Console
 RINEX_HELP = """Export a receiver's observations as RINEX with the event marks of the exposures.
 
 Reads the recorded RXM-RAWX of u-blox, RANGE of NovAtel and MeasEpoch of Septentrio receivers. Each
-event mark is an epoch of flag 5, rounded to 100 ns; `marks.csv` keeps nanoseconds and standard deviations. A position file of
-RTKLIB comes back with `syntopic orient --trajectory`.
+event mark is an epoch of flag 5, rounded to 100 ns; `marks.csv` keeps nanoseconds and standard
+deviations. Ephemerides of GPS are written as `<receiver>.nav` where RXM-SFRBX, RAWEPHEM or GPSRawCA
+was recorded. A position file of RTKLIB comes back with `syntopic orient --trajectory`.
 
 Examples: `syntopic export rinex MISSION`,
 `syntopic export rinex MISSION --version 4.00 --antenna "NOV703GGG.R2    NONE"`
@@ -54,6 +55,7 @@ def rinex(
             "values": done.written.values,
             "values_left_out": done.written.left_out,
             "marks": done.written.marks,
+            "ephemerides": len(done.ephemerides),
             "without_mark": list(done.without_mark),
             "intervals_with_several_marks": done.crowded,
             "unknown_signals": done.counts.unknown_signals,
@@ -68,9 +70,16 @@ def rinex(
     console = Console()
     console.print(
         f"{done.written.epochs} epochs, {done.written.values} values, {done.written.marks} event "
-        f"marks in {done.folder / done.name}",
+        f"marks in {done.folder / done.name}; {len(done.ephemerides)} ephemerides of GPS",
         soft_wrap=True,
     )
+    if not done.ephemerides:
+        console.print(
+            f"No navigation file: the receiver recorded no complete {done.navigation_message}; use "
+            "a broadcast ephemeris of the day",
+            style="yellow",
+            soft_wrap=True,
+        )
     if done.other_receivers:
         console.print(
             f"Receiver {done.folder.name} of several; "

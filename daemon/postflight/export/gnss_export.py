@@ -12,6 +12,7 @@ from bisect import bisect_left
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 from daemon import DaemonError
@@ -29,10 +30,15 @@ from daemon.postflight.exchange.rinex import (
     RinexText,
     observation_text,
 )
-from drivers.receivers.novatel.observations import novatel_observations
-from drivers.receivers.observations import ObservationCounts, ObservationEpoch
-from drivers.receivers.septentrio.observations import septentrio_observations
-from drivers.receivers.ublox.observations import ublox_observations
+from daemon.postflight.exchange.rinex_navigation import navigation_text
+from drivers.receivers.gps_ephemeris import GpsEphemeris, Subframe, ephemerides_of
+from drivers.receivers.novatel.observations import novatel_observations, novatel_subframes
+from drivers.receivers.observations import WEEK_NS, ObservationCounts, ObservationEpoch
+from drivers.receivers.septentrio.observations import (
+    septentrio_observations,
+    septentrio_subframes,
+)
+from drivers.receivers.ublox.observations import ublox_observations, ublox_subframes
 
 Decoder = Callable[[bytes, ObservationCounts], Iterator[ObservationEpoch]]
 
@@ -42,8 +48,16 @@ DECODERS: Mapping[str, Decoder] = {
     "septentrio": septentrio_observations,
 }
 """Decoders of raw observations by driver."""
+SUBFRAMES: Mapping[str, Callable[[bytes], Iterator[Subframe]]] = {
+    "ublox": ublox_subframes,
+    "novatel": novatel_subframes,
+    "septentrio": septentrio_subframes,
+}
+"""Decoders of the navigation message of GPS by driver."""
 MESSAGES = {"ublox": "RXM-RAWX", "novatel": "RANGE", "septentrio": "MeasEpoch"}
+NAVIGATION_MESSAGES = {"ublox": "RXM-SFRBX", "novatel": "RAWEPHEM", "septentrio": "GPSRawCA"}
 MARK_SOURCE = "event-mark"
+_GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC)
 
 
 class GnssExportError(DaemonError):
@@ -54,7 +68,8 @@ class GnssExportError(DaemonError):
 class GnssExport:
     """The folder, the written file, its figures, and exposures without a mark of the receiver.
 
-    `other_receivers` have observations, too, and were not asked for.
+    `other_receivers` have observations, too, and were not asked for. `navigation_message` names
+    what a receiver records for `ephemerides`.
     """
 
     folder: Path
@@ -64,6 +79,8 @@ class GnssExport:
     without_mark: tuple[int, ...]
     crowded: int
     failures: tuple[ExposureFailure, ...]
+    ephemerides: tuple[GpsEphemeris, ...]
+    navigation_message: str
     other_receivers: tuple[str, ...] = ()
 
 
@@ -76,6 +93,8 @@ def export_rinex(
     one_mark_per_epoch: bool = False,
 ) -> GnssExport:
     """Write `export/rinex/<receiver>/` with `<receiver>.obs` and `marks.csv`.
+
+    Where the receiver recorded the navigation message of GPS, `<receiver>.nav` is written, too.
 
     Args:
         version: of RINEX.
@@ -91,7 +110,8 @@ def export_rinex(
         raise GnssExportError(f"RINEX {version} is not written; {' and '.join(VERSIONS)} are")
     name, driver, others = _receiver_of(mission, receiver)
     counts = ObservationCounts()
-    epochs = list(DECODERS[driver](_recorded(mission, name), counts))
+    recorded = _recorded(mission, name)
+    epochs = list(DECODERS[driver](recorded, counts))
     if not epochs:
         raise GnssExportError(
             f"{mission.log_dir}: receiver {name} recorded no {MESSAGES[driver]}; switch the "
@@ -111,14 +131,23 @@ def export_rinex(
         )
     header = _header(mission, name, antenna, exposures)
     written = observation_text(header, epochs, marks, version=version)
+    ephemerides = tuple(
+        ephemerides_of(SUBFRAMES[driver](recorded), near_week=instants[0] // WEEK_NS)
+    )
     folder = mission.export_dir / "rinex" / name
     texts = {f"{name}.obs": written.text, "marks.csv": _marks_text(marked)}
+    if ephemerides:
+        made = _GPS_EPOCH + timedelta(seconds=instants[0] // 1_000_000_000)
+        texts[f"{name}.nav"] = navigation_text(
+            ephemerides, version=version, made=made, comments=_simulated(exposures)
+        )
     write_folder(folder, {file: [text.encode("utf-8")] for file, text in texts.items()})
     with_mark = {e.number for e in marked}
     without = tuple(e.number for e in exposures if e.number not in with_mark)
     return GnssExport(
-        folder, f"{name}.obs", written, counts, without, crowded, tuple(sealed.failures), others
-    )
+        folder, f"{name}.obs", written, counts, without, crowded, tuple(sealed.failures),
+        ephemerides, NAVIGATION_MESSAGES[driver], others,
+    )  # fmt: skip
 
 
 def _receiver_of(mission: Mission, wanted: str | None) -> tuple[str, str, tuple[str, ...]]:
@@ -174,9 +203,13 @@ def _header(mission: Mission, name: str, antenna: str, exposures: list[Exposure]
         comments=(
             "events of flag 5: mid-exposure of the reference head",
             "ANTENNA: DELTA X/Y/Z: body, forward right down, from rig",
-            *(("SIMULATED: emulated hardware",) if any(e.simulated for e in exposures) else ()),
+            *_simulated(exposures),
         ),
     )
+
+
+def _simulated(exposures: list[Exposure]) -> tuple[str, ...]:
+    return ("SIMULATED: emulated hardware",) if any(e.simulated for e in exposures) else ()
 
 
 def _marks_text(marked: list[Exposure]) -> str:

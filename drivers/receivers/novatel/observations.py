@@ -1,6 +1,6 @@
-"""Raw observations of NovAtel receivers: binary RANGE.
+"""Raw observations and navigation messages of NovAtel receivers: binary RANGE, RAWEPHEM.
 
-Source: NovAtel OM-20000169, RANGE and "Channel Tracking Status"; RINEX 3.04, tables 9 to 15.
+Source: NovAtel OM-20000169, RANGE, "Channel Tracking Status", RAWEPHEM; RINEX 3.04, tables 9 to 15.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ import struct
 from collections.abc import Iterator, Mapping
 from typing import Final
 
+from drivers.receivers.gps_ephemeris import Subframe
 from drivers.receivers.novatel.framing import log_of, novatel_framer
 from drivers.receivers.observations import (
     WEEK_NS,
@@ -19,6 +20,9 @@ from drivers.receivers.observations import (
 )
 
 RANGE: Final = (43, "RANGE")
+RAWEPHEM: Final = (41, "RAWEPHEM")
+_RAWEPHEM_HEAD_NBYTES: Final = 12
+_SUBFRAME_NBYTES: Final = 30
 _SIGNAL: Final = struct.Struct("<HHdfdffffI")
 
 _CODES: Final[Mapping[tuple[int, int], tuple[str, str]]] = {
@@ -61,6 +65,33 @@ def novatel_observations(data: bytes, counts: ObservationCounts) -> Iterator[Obs
         else:
             counts.epochs += 1
             yield epoch
+
+
+def novatel_subframes(data: bytes) -> Iterator[Subframe]:
+    """Subframes 1 to 3 of GPS, of binary RAWEPHEM logs in a recording.
+
+    Args:
+        data: bytes as received.
+
+    Yields:
+        Subframes in the order received.
+    """
+    for frame in novatel_framer().feed(data):
+        try:
+            log = log_of(frame)
+        except ValueError:
+            continue
+        body = log.body
+        if log.identity not in RAWEPHEM or not isinstance(body, bytes):
+            continue
+        if len(body) < _RAWEPHEM_HEAD_NBYTES + 3 * _SUBFRAME_NBYTES:
+            continue
+        satellite = int.from_bytes(body[:4], "little")
+        if not 1 <= satellite <= 32:
+            continue
+        for k in range(3):
+            at = _RAWEPHEM_HEAD_NBYTES + k * _SUBFRAME_NBYTES
+            yield Subframe(satellite, int.from_bytes(body[at : at + _SUBFRAME_NBYTES], "big"))
 
 
 def _range(gps_ns: int, body: bytes, counts: ObservationCounts) -> ObservationEpoch | None:

@@ -1,10 +1,10 @@
-"""Raw observations of Septentrio receivers: MeasEpoch.
+"""Raw observations and navigation messages of Septentrio receivers: MeasEpoch, GPSRawCA.
 
 The first signal of a satellite is a block of its own; the others follow it as differences: of the
 pseudorange, of the phase from the pseudorange in cycles, of the Doppler scaled by the frequencies.
 
-Source: Septentrio mosaic-X5 reference guide, firmware 4.14, chapter 4, "MeasEpoch", "Signal type"
-and "Satellite ID and GLONASS frequency number"; RINEX 3.04, tables 9 to 15.
+Source: Septentrio mosaic-X5 reference guide, firmware 4.14, chapter 4, "MeasEpoch", "GPSRawCA",
+"Signal type" and "Satellite ID and GLONASS frequency number"; RINEX 3.04, tables 9 to 15.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Final
 
+from drivers.receivers.gps_ephemeris import Subframe, subframe_of_words
 from drivers.receivers.observations import (
     WEEK_NS,
     Observation,
@@ -29,6 +30,8 @@ from drivers.receivers.septentrio.blocks import (
 )
 
 MEAS_EPOCH: Final = 4027
+GPS_RAW_CA: Final = 4017
+_RAW_CA: Final = struct.Struct("<6xBB4x10I")
 LIGHT_MPS: Final = 299_792_458.0
 _HEAD: Final = struct.Struct("<IHBBBB")
 _FIRST: Final = struct.Struct("<BBBBIiHbBHBB")
@@ -37,7 +40,7 @@ _E6B: Final = 1 << 6
 _SCRAMBLED: Final = 1 << 7
 _HALF_CYCLE: Final = 1 << 2
 _EXTENDED: Final = 31
-"""A signal number of five bits that says: 32 more than the upper five bits of ObsInfo."""
+"""This number of five bits means: 32 more than the upper five bits of ObsInfo."""
 _NOT_MEASURED: Final = {"doppler": -0x80000000, "lock": 0xFFFF, "short_lock": 0xFF, "strength": 255}
 _PHASE_NOT_MEASURED: Final = (-128, 0)
 _CODE_NOT_MEASURED: Final = (-4, 0)
@@ -103,6 +106,27 @@ def septentrio_observations(data: bytes, counts: ObservationCounts) -> Iterator[
         else:
             counts.epochs += 1
             yield epoch
+
+
+def septentrio_subframes(data: bytes) -> Iterator[Subframe]:
+    """Subframes of GPS L1 C/A, of GPSRawCA in a recording; those with wrong parity are left out.
+
+    Args:
+        data: bytes as received.
+
+    Yields:
+        Subframes in the order received.
+    """
+    for frame in sbf_framer().feed(data):
+        if int.from_bytes(frame[4:6], "little") & 0x1FFF != GPS_RAW_CA:
+            continue
+        body = frame[HEADER.size :]
+        if len(body) < _RAW_CA.size:
+            continue
+        satellite, is_right, *words = _RAW_CA.unpack_from(body)
+        subframe = subframe_of_words(satellite, words)
+        if is_right and subframe is not None:
+            yield subframe
 
 
 def _epoch(body: bytes, counts: ObservationCounts) -> ObservationEpoch | None:

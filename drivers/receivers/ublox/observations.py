@@ -1,6 +1,7 @@
-"""Raw observations of u-blox receivers: RXM-RAWX.
+"""Raw observations and navigation messages of u-blox receivers: RXM-RAWX, RXM-SFRBX.
 
-Source: u-blox F9 interface description, UBX-18010854, RXM-RAWX; RINEX 3.04, tables 9 to 15.
+Source: u-blox F9 interface description, UBX-18010854, RXM-RAWX and RXM-SFRBX; RINEX 3.04, tables 9
+to 15.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ import struct
 from collections.abc import Iterator, Mapping
 from typing import Final
 
+from drivers.receivers.gps_ephemeris import Subframe, subframe_of_words
 from drivers.receivers.observations import (
     WEEK_NS,
     Observation,
@@ -19,6 +21,8 @@ from drivers.receivers.observations import (
 from drivers.receivers.ublox.framing import UbxFramer
 
 RAWX: Final = (0x02, 0x15)
+SFRBX: Final = (0x02, 0x13)
+_SFRBX_HEAD_NBYTES: Final = 8
 _HEAD: Final = struct.Struct("<dHbBBB2x")
 _SIGNAL: Final = struct.Struct("<ddfBBBBHBBBBBx")
 
@@ -58,6 +62,29 @@ def ublox_observations(data: bytes, counts: ObservationCounts) -> Iterator[Obser
         else:
             counts.epochs += 1
             yield epoch
+
+
+def ublox_subframes(data: bytes) -> Iterator[Subframe]:
+    """Subframes of GPS L1 C/A, of RXM-SFRBX in a recording.
+
+    Args:
+        data: bytes as received; the receiver has checked parities.
+
+    Yields:
+        Subframes in the order received.
+    """
+    for frame in UbxFramer().feed(data):
+        payload = frame[6:-2]
+        if (frame[2], frame[3]) != SFRBX or len(payload) < _SFRBX_HEAD_NBYTES:
+            continue
+        system, satellite, signal = payload[:3]
+        count = payload[4]
+        if (system, signal) != (0, 0) or len(payload) != _SFRBX_HEAD_NBYTES + 4 * count:
+            continue
+        words = struct.unpack_from(f"<{count}I", payload, _SFRBX_HEAD_NBYTES)
+        subframe = subframe_of_words(satellite, words)
+        if subframe is not None:
+            yield subframe
 
 
 def _rawx(payload: bytes, counts: ObservationCounts) -> ObservationEpoch | None:

@@ -1,7 +1,7 @@
-"""A small GPS constellation, and what receivers measure of it: RXM-RAWX, RANGE, MeasEpoch.
+"""A small GPS constellation, and what receivers measure of it: observations and messages.
 
 Satellites follow the broadcast ephemeris model (IS-GPS-200, table 20-IV) with the elements that the
-navigation file states; signals travel in vacuum, clocks are perfect. Carrier phases have an
+subframes state; signals travel in vacuum, clocks are perfect. Carrier phases have an
 arbitrary whole number of cycles.
 """
 
@@ -10,7 +10,7 @@ from __future__ import annotations
 import binascii
 import struct
 import zlib
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 
 import numpy as np
 
@@ -177,29 +177,79 @@ def meas_epoch(at: np.ndarray, gps_ns: int, toe_s: float, *, signals=SBF_SIGNALS
     return b"$@" + struct.pack("<H", binascii.crc_hqx(checked, 0)) + checked
 
 
-def navigation_text(gps_ns: int, toe_s: float) -> str:
-    """A RINEX 3.04 navigation file with the elements of all satellites."""
-    week = gps_ns // WEEK_NS
-    at = GPS_EPOCH + timedelta(seconds=week * 604_800 + toe_s)
-    lines = [
-        f"{'     3.04':<20}{'N: GNSS NAV DATA':<20}{'G: GPS':<20}RINEX VERSION / TYPE",
-        f"{'emulated':<60}PGM / RUN BY / DATE",
-        f"{'':<60}END OF HEADER",
-    ]
+def subframe_words(prn: int, gps_ns: int, toe_s: float, *, corrections: int = 1) -> list[list[int]]:
+    """Subframes 1 to 3 of a satellite: ten words of 24 bits each, issue of data 17.
 
-    def row(*values: float) -> str:
-        return "    " + "".join(f"{v:19.12e}" for v in values)
+    Without `corrections` they state the orbit and the perfect clock of the constellation; with
+    them, fields that it does not have are not zero.
+    The fields are written one after the other, as in figure 20-1 of IS-GPS-200.
+    """
+    node, inclination, anomaly = satellites()[prn]
+    week, rest = divmod(gps_ns, WEEK_NS)
+    count = rest // 6_000_000_000
+    k = corrections
 
-    for prn, (node, inclination, anomaly) in satellites().items():
-        first = f"G{prn:02d} {at:%Y %m %d %H %M %S}" + "".join(f"{0.0:19.12e}" for _ in range(3))
-        lines += [
-            first,
-            row(1.0, 0.0, 0.0, anomaly),
-            row(0.0, 0.0, 0.0, SQRT_A),
-            row(toe_s, 0.0, node, 0.0),
-            row(inclination, 0.0, 0.0, 0.0),
-            row(0.0, 0.0, float(week), 0.0),
-            row(2.0, 0.0, 0.0, 1.0),
-            row(toe_s, 4.0, 0.0, 0.0),
-        ]
-    return "\n".join(lines) + "\n"
+    def fields(*pairs: tuple[float, int]) -> int:
+        whole = 0
+        for value, bits in pairs:
+            whole = whole << bits | (round(value) & ((1 << bits) - 1))
+        return whole
+
+    def cycles(angle: float) -> float:
+        return (angle / 3.1415926535898 + 1) % 2 - 1
+
+    def head(number: int) -> tuple[tuple[float, int], ...]:
+        return (0x8B, 8), (0, 16), (count + number, 17), (0, 2), (number, 3), (0, 2)
+
+    frames = [
+        fields(
+            *head(1), (week % 1024, 10), (1, 2), (2, 4), (0, 6), (17 >> 8, 2), (1, 1), (0, 23),
+            (0, 24), (0, 24), (0, 16), (-5 * k, 8), (17, 8), (toe_s / 16, 16), (-3 * k, 8),
+            (21 * k, 16), ((-1234 - prn) * k, 22), (0, 2),
+        ),
+        fields(
+            *head(2), (17, 8), (-88 * k, 16), (140 * k, 16), (cycles(anomaly) * 2**31, 32),
+            (-77 * k, 16), (0.012 * 2**33 * k, 32), (66 * k, 16), (SQRT_A * 2**19, 32),
+            (toe_s / 16, 16), (0, 1), (0, 7),
+        ),
+        fields(
+            *head(3), (-9 * k, 16), (cycles(node) * 2**31, 32), (11 * k, 16),
+            (cycles(inclination) * 2**31, 32), (321 * k, 16),
+            (cycles(-1.1) * 2**31 * k, 32), (-22_000 * k, 24), (17, 8), (-45 * k, 14), (0, 2),
+        ),
+    ]  # fmt: skip
+    return [[frame >> 24 * (9 - n) & 0xFFFFFF for n in range(10)] for frame in frames]
+
+
+def sfrbx(prn: int, words: list[int]) -> bytes:
+    """One RXM-SFRBX of GPS L1 C/A; parity bits are ones."""
+    payload = struct.pack("<BBBBBBBB", 0, prn, 0, 0, 10, 0, 2, 0)
+    payload += struct.pack("<10I", *(word << 6 | 0x3F for word in words))
+    body = struct.pack("<BBH", 0x02, 0x13, len(payload)) + payload
+    a = b = 0
+    for byte in body:
+        a = (a + byte) & 255
+        b = (b + a) & 255
+    return b"\xb5\x62" + body + bytes((a, b))
+
+
+def rawephem(prn: int, gps_ns: int, toe_s: float, frames: list[list[int]]) -> bytes:
+    """One binary RAWEPHEM."""
+    week, rest = divmod(gps_ns, WEEK_NS)
+    body = struct.pack("<III", prn, week, round(toe_s))
+    body += b"".join(word.to_bytes(3, "big") for words in frames for word in words)
+    head = struct.pack(
+        "<3sBHBBHHBBHiIHH", b"\xaa\x44\x12", 28, 41, 0, 0x20, len(body), 0, 0, 180, week,
+        rest // 1_000_000, 0, 0, 0,
+    )  # fmt: skip
+    data = head + body
+    return data + struct.pack("<I", zlib.crc32(data, 0xFFFFFFFF) ^ 0xFFFFFFFF)
+
+
+def gps_raw_ca(prn: int, gps_ns: int, words: list[int]) -> bytes:
+    """One GPSRawCA with right parity."""
+    week, rest = divmod(gps_ns, WEEK_NS)
+    content = struct.pack("<IH6B", rest // 1_000_000, week, prn, 1, 0, 0, 0, 1)
+    content += struct.pack("<10I", *(word << 6 | 0x15 for word in words))
+    checked = struct.pack("<HH", 4017, 8 + len(content)) + content
+    return b"$@" + struct.pack("<H", binascii.crc_hqx(checked, 0)) + checked

@@ -27,9 +27,10 @@ from drivers.receivers.ublox.observations import ublox_observations
 from tests.daemon.orientation.test_orientation import sample_at
 from tests.daemon.postflight.exchange.emulated_gnss import (
     WEEK_NS,
-    navigation_text,
     novatel_range,
     rawx,
+    sfrbx,
+    subframe_words,
 )
 from tests.daemon.postflight.exchange.flown_block import EPOCH_NS, FLIGHT, fly
 
@@ -86,6 +87,9 @@ def flown(tmp_path_factory) -> Path:
         instant = START_NS + k * STEP_NS
         log.write(message_of(sample_at(instant)))
         observed = rawx(antenna_at(instant), instant, TOE_S, noise)
+        if k < 30:
+            words = subframe_words(k + 1, START_NS, TOE_S, corrections=0)
+            observed += b"".join(sfrbx(k + 1, part) for part in words)
         log.write(Message("raw/gnss", k * STEP_NS, observed))
     log.close()
     return mission
@@ -193,6 +197,7 @@ def test_damaged_messages_cost_themselves_only() -> None:
 def test_marks_are_events_of_100_ns_and_the_sidecar_keeps_nanoseconds(flown) -> None:
     content, path = exported(flown)
     assert (content["epochs"], content["marks"]) == (EPOCHS, 4)
+    assert content["ephemerides"] == 30 and path.with_suffix(".nav").is_file()
     events = [
         line for line in path.read_text().splitlines() if line.startswith("> ") and line[31] == "5"
     ]
@@ -260,7 +265,7 @@ def solution(flown, tmp_path_factory) -> Path:
     epochs = list(ublox_observations(stream, ObservationCounts()))
     header = RinexHeader("BASE", position_m=tuple(base))
     (folder / "base.obs").write_text(observation_text(header, epochs, [], version="3.04").text)
-    (folder / "brdc.nav").write_text(navigation_text(START_NS, TOE_S))
+    shutil.copy(rover.with_suffix(".nav"), folder / "brdc.nav")
     (folder / "ppk.conf").write_text(
         "pos1-posmode=kinematic\npos1-frequency=l1\npos1-soltype=combined\npos1-elmask=10\n"
         "pos1-ionoopt=off\npos1-tropopt=off\npos1-dynamics=on\npos1-navsys=1\n"
