@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyproj
 
 from daemon import DaemonError
 from daemon.mission.foreign_files import ForeignFileError, open_regular_file
+from daemon.orientation.geodesy import CRS, CRSError
 from daemon.orientation.georeference import Georeference
 from drivers.base.extras import require
 from processing.geometry.terrain_rays import HeightModel
@@ -126,8 +126,8 @@ def _geotiff(path: Path, descriptor: int, georeference: Georeference) -> HeightM
             heights = raster.read(1, out_dtype="float64")
             heights[raster.read_masks(1) == 0] = np.nan
             place, system = raster.transform, raster.crs
-            own = None if system is None else pyproj.CRS.from_wkt(system.to_wkt())
-    except (rasterio.errors.RasterioError, pyproj.exceptions.CRSError, ValueError) as error:
+            own = None if system is None else CRS.from_wkt(system.to_wkt())
+    except (rasterio.errors.RasterioError, CRSError, ValueError) as error:
         found = str(error).replace(opened, path.name)
         raise ElevationError(
             f"{path}: no GeoTIFF that can be read ({found}). A height model is a GeoTIFF or an "

@@ -1,7 +1,8 @@
-"""The ellipsoid of WGS 84: offsets, distances and earth-centred coordinates, computed by PROJ.
+"""PROJ, and the ellipsoid of WGS 84: offsets, distances and earth-centred coordinates.
 
-Coordinate systems of customers are in `daemon.orientation.georeference`, which sets PROJ up from
-here. PROJ is never allowed to use the network: a missing grid is an error, not a download.
+No other module imports pyproj: its classes and errors have their names here. PROJ is never allowed
+to use the network: a missing grid is an error, not a download. Coordinate systems of customers are
+in `daemon.orientation.georeference`.
 
 Accuracy: `Geod` and `cart` of PROJ are exact to 1e-8 m. A plane of `east_north_m` keeps distances
 and directions from its origin; at 50 km from it other lengths are wrong by less than 2e-5.
@@ -18,13 +19,22 @@ import pyproj
 
 # pyproj states no types for this module.
 from pyproj.network import set_network_enabled  # type: ignore[attr-defined]
+from pyproj.transformer import TransformerGroup as _TransformerGroup
 
 set_network_enabled(active=False)
 
+CRS = pyproj.CRS
+Transformer = pyproj.Transformer
+TransformerGroup = _TransformerGroup
+CRSError = pyproj.exceptions.CRSError
+ProjError = pyproj.exceptions.ProjError
+
 GEODETIC: Final = "EPSG:4979"
 """Latitude, longitude and ellipsoidal height, WGS 84."""
+GEOGRAPHIC: Final = "EPSG:4326"
+"""Latitude and longitude, WGS 84."""
 ELLIPSOID: Final = pyproj.Geod(ellps="WGS84")
-ECEF_FROM_GEODETIC: Final = pyproj.Transformer.from_pipeline(
+ECEF_FROM_GEODETIC: Final = Transformer.from_pipeline(
     "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart +ellps=WGS84"
 )
 """From longitude, latitude in degrees and ellipsoidal height to earth-centred metres."""

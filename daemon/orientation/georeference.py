@@ -12,12 +12,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import pyproj
 from numpy.typing import NDArray
-from pyproj.transformer import TransformerGroup
 
 from daemon import DaemonError
-from daemon.orientation.geodesy import ELLIPSOID, GEODETIC
+from daemon.orientation.geodesy import (
+    CRS,
+    ELLIPSOID,
+    GEODETIC,
+    CRSError,
+    Transformer,
+    TransformerGroup,
+)
 
 _CODE = re.compile(r"[A-Za-z]{2,10}:\w{1,10}(\+([A-Za-z]{2,10}:)?\w{1,10})?", re.ASCII)
 STEP_DEG = 1e-3
@@ -60,9 +65,9 @@ class Georeference:
         try:
             # Other texts that PROJ takes name files and addresses, and a mission may say them.
             if _CODE.fullmatch(crs) is None:
-                raise pyproj.exceptions.CRSError("no code of an authority")
-            self.crs = pyproj.CRS.from_user_input(crs)
-        except pyproj.exceptions.CRSError as error:
+                raise CRSError("no code of an authority")
+            self.crs = CRS.from_user_input(crs)
+        except CRSError as error:
             raise GeoreferenceError(
                 f"{crs[:100]} is no coordinate system PROJ knows; "
                 "write it as EPSG:25833 or EPSG:25833+7837"
@@ -123,7 +128,7 @@ class Georeference:
         return float(x), float(y), float(z)
 
 
-def accurate_transformer(crs: pyproj.CRS, name: str) -> pyproj.Transformer:
+def accurate_transformer(crs: CRS, name: str) -> Transformer:
     """From longitude, latitude (deg) and ellipsoidal height of WGS 84 to a system, not roughly.
 
     Args:
@@ -139,11 +144,11 @@ def accurate_transformer(crs: pyproj.CRS, name: str) -> pyproj.Transformer:
         group = TransformerGroup(GEODETIC, crs, always_xy=True, allow_ballpark=False)
     if not group.transformers or not group.best_available:
         raise GeoreferenceError(_missing_grids(name, group.unavailable_operations))
-    transformer: pyproj.Transformer = group.transformers[0]
+    transformer: Transformer = group.transformers[0]
     return transformer
 
 
-def _refuse_unfit(crs: pyproj.CRS, name: str) -> None:
+def _refuse_unfit(crs: CRS, name: str) -> None:
     horizontal = crs.sub_crs_list[0] if crs.is_compound else crs
     if not horizontal.is_projected:
         raise GeoreferenceError(

@@ -187,6 +187,43 @@ def vectors_from_rotations(rotations: Array) -> Array:
     return np.asarray(Rotation.from_matrix(rotations, assume_valid=True).as_rotvec())
 
 
+def rotations_from_quaternions(wxyz: Sequence[float] | Array) -> Array:
+    """Rotation matrices of quaternions, which are normalised.
+
+    Args:
+        wxyz: w, x, y, z, shape (..., 4), not all zero.
+
+    Returns:
+        Shape (..., 3, 3).
+
+    Raises:
+        ValueError: a quaternion is zero.
+
+    Example:
+        >>> rotations_from_quaternions([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)]).round(6) @ [1, 0, 0]
+        array([0., 1., 0.])
+    """
+    xyzw = np.roll(np.asarray(wxyz, float), -1, axis=-1)
+    return np.asarray(Rotation.from_quat(xyzw).as_matrix())
+
+
+def quaternions_from_rotations(rotations: Array) -> Array:
+    """Quaternions w, x, y, z of rotation matrices, with w not negative.
+
+    Args:
+        rotations: shape (..., 3, 3).
+
+    Returns:
+        Shape (..., 4).
+
+    Example:
+        >>> quaternions_from_rotations(rotation_matrix(0.0, 0.0, np.pi)).round(6) + 0.0
+        array([0., 0., 0., 1.])
+    """
+    known = Rotation.from_matrix(rotations, assume_valid=True)
+    return np.roll(known.as_quat(canonical=True), 1, axis=-1)
+
+
 def skew(vectors: Array) -> Array:
     """Cross product matrices [v]x of vectors: [v]x w = v x w.
 

@@ -53,6 +53,27 @@ def test_only_the_capture_side_of_the_drivers_imports_gi() -> None:
     assert all(path.startswith("drivers/cameras/aravis/") for path in importing), importing
 
 
+@pytest.mark.parametrize(
+    ("imported", "homes"),
+    [
+        (r"scipy\.spatial\.transform\b", {"processing/geometry/rotation.py"}),
+        (
+            r"pyproj\b",
+            {"daemon/orientation/geodesy.py", "daemon/onboard/monitoring/maps/hill_shade.py"},
+        ),
+    ],
+)
+def test_rotations_and_geodesy_have_their_home(imported: str, homes: set[str]) -> None:
+    """The emulator has its own, as it shares no mathematics with what it tests."""
+    importing = {
+        path.relative_to(ROOT).as_posix()
+        for package in ("daemon", "drivers", "processing")
+        for path in (ROOT / package).rglob("*.py")
+        if re.search(rf"^\s*(import|from) {imported}", path.read_text("utf-8"), re.MULTILINE)
+    }
+    assert importing == homes
+
+
 def test_processes_are_spawned_never_forked() -> None:
     for package in PACKAGES:
         for path in (ROOT / package).rglob("*.py"):

@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from daemon.mission.foreign_files import ForeignFileError, read_regular_file
 from daemon.postflight.exchange.block import (
@@ -25,6 +24,7 @@ from daemon.postflight.exchange.block import (
     BlockPoints,
 )
 from processing.geometry.forward_distortion import ForwardDistortion
+from processing.geometry.rotation import rotations_from_vectors
 
 Array = NDArray[np.float64]
 
@@ -87,7 +87,7 @@ def read_bal(path: Path) -> Block:
     cameras, found = [], []
     for k in range(images):
         values = [next(numbers) for _ in range(9)]
-        rotation = Rotation.from_rotvec(values[:3]).as_matrix()
+        rotation = rotations_from_vectors(np.array(values[:3]))
         cameras.append((values[6], values[7], values[8]))
         found.append((f"image{k:06d}", rotation, np.array(values[3:6])))
     xyz = [[next(numbers) for _ in range(3)] for _ in range(points)]

@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from daemon.mission.foreign_files import ForeignFileError, read_regular_file
 from daemon.postflight.exchange.block import (
@@ -28,6 +27,7 @@ from daemon.postflight.exchange.block import (
     fitted,
 )
 from processing.geometry.forward_distortion import Form, ForwardDistortion
+from processing.geometry.rotation import quaternions_from_rotations, rotations_from_quaternions
 
 Array = NDArray[np.float64]
 
@@ -139,18 +139,6 @@ def rig_pose(rig: BlockRig, camera: int) -> tuple[Array, Array]:
     return np.asarray(turn), np.asarray(-turn @ VISION_FROM_CAMERA @ rig.offset_m[camera])
 
 
-def quaternion(turn: Array) -> list[float]:
-    """w, x, y, z with w not negative."""
-    x, y, z, w = Rotation.from_matrix(turn).as_quat(canonical=True).tolist()
-    return [w, x, y, z]
-
-
-def rotation_of_quaternion(wxyz: Sequence[float]) -> Array:
-    """The rotation (3, 3) of a quaternion w, x, y, z."""
-    w, x, y, z = wxyz
-    return np.asarray(Rotation.from_quat([x, y, z, w]).as_matrix())
-
-
 def frame_groups(block: Block, rig: BlockRig | None) -> list[tuple[int, list[int]]]:
     """Frames in order: the rig's index and the indices of their images."""
     if rig is None:
@@ -182,7 +170,7 @@ def _rigs(block: Block, rig: BlockRig | None) -> Iterator[str]:
     sensors: list[object] = []
     for camera in others:
         turn, shift = rig_pose(rig, camera)
-        sensors += ["CAMERA", camera + 1, 1, *quaternion(turn), *shift.tolist()]
+        sensors += ["CAMERA", camera + 1, 1, *_pose_values(turn, shift)]
     yield _line(1, len(others) + 1, "CAMERA", rig.reference + 1, *sensors)
 
 
@@ -193,15 +181,18 @@ def _frames(block: Block, rig: BlockRig | None) -> list[str]:
         data: list[object] = []
         for k in members:
             data += ["CAMERA", block.images[k].camera + 1, k + 1]
-        lines.append(
-            _line(number, of_rig + 1, *quaternion(turn), *shift.tolist(), len(members), *data)
-        )
+        pose = _pose_values(turn, shift)
+        lines.append(_line(number, of_rig + 1, *pose, len(members), *data))
     return lines
 
 
 def _pose(rotation: Array, centre_m: Array) -> list[float]:
-    turn, shift = vision_pose(rotation, centre_m)
-    return [*quaternion(turn), *shift.tolist()]
+    return _pose_values(*vision_pose(rotation, centre_m))
+
+
+def _pose_values(rotation: Array, shift: Array) -> list[float]:
+    """Quaternion w, x, y, z and translation of a rigid motion (3, 3), (3,)."""
+    return [*quaternions_from_rotations(rotation).tolist(), *shift.tolist()]
 
 
 def model_parameters(name: str, model: ForwardDistortion) -> list[float]:
@@ -245,7 +236,7 @@ def read_colmap(folder: Path) -> Block:
             if camera not in cameras:
                 raise BlockError(f"{place}: camera {camera} is not in cameras.txt")
             pose = [float(v) for v in words[1:8]]
-            turn, shift = rotation_of_quaternion(pose[:4]), np.array(pose[4:])
+            turn, shift = rotations_from_quaternions(pose[:4]), np.array(pose[4:])
             frame, own = posed.get(number, (number, (turn, shift)))
             rotation, centre = camera_pose(*own)
             index[number] = len(images)
@@ -312,14 +303,14 @@ def _frame_poses(folder: Path) -> dict[int, tuple[int, tuple[Array, Array]]]:
                 if has_pose:
                     pose = [float(v) for v in rest[3:10]]
                     sensors[rig, int(rest[1])] = (
-                        rotation_of_quaternion(pose[:4]), np.array(pose[4:]),
+                        rotations_from_quaternions(pose[:4]), np.array(pose[4:]),
                     )  # fmt: skip
                 rest = rest[10 if has_pose else 3 :]
     posed = {}
     for place, words in _records(folder / "frames.txt"):
         with _reading(place):
             pose = [float(v) for v in words[2:9]]
-            turn, shift = rotation_of_quaternion(pose[:4]), np.array(pose[4:])
+            turn, shift = rotations_from_quaternions(pose[:4]), np.array(pose[4:])
             data = words[10:]
             if len(data) != 3 * int(words[9]):
                 raise BlockError(f"{place}: {words[9]} images are announced, others are listed")

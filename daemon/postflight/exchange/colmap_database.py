@@ -14,10 +14,10 @@ from daemon.postflight.exchange.colmap import (
     MODEL_OF_FORM,
     frame_groups,
     model_parameters,
-    quaternion,
     rig_pose,
 )
 from drivers.base.extras import require
+from processing.geometry.rotation import quaternions_from_rotations
 
 
 def write_database(path: Path, block: Block, rig: BlockRig | None) -> int:
@@ -98,7 +98,7 @@ def _rigs(pycolmap: Any, block: Block, rig: BlockRig | None) -> list[Any]:
     for camera in rig.rotation:
         if camera != rig.reference:
             turn, shift = rig_pose(rig, camera)
-            w, x, y, z = quaternion(turn)
+            w, x, y, z = quaternions_from_rotations(turn).tolist()
             pose = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([x, y, z, w])), shift)
             one.add_sensor(sensor(camera), pose)
     return [one]

@@ -13,10 +13,9 @@ from __future__ import annotations
 from xml.etree import ElementTree as ET
 
 import numpy as np
-import pyproj
 from numpy.typing import NDArray
 
-from daemon.orientation.geodesy import ECEF_FROM_GEODETIC
+from daemon.orientation.geodesy import CRS, ECEF_FROM_GEODETIC, GEOGRAPHIC
 from daemon.orientation.local_frame import LocalFrame, enu_axes
 from daemon.postflight.exchange.block import (
     VISION_FROM_CAMERA,
@@ -71,7 +70,7 @@ def metashape_texts(
     for number, image in enumerate(block.images):
         _camera(cameras, number, image, masters[number], suffix)
     reference = ET.SubElement(chunk, "reference")
-    reference.text = pyproj.CRS.from_epsg(4326).to_wkt("WKT1_GDAL")
+    reference.text = CRS(GEOGRAPHIC).to_wkt("WKT1_GDAL")
     ET.indent(root)
     text = '<?xml version="1.0" encoding="UTF-8"?>\n' + ET.tostring(root, encoding="unicode") + "\n"
     return {"cameras.xml": text}, residuals

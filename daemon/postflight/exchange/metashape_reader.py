@@ -16,12 +16,11 @@ from typing import Final
 from xml.etree import ElementTree as ET
 
 import numpy as np
-import pyproj
 from numpy.typing import NDArray
 
 from daemon.mission.foreign_files import ForeignFileError, read_regular_file
 from daemon.mission.foreign_xml import XmlError, parse_xml
-from daemon.orientation.geodesy import ECEF_FROM_GEODETIC
+from daemon.orientation.geodesy import CRS, ECEF_FROM_GEODETIC, GEOGRAPHIC, CRSError
 from daemon.orientation.local_frame import LocalFrame, enu_axes
 from daemon.postflight.exchange.block import (
     VISION_FROM_CAMERA,
@@ -234,14 +233,14 @@ def _moved(
     return replace(block, images=images, frame=frame, notes=tuple(notes))
 
 
-def _reference_of(path: Path, chunk: ET.Element) -> pyproj.CRS | None:
+def _reference_of(path: Path, chunk: ET.Element) -> CRS | None:
     """The coordinate system of the reference, horizontal; None where the file has none."""
     wkt = (chunk.findtext("reference") or "").strip()
     if not wkt:
         return None
     try:
-        crs = pyproj.CRS.from_wkt(wkt)
-    except pyproj.exceptions.CRSError as error:
+        crs = CRS.from_wkt(wkt)
+    except CRSError as error:
         raise BlockError(f"{path}: reference {wkt[:60]!r} is no coordinate system") from error
     if crs.is_compound:
         crs = crs.sub_crs_list[0]
@@ -253,9 +252,9 @@ def _reference_of(path: Path, chunk: ET.Element) -> pyproj.CRS | None:
     return crs
 
 
-def _check_datum(path: Path, crs: pyproj.CRS, notes: list[str]) -> None:
+def _check_datum(path: Path, crs: CRS, notes: list[str]) -> None:
     """Refuse another ellipsoid than that of WGS 84, and note another datum."""
-    ours = pyproj.CRS.from_epsg(4326).ellipsoid
+    ours = CRS(GEOGRAPHIC).ellipsoid
     theirs = crs.ellipsoid
     if (
         ours is None

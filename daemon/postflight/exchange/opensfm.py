@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from daemon.mission.foreign_files import ForeignFileError, read_regular_file
 from daemon.orientation.local_frame import LocalFrame
@@ -34,7 +33,11 @@ from daemon.postflight.exchange.colmap import camera_pose, rig_pose, vision_pose
 from daemon.postflight.exchange.opensfm_tracks import TRACKS_FILE, read_tracks
 from processing.geometry.forward_distortion import ForwardDistortion
 from processing.geometry.orientation import BODY_FROM_CAMERA, ENU_FROM_NED
-from processing.geometry.rotation import roll_pitch_heading
+from processing.geometry.rotation import (
+    roll_pitch_heading,
+    rotations_from_vectors,
+    vectors_from_rotations,
+)
 
 Array = NDArray[np.float64]
 
@@ -145,7 +148,7 @@ def _camera_json(camera: BlockCamera, model: ForwardDistortion) -> dict[str, Any
 def _shot(block: Block, image: BlockImage) -> dict[str, Any]:
     turn, shift = vision_pose(image.rotation, image.centre_m)
     shot: dict[str, Any] = {
-        "rotation": Rotation.from_matrix(turn).as_rotvec().tolist(),
+        "rotation": vectors_from_rotations(turn).tolist(),
         "translation": shift.tolist(),
         "camera": block.cameras[image.camera].name,
         "orientation": 1,
@@ -164,7 +167,7 @@ def _rigs(block: Block, rig: BlockRig, suffix: str) -> tuple[dict[str, Any], dic
         turn, shift = rig_pose(rig, camera)
         places[camera] = (turn, shift)
         heads[block.cameras[camera].name] = {
-            "rotation": Rotation.from_matrix(turn).as_rotvec().tolist(),
+            "rotation": vectors_from_rotations(turn).tolist(),
             "translation": shift.tolist(),
         }
     instances: dict[str, Any] = {}
@@ -174,7 +177,7 @@ def _rigs(block: Block, rig: BlockRig, suffix: str) -> tuple[dict[str, Any], dic
             turn, shift = vision_pose(image.rotation, image.centre_m)
             head_turn, head_shift = places[image.camera]
             instances[name] = {
-                "rotation": Rotation.from_matrix(head_turn.T @ turn).as_rotvec().tolist(),
+                "rotation": vectors_from_rotations(head_turn.T @ turn).tolist(),
                 "translation": (head_turn.T @ (shift - head_shift)).tolist(),
                 "rig_camera_ids": {},
             }
@@ -220,7 +223,7 @@ def _block_of(file: Path, content: Mapping[str, Any]) -> Block:
             raise BlockError(
                 f"{file}: shot {name} names camera {shot['camera']}, which is not there"
             )
-        turn = Rotation.from_rotvec(_numbers(shot["rotation"])).as_matrix()
+        turn = rotations_from_vectors(np.array(_numbers(shot["rotation"])))
         rotation, centre = camera_pose(turn, np.array(_numbers(shot["translation"])))
         camera = names.index(shot["camera"])
         images.append(BlockImage(name, camera, frames.get(name, number), centre, rotation))

@@ -13,8 +13,7 @@ from contextlib import closing
 from datetime import UTC, datetime
 from pathlib import Path
 
-from pyproj import CRS
-
+from daemon.orientation.geodesy import CRS
 from daemon.postflight.export.gis_layers import GisFeature, GisLayer, Kind, Places
 from daemon.postflight.export.qgis_styles import style_of
 

@@ -12,8 +12,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pyproj import Transformer
-
 from daemon.mission.exposure_batch import ExposureFailure, for_each_exposure
 from daemon.mission.layout import Mission, exposure_name
 from daemon.mission.store.direct_io import create_file
@@ -23,6 +21,7 @@ from daemon.mission.store.level2 import verdict_of
 from daemon.mission.store.publication import published
 from daemon.orientation.exterior_orientation import ExteriorOrientation, sealed_exposures
 from daemon.orientation.footprints import footprint, polygon
+from daemon.orientation.geodesy import GEOGRAPHIC, Transformer
 from daemon.orientation.orientation_inputs import OrientationError, read_orientation_inputs
 from daemon.orientation.stac_items import (
     EXTENSIONS,
@@ -205,7 +204,7 @@ def _orthoimage(mission: Mission, path: Path, items: Sequence[Mapping[str, Any]]
             f"{path}: has no EPSG code or no transform, so it is no orthoimage; move it away"
         )
     west, south, east, north = asset["proj:bbox"]
-    to_wgs84 = Transformer.from_crs(asset["proj:code"], "EPSG:4326", always_xy=True)
+    to_wgs84 = Transformer.from_crs(asset["proj:code"], GEOGRAPHIC, always_xy=True)
     ring = [
         (float(x), float(y))
         for x, y in (

@@ -13,10 +13,9 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from pyproj import CRS
-from pyproj.exceptions import CRSError, ProjError
 
 from daemon.mission.foreign_files import ForeignFileError, read_regular_file
+from daemon.orientation.geodesy import CRS, CRSError, ProjError
 from daemon.orientation.georeference import GeoreferenceError, accurate_transformer
 from daemon.orientation.local_frame import LocalFrame
 from daemon.postflight.adjustment.csv_tables import read_table
