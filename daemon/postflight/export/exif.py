@@ -20,9 +20,12 @@ _GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC)
 _ASCII, _SHORT, _LONG, _RATIONAL, _BYTE, _UNDEFINED = 2, 3, 4, 5, 1, 7
 _SIZE = {_ASCII: 1, _SHORT: 2, _LONG: 4, _RATIONAL: 8, _BYTE: 1, _UNDEFINED: 1}
 _MAX_SEGMENT_NBYTES = 65_533
-_EXIF_IFD, _GPS_IFD = 0x8769, 0x8825
+EXIF_IFD, GPS_IFD = 0x8769, 0x8825
+"""Tags of the pointers to the directories of EXIF and of the position."""
 
 Value = bytes | int | tuple[Fraction, ...]
+Entries = list[tuple[int, int, Value]]
+"""Tag, type and value."""
 
 
 FULL_FRAME_DIAGONAL_MM = 43.266615
@@ -82,6 +85,11 @@ class PictureMetadata:
     lens_serial: str = ""
     is_perspective: bool = True
 
+    @property
+    def utc_text(self) -> str:
+        """UTC to the second, as EXIF writes it."""
+        return f"{utc_of(self.gps_ns)[0]:%Y:%m:%d %H:%M:%S}"
+
 
 def utc_of(gps_ns: int) -> tuple[datetime, int]:
     """UTC of a GPS instant, whole seconds, and the nanoseconds beyond."""
@@ -93,18 +101,23 @@ def utc_of(gps_ns: int) -> tuple[datetime, int]:
 
 def exif_bytes(shot: PictureMetadata) -> bytes:
     """The TIFF structure of an Exif segment, little-endian."""
+    return _tiff(*exif_entries(shot))
+
+
+def exif_entries(shot: PictureMetadata) -> tuple[Entries, Entries, Entries]:
+    """Entries of the main directory, of that of EXIF, and of that of the position."""
     instant, beyond_ns = utc_of(shot.gps_ns)
-    stamp = _text(instant.strftime("%Y:%m:%d %H:%M:%S"))
+    stamp = _text(shot.utc_text)
     decimals = _text(f"{beyond_ns // 1000:06d}")
     per_cm = _rational(10.0 / (shot.pixel_um * 1e-3))
-    main: list[tuple[int, int, Value]] = [
+    main: Entries = [
         (0x010E, _ASCII, _text(shot.remark)),
         (0x010F, _ASCII, _text("Syntopic")),
         (0x0110, _ASCII, _text(shot.camera)),
         (0x0131, _ASCII, _text("Syntopic")),
         (0x0132, _ASCII, stamp),
     ]
-    detail: list[tuple[int, int, Value]] = [
+    detail: Entries = [
         (0x9000, _UNDEFINED, b"0232"),
         (0x9101, _UNDEFINED, bytes([1, 2, 3, 0])),
         (0x9003, _ASCII, stamp),
@@ -133,7 +146,7 @@ def exif_bytes(shot: PictureMetadata) -> bytes:
     if shot.serial:
         detail.append((0xA431, _ASCII, _text(shot.serial)))
     second = Fraction(instant.second * 1_000_000 + beyond_ns // 1000, 1_000_000)
-    gps: list[tuple[int, int, Value]] = [
+    gps: Entries = [
         (0x0000, _BYTE, bytes([2, 3, 0, 0])),
         (0x0001, _ASCII, _text("N" if shot.latitude_deg >= 0 else "S")),
         (0x0002, _RATIONAL, _sexagesimal(shot.latitude_deg)),
@@ -149,7 +162,7 @@ def exif_bytes(shot: PictureMetadata) -> bytes:
     ]
     if shot.position_sigma_m is not None:
         gps.append((0x001F, _RATIONAL, (_rational(shot.position_sigma_m),)))
-    return _tiff(main, detail, gps)
+    return main, detail, gps
 
 
 def with_metadata(jpeg: bytes, shot: PictureMetadata) -> bytes:
@@ -177,19 +190,19 @@ def _tiff(
     gps: Sequence[tuple[int, int, Value]],
 ) -> bytes:
     """Header and three directories, one behind the other."""
-    at = 8 + _length([*main, (_EXIF_IFD, _LONG, 0), (_GPS_IFD, _LONG, 0)])
+    at = 8 + _length([*main, (EXIF_IFD, _LONG, 0), (GPS_IFD, _LONG, 0)])
     second = at + _length(detail)
-    first = _directory([*main, (_EXIF_IFD, _LONG, at), (_GPS_IFD, _LONG, second)], 8)
+    first = directory_bytes([*main, (EXIF_IFD, _LONG, at), (GPS_IFD, _LONG, second)], 8)
     return (
         struct.pack("<2sHI", b"II", 42, 8)
         + first
-        + _directory(detail, at)
-        + _directory(gps, second)
+        + directory_bytes(detail, at)
+        + directory_bytes(gps, second)
     )
 
 
-def _directory(entries: Sequence[tuple[int, int, Value]], offset: int) -> bytes:
-    """One IFD with its values behind it, entries by tag as the standard requires."""
+def directory_bytes(entries: Sequence[tuple[int, int, Value]], offset: int) -> bytes:
+    """One IFD at an offset with its values behind it, by tag as the standard requires."""
     ordered = sorted(entries, key=lambda entry: entry[0])
     beyond = offset + 2 + 12 * len(ordered) + 4
     table, data = struct.pack("<H", len(ordered)), b""
@@ -206,7 +219,7 @@ def _directory(entries: Sequence[tuple[int, int, Value]], offset: int) -> bytes:
 
 
 def _length(entries: Sequence[tuple[int, int, Value]]) -> int:
-    return len(_directory(entries, 0))
+    return len(directory_bytes(entries, 0))
 
 
 def _raw(kind: int, value: Value) -> bytes:

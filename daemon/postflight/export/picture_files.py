@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from daemon.mission.store.durable import new_file, sync_file
 from daemon.mission.store.level0 import refuse_decompression_bomb
 from daemon.mission.store.level2 import jpeg_bytes
+from daemon.postflight.export.embedded_exif import append_to_jp2, embed_in_tiff, placeholders
 from daemon.postflight.export.exif import PictureMetadata, metadata_texts
 from daemon.postflight.export.xmp_packet import xmp_bytes
 from drivers.base.extras import require
@@ -112,12 +113,16 @@ def write_raster(
         ) as raster:  # fmt: skip
             raster.write(planes)
             raster.colorinterp = [getattr(ColorInterp, name) for name in interpretation]
-            raster.update_tags(**metadata_texts(shot))
+            raster.update_tags(**metadata_texts(shot), **placeholders(shot))
             raster.update_tags(ns="xml:XMP", **{"xml:XMP": xmp_bytes(shot).decode()})
             for number, band in enumerate(shot.bands, 1):
                 raster.set_band_description(number, band)
         with memory.open() as raster, new_file(final) as part:
             copy(raster, str(part), **options)
+            if kind == "jp2":
+                append_to_jp2(part, shot)
+            else:
+                embed_in_tiff(part, shot)
             # What JPEG 2000 cannot hold (control points, names and interpretation of bands)
             # GDAL writes next to the file, named after it.
             sidecar = part.with_name(part.name + SIDECAR)

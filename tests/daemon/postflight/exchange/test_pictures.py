@@ -14,12 +14,25 @@ from typer.testing import CliRunner
 
 from daemon.cli import app
 from daemon.mission.store.level0 import read_description
+from daemon.postflight.export.embedded_exif import (
+    EmbeddedExifError,
+    append_to_jp2,
+    embed_in_tiff,
+)
+from daemon.postflight.export.exif import PictureMetadata
+from sim_hw.world.true_camera import projection_centre_m
 from tests.daemon.postflight.exchange.flown_block import FLIGHT, FlownBlock, fly
 
 rasterio = pytest.importorskip("rasterio", reason="pip install 'syntopic[geotiff]'")
 pytestmark = pytest.mark.peer
 
 RUN = CliRunner()
+SHOT = PictureMetadata(
+    camera="camera", serial="", name="picture", gps_ns=1_448_000_000_000_000_000, latitude_deg=47.0,
+    longitude_deg=15.0, height_m=900.0, position_sigma_m=None, f_mm=70.0, pixel_um=6.0,
+    exposure_time_s=None, yaw_pitch_roll_deg=(0.0, 0.0, 0.0), omega_phi_kappa_deg=(0.0, 0.0, 0.0),
+    centre_m=(0.0, 0.0, 0.0), crs="EPSG:32633", remark="",
+)  # fmt: skip
 RIG_LINES = 'serial = "UCL-0815"\n'
 
 
@@ -124,8 +137,9 @@ def test_a_jpeg_states_that_near_infrared_is_left_out(stitched) -> None:
     assert "without" not in cir["IFD0:ImageDescription"]
 
 
-def test_exiftool_reads_every_tag_of_a_stitched_picture(stitched) -> None:
-    files = export(stitched, "jpeg", "--attitude-sigma", "5", "6", "8")
+@pytest.mark.parametrize("kind", ["jpeg", "cog", "tiff", "jp2"])
+def test_exiftool_reads_every_tag_of_a_stitched_picture(stitched, kind) -> None:
+    files = export(stitched, kind, "--attitude-sigma", "5", "6", "8")
     found = tags(files["000001_pan"])
     assert not [key for key in found if "Warning" in key or "Error" in key]
     virtual = stitched.rig.virtual_image
@@ -156,8 +170,40 @@ def test_exiftool_reads_every_tag_of_a_stitched_picture(stitched) -> None:
     }
     for key, value in expected.items():
         assert found.get(key) == value, (key, found.get(key))
+    place = [found[f"GPS:GPS{name}"] for name in ("Latitude", "Longitude", "Altitude")]
+    truth = FLIGHT.geodetic(projection_centre_m(stitched.rig.cone(stitched.rig.master_cone), pose))
+    assert place == pytest.approx(truth, abs=1e-3)
     # A trajectory as CSV states no accuracy: none is written.
     assert not [key for key in found if "GPSXYAccuracy" in key or "RtkStd" in key]
+
+
+@pytest.mark.parametrize("kind", ["cog", "tiff", "jp2"])
+def test_exif_of_rasters_is_that_of_the_jpeg(stitched, kind) -> None:
+    jpeg = tags(export(stitched, "jpeg")["000001_pan"])
+    found = tags(export(stitched, kind)["000001_pan"])
+    assert not [key for key in found if "Warning" in key or "Error" in key]
+    own = {k: v for k, v in jpeg.items() if k.split(":")[0] in ("ExifIFD", "GPS")}
+    assert len(own) >= 25 and {k: found.get(k) for k in own} == own
+    for key in ("Make", "Model", "ImageDescription", "Software", "ModifyDate"):
+        assert found[f"IFD0:{key}"] == jpeg[f"IFD0:{key}"], key
+
+
+def test_exif_has_no_place_in_other_files(tmp_path) -> None:
+    path = tmp_path / "plain.tif"
+    shot = SHOT
+    for options, sentence in (
+        ({"bigtiff": True}, "no classic TIFF"),
+        ({"byteorder": ">"}, "no classic TIFF"),
+        ({}, "no entry"),
+    ):
+        tifffile.imwrite(path, np.zeros((8, 8), np.uint16), **options)
+        before = path.read_bytes()
+        with pytest.raises(EmbeddedExifError, match=sentence):
+            embed_in_tiff(path, shot)
+        assert path.read_bytes() == before
+    path.write_bytes(b"\0\0\0\x0cjP  \r\n\x87\n\0\0\0\0jp2c\xff\x4f")
+    with pytest.raises(EmbeddedExifError, match="no length"):
+        append_to_jp2(path, shot)
 
 
 def test_heads_have_rig_tags_of_multi_band_readers(tmp_path) -> None:
