@@ -118,7 +118,7 @@ class FaultLatches:
         elif kind == "disk-health":
             fault = f"health of disk {event.get('disk')}"
             if event.get("fault"):
-                self.raise_fault(fault, sentence, fault, sequence=sequence)
+                self.raise_fault(fault, sentence, f"disk {event.get('disk')}", sequence=sequence)
             else:
                 self.clear_fault(fault)
         elif kind in ("disk-joined", "disk-released"):

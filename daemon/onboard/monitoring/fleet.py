@@ -20,6 +20,7 @@ from daemon.onboard.monitoring.client.telemetry_client import (
     ServiceAddress,
     telemetry_records,
 )
+from daemon.onboard.monitoring.server_messages import with_messages
 from daemon.onboard.monitoring.web.page_files import PAGE, add_security_headers
 
 BYTES_PER_S = 4000.0
@@ -136,7 +137,7 @@ def create_fleet_app(members: Sequence[FleetMember]) -> FastAPI:
     @app.get("/api/v1/fleet")
     async def fleet() -> dict[str, Any]:
         """The state of each aircraft, and all alarms."""
-        return fleet_json(members, time.monotonic())
+        return dict(with_messages(fleet_json(members, time.monotonic())))
 
     @app.get("/")
     async def page() -> FileResponse:

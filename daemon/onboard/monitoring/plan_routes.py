@@ -11,6 +11,7 @@ from fastapi.params import Depends
 from daemon.onboard.monitoring.coverage import Coverage, advice_json
 from daemon.onboard.monitoring.flight_state import FlightState
 from daemon.onboard.monitoring.remaining import remaining_json
+from daemon.onboard.monitoring.server_messages import with_messages
 from daemon.planning import reflight_files
 
 ReflightFile = Literal["fly-again.geojson", "fly-again.kml", "fly-again.waypoints", "fly-again.csv"]
@@ -48,17 +49,15 @@ def add_plan(app: FastAPI, state: FlightState, coverage: Coverage, watcher: Depe
     @app.get("/api/v1/triangulation", dependencies=[watcher], tags=["plan"])
     async def triangulation() -> dict[str, Any]:
         """The live triangulation: accuracy, drifts, findings, what to fly again; empty if off."""
-        return state.triangulation()
+        return dict(with_messages(state.triangulation()))
 
     @app.get("/api/v1/advice", dependencies=[watcher], tags=["plan"])
     async def advice() -> dict[str, Any]:
         """Insufficient coverage of the plan: gaps, and segments still to be flown."""
         advice_task = coverage.advice_task()
-        return (
-            {}
-            if advice_task is None
-            else advice_json(await asyncio.to_thread(advice_task), coverage)
-        )
+        if advice_task is None:
+            return {}
+        return dict(with_messages(advice_json(await asyncio.to_thread(advice_task), coverage)))
 
     @app.get(
         "/api/v1/advice/{file}",

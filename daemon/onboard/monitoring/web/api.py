@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +18,7 @@ from typing import Annotated, Any, Literal
 from fastapi import Depends, FastAPI, HTTPException, Query, Request, Response, WebSocket
 from fastapi import Path as PathParameter
 from fastapi.exceptions import RequestValidationError
-from fastapi.responses import FileResponse, JSONResponse, PlainTextResponse
+from fastapi.responses import FileResponse, PlainTextResponse
 from fastapi.staticfiles import StaticFiles
 from pydantic import BaseModel
 from starlette.exceptions import HTTPException as StarletteHTTPException
@@ -41,17 +41,22 @@ from daemon.onboard.monitoring.map_routes import add_maps
 from daemon.onboard.monitoring.maps.map_library import MapLibrary
 from daemon.onboard.monitoring.metrics import exposition
 from daemon.onboard.monitoring.plan_routes import add_plan
+from daemon.onboard.monitoring.server_messages import message_of, with_messages
 from daemon.onboard.monitoring.telemetry import MIN_BYTES_PER_S, Subscription, packed
 from daemon.onboard.monitoring.web.connections import (
     Connections,
     source_of,
 )
 from daemon.onboard.monitoring.web.page_files import PAGE, add_security_headers
+from daemon.onboard.monitoring.web.problems import (
+    documented_problem,
+    http_problem,
+    validation_problem,
+)
 from daemon.onboard.monitoring.web.request_body import COMMAND_OPENAPI, command_body
 from daemon.onboard.monitoring.web.request_filter import bearer_token
 from daemon.onboard.monitoring.web.watch_admission import admit_watcher, connection_of
 
-PROBLEM_JSON = "application/problem+json"
 TELEMETRY_TICK_S = 0.05
 SEND_TIMEOUT_S = 5.0
 """A client that does not accept a record in this time is disconnected."""
@@ -73,20 +78,13 @@ PRODUCT_POLICY = "sandbox; default-src 'none'; style-src 'unsafe-inline'; img-sr
 """Headers of a file from a mission, so that no browser treats it as a page."""
 
 
-class Problem(BaseModel):
-    """An error, RFC 9457."""
-
-    type: str = "about:blank"
-    title: str
-    status: int
-    detail: str = ""
-
-
 class CommandResponse(BaseModel):
     """Result of a command."""
 
     done: bool
     sentence: str
+    message: dict[str, Any] | None = None
+    """Code and parameters of the sentence."""
 
 
 Number = Annotated[int, PathParameter(ge=1, lt=10**9, description="of the exposure")]
@@ -146,13 +144,13 @@ def create_app(
         title="Syntopic",
         description="State, products and commands of an aerial camera in flight.",
         version="1",
-        responses={"default": _documented_problem(), 422: _documented_problem()},
+        responses={"default": documented_problem(), 422: documented_problem()},
         docs_url=None,
         redoc_url=None,
     )
     app.middleware("http")(add_security_headers)
-    app.add_exception_handler(StarletteHTTPException, _http_problem)
-    app.add_exception_handler(RequestValidationError, _validation_problem)
+    app.add_exception_handler(StarletteHTTPException, http_problem)
+    app.add_exception_handler(RequestValidationError, validation_problem)
     access = _AccessControl(settings, gateway, connections or Connections())
     _add_state(app, state, access)
     _add_products(app, state, access)
@@ -243,12 +241,12 @@ def _add_state(app: FastAPI, state: FlightState, access: _AccessControl) -> None
     @app.get("/api/v1/state", dependencies=[watcher], tags=["state"])
     async def whole_state() -> dict[str, Any]:
         """The complete state."""
-        return state.snapshot()
+        return _mapping(state.snapshot())
 
     @app.get("/api/v1/brief", dependencies=[watcher], tags=["state"])
     async def brief_state() -> dict[str, Any]:
         """Phase, ledger, disk, clock, faults."""
-        return {"version": 1, **state.brief()}
+        return _mapping({"version": 1, **state.brief()})
 
     @app.get("/api/v1/ledger", dependencies=[watcher], tags=["state"])
     async def ledger() -> dict[str, Any]:
@@ -258,17 +256,17 @@ def _add_state(app: FastAPI, state: FlightState, access: _AccessControl) -> None
     @app.get("/api/v1/devices", dependencies=[watcher], tags=["state"])
     async def devices() -> list[dict[str, Any]]:
         """Every device, whether it delivers, what helps if not, and its counters."""
-        return state.devices()
+        return _listed(state.devices())
 
     @app.get("/api/v1/faults", dependencies=[watcher], tags=["state"])
     async def faults() -> list[dict[str, Any]]:
         """Active faults, and cleared ones that are not acknowledged."""
-        return state.faults()
+        return _listed(state.faults())
 
     @app.get("/api/v1/events", dependencies=[watcher], tags=["state"])
     async def events(after: Annotated[int, Query(ge=0, lt=2**53)] = 0) -> list[dict[str, Any]]:
         """What happened, oldest first, after a sequence number."""
-        return state.changed("events", after)
+        return _listed(state.changed("events", after))
 
     @app.get(
         "/api/v1/configuration",
@@ -319,7 +317,7 @@ def _add_products(app: FastAPI, state: FlightState, access: _AccessControl) -> N
         limit: Annotated[int, Query(ge=1, le=EXPOSURES_MAX)] = 100,
     ) -> list[dict[str, Any]]:
         """Exposures by number."""
-        return state.exposures(after, limit)
+        return _listed(state.exposures(after, limit))
 
     @app.get("/api/v1/footprints", dependencies=[watcher], tags=["exposures"])
     async def footprints() -> list[dict[str, Any]]:
@@ -332,7 +330,7 @@ def _add_products(app: FastAPI, state: FlightState, access: _AccessControl) -> N
         found = state.exposure(number)
         if found is None:
             raise HTTPException(404, f"exposure {number} is not known")
-        return found
+        return _mapping(found)
 
     @app.get(
         "/api/v1/exposures/{number}/{product}",
@@ -357,7 +355,12 @@ def _add_commands(
 ) -> None:
     principal = Depends(access.command)
 
-    @app.post("/api/v1/commands/{name}", tags=["commands"], openapi_extra=COMMAND_OPENAPI)
+    @app.post(
+        "/api/v1/commands/{name}",
+        tags=["commands"],
+        openapi_extra=COMMAND_OPENAPI,
+        response_model_exclude_none=True,
+    )
     async def command(
         name: CommandName, request: Request, by: Principal = principal
     ) -> CommandResponse:
@@ -389,7 +392,8 @@ def _add_commands(
             state.acknowledge(given.fault, f"{by.name} ({by.role})")
         if not answer.done:
             raise HTTPException(409, answer.sentence)
-        return CommandResponse(done=True, sentence=answer.sentence)
+        message = message_of(answer.sentence)
+        return CommandResponse(done=True, sentence=answer.sentence, message=message)
 
 
 def _add_telemetry(app: FastAPI, state: FlightState, access: _AccessControl) -> None:
@@ -427,7 +431,7 @@ async def _send(socket: WebSocket, record: Any, form: str) -> None:
     if form == "msgpack":
         await socket.send_bytes(packed(record))
     else:
-        await socket.send_json(record)
+        await socket.send_json(with_messages(record))
 
 
 async def _wait_for_disconnect(socket: WebSocket) -> None:
@@ -445,42 +449,12 @@ def _add_page(app: FastAPI) -> None:
     app.mount("/", StaticFiles(directory=PAGE, html=True), name="page")
 
 
-def _documented_problem() -> dict[str, Any]:
-    schema = Problem.model_json_schema()
-    return {"description": "what is wrong", "content": {PROBLEM_JSON: {"schema": schema}}}
+def _mapping(value: Mapping[str, Any]) -> dict[str, Any]:
+    return dict(with_messages(value))
 
 
-async def _http_problem(_request: Request, error: Exception) -> Response:
-    assert isinstance(error, StarletteHTTPException)
-    problem = Problem(
-        title=_title(error.status_code), status=error.status_code, detail=error.detail
-    )
-    headers = dict(error.headers or {})
-    return JSONResponse(problem.model_dump(), error.status_code, headers, PROBLEM_JSON)
-
-
-async def _validation_problem(_request: Request, error: Exception) -> Response:
-    assert isinstance(error, RequestValidationError)
-    sentences = [f"{'.'.join(map(str, e['loc'][1:]))}: {e['msg']}" for e in error.errors()]
-    problem = Problem(title=_title(422), status=422, detail="; ".join(sentences))
-    return JSONResponse(problem.model_dump(), 422, media_type=PROBLEM_JSON)
-
-
-def _title(status: int) -> str:
-    titles: Mapping[int, str] = {
-        401: "Not known here",
-        403: "Not allowed",
-        404: "Not found",
-        405: "No such method",
-        408: "Too slow",
-        409: "Not possible now",
-        413: "Too large",
-        415: "Not JSON",
-        422: "Not understood",
-        429: "Too many attempts",
-        504: "No answer",
-    }
-    return titles.get(status, "Not done")
+def _listed(values: Sequence[Any]) -> list[dict[str, Any]]:
+    return list(with_messages(values))
 
 
 def _address(http: HTTPConnection) -> str:

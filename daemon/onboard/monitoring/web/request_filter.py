@@ -15,6 +15,7 @@ from http import HTTPStatus
 from typing import Any
 from urllib.parse import urlsplit
 
+from daemon.onboard.monitoring.server_messages import with_message
 from daemon.onboard.monitoring.web.connections import (
     REQUESTS_PER_CONNECTION,
     ClientConnection,
@@ -183,6 +184,7 @@ async def _refuse(scope: Scope, send: Send, status: int, detail: str) -> None:
         return
     title = HTTPStatus(status).phrase
     problem = {"type": "about:blank", "title": title, "status": status, "detail": detail}
+    problem = with_message(problem, "detail")
     headers = [(b"content-type", b"application/problem+json"), (b"connection", b"close")]
     await send({"type": "http.response.start", "status": status, "headers": headers})
     await send({"type": "http.response.body", "body": json.dumps(problem).encode()})

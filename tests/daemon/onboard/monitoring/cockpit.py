@@ -15,7 +15,7 @@ import numpy as np
 from daemon.onboard.service.messages import ServiceEvent
 from tests.daemon.onboard.monitoring import flight_events
 from tests.daemon.onboard.monitoring.guidance_frames import guidance_frame
-from tests.daemon.onboard.monitoring.test_page import WITHIN_S, Service
+from tests.daemon.onboard.monitoring.page_service import WITHIN_S, Service
 from tests.support.browser import Browser
 from tests.support.npm import npm_package
 

@@ -31,7 +31,7 @@ from tests.daemon.onboard.monitoring.cockpit import (
     save_picture,
 )
 from tests.daemon.onboard.monitoring.guidance_frames import aerial_map, vector_map
-from tests.daemon.onboard.monitoring.test_page import WITHIN_S, Service
+from tests.daemon.onboard.monitoring.page_service import WITHIN_S, Service
 from tests.support.browser import Browser, chromium
 
 EXPOSURES = ["good", "good", "usable", "good", "good", "refly", "good", "good", "good"]

@@ -14,7 +14,7 @@ from daemon.onboard.flight.flag_table import FLAG_TABLE
 from daemon.onboard.monitoring.web.page_files import PAGE
 
 LANGUAGES = ("en", "de", "fr", "es", "zh")
-CATALOGS = ("page", "map", "alarm", "landing")
+CATALOGS = ("page", "map", "alarm", "landing", "server")
 PLURALS = (".one", ".other")
 OWN_ALARMS = ("alarm.page.",)
 """Alarms that the page raises; their text is in the catalog only."""

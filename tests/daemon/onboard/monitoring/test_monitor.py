@@ -13,7 +13,7 @@ from daemon.cli import app
 from daemon.cli.monitor import _MonitorState
 from daemon.terminal.console import Console
 from tests.daemon.onboard.monitoring import flight_events
-from tests.daemon.onboard.monitoring.test_page import Service
+from tests.daemon.onboard.monitoring.page_service import Service
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from tests.daemon.onboard.monitoring import flight_events
-from tests.daemon.onboard.monitoring.test_page import WITHIN_S, Service
+from tests.daemon.onboard.monitoring.page_service import WITHIN_S, Service
 from tests.support.browser import Browser, chromium
 
 

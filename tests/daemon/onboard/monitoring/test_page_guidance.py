@@ -16,8 +16,8 @@ from daemon.mission.store.level0 import tiff_parts
 from processing.rig import shipped_rigs
 from tests.daemon.onboard.monitoring import flight_events
 from tests.daemon.onboard.monitoring.guidance_frames import guidance_frame, vector_map
+from tests.daemon.onboard.monitoring.page_service import WITHIN_S, Service
 from tests.daemon.onboard.monitoring.test_base_maps import geotiff
-from tests.daemon.onboard.monitoring.test_page import WITHIN_S, Service
 from tests.support.browser import Browser, chromium
 
 LINES = {"A1": [[15.43, 47.07], [15.43, 47.08]], "A2": [[15.434, 47.08], [15.434, 47.07]]}

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from tests.daemon.onboard.monitoring import flight_events
-from tests.daemon.onboard.monitoring.test_page import WITHIN_S, Service
+from tests.daemon.onboard.monitoring.page_service import WITHIN_S, Service
 from tests.support.browser import Browser, chromium
 
 STEPS = "document.querySelector('[data-step={}]')?.innerText.includes({})"

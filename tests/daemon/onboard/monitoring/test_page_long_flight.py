@@ -9,7 +9,7 @@ import pytest
 from daemon.onboard.monitoring import flight_state
 from daemon.onboard.monitoring.flight_state import FlightState
 from tests.daemon.onboard.monitoring import flight_events
-from tests.daemon.onboard.monitoring.test_page import WITHIN_S, Service
+from tests.daemon.onboard.monitoring.page_service import WITHIN_S, Service
 from tests.support.browser import Browser, chromium
 
 OLDER = """(async () => {{

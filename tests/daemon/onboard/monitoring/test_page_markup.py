@@ -15,7 +15,7 @@ import pytest
 from daemon.onboard.service.messages import ServiceEvent
 from processing.rig import shipped_rigs
 from tests.daemon.onboard.monitoring import flight_events
-from tests.daemon.onboard.monitoring.test_page import WITHIN_S, Service
+from tests.daemon.onboard.monitoring.page_service import WITHIN_S, Service
 from tests.support.browser import Browser, chromium
 
 pytestmark = pytest.mark.trust

@@ -14,7 +14,7 @@ import pytest
 from daemon.onboard.monitoring.web.page_files import PAGE
 from tests.daemon.onboard.monitoring import flight_events
 from tests.daemon.onboard.monitoring.guidance_frames import guidance_frame
-from tests.daemon.onboard.monitoring.test_page import WITHIN_S, Service
+from tests.daemon.onboard.monitoring.page_service import WITHIN_S, Service
 from tests.support.browser import Browser, chromium
 
 LINES = {"A1": [[15.43, 47.07], [15.43, 47.08]], "A2": [[15.434, 47.08], [15.434, 47.07]]}

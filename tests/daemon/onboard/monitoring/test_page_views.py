@@ -25,8 +25,8 @@ from tests.daemon.onboard.monitoring.cockpit import (
     save_picture,
 )
 from tests.daemon.onboard.monitoring.guidance_frames import guidance_frame
+from tests.daemon.onboard.monitoring.page_service import WITHIN_S, Service
 from tests.daemon.onboard.monitoring.test_fleet import checksum, member
-from tests.daemon.onboard.monitoring.test_page import WITHIN_S, Service
 from tests.support.browser import Browser, chromium
 
 

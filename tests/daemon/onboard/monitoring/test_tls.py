@@ -19,8 +19,8 @@ from daemon.onboard.monitoring.access.certificate_authority import issue_certifi
 from daemon.onboard.service.messages import Stop
 from daemon.onboard.service.processes import ChildProcess
 from tests.daemon.onboard.monitoring import flight_events
+from tests.daemon.onboard.monitoring.page_service import Service
 from tests.daemon.onboard.monitoring.test_certificates import expire, self_signed
-from tests.daemon.onboard.monitoring.test_page import Service
 
 pytestmark = pytest.mark.trust
 RENEWED_WITHIN_S = 30.0

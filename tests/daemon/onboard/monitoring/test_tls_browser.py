@@ -15,7 +15,7 @@ import pytest
 
 from daemon.onboard.monitoring.access.certificate_authority import issue_certificate
 from tests.daemon.onboard.monitoring import flight_events
-from tests.daemon.onboard.monitoring.test_page import WITHIN_S, Service
+from tests.daemon.onboard.monitoring.page_service import WITHIN_S, Service
 from tests.support.browser import Browser, chromium
 from tests.support.namespaces import Host, two_hosts
 

@@ -1,7 +1,7 @@
 // Alarms: faults of the service and alarms of the page, by severity; acknowledged, shelved, silenced.
 
 import { by, button, element, redraw } from "./dom.js";
-import { knows, locale, serverText, t } from "./i18n.js";
+import { knows, locale, serverLanguage, serverText, t } from "./i18n.js";
 import { clock, span } from "./format.js";
 import { setBadge } from "./tabs.js";
 import { isSoundOn, setSound, soundFor, unlockSound } from "./alarm_sound.js";
@@ -40,7 +40,7 @@ function ofFault(fault, nowNs) {
   return {
     id: fault.id, code: fault.code || "", severity: fault.severity || "warning", device: fault.device, isService: true,
     isActive: fault.stands, isAcknowledged: fault.acknowledged, by: fault.acknowledged_by || "", count: fault.count,
-    isPrevious: fault.previous, detail: serverText(fault), ageS: secondsSince(nowNs, fault.raised_mono_ns),
+    isPrevious: fault.previous, detail: serverText(fault), detailLanguage: serverLanguage(fault), ageS: secondsSince(nowNs, fault.raised_mono_ns),
     clearedS: secondsSince(nowNs, fault.cleared_mono_ns), untilMs: shelved.get(fault.id) ?? null, aircraft: fault.aircraft || "",
   };
 }
@@ -48,7 +48,7 @@ function ofFault(fault, nowNs) {
 function ofPage(alarm) {
   return {
     id: `page ${alarm.code}`, code: alarm.code, severity: alarm.severity, device: "", isService: false, isActive: true,
-    isAcknowledged: alarm.isAcknowledged, by: "", count: 1, isPrevious: false, detail: t(`alarm.${alarm.code}.text`, alarm.params),
+    isAcknowledged: alarm.isAcknowledged, by: "", count: 1, isPrevious: false, detail: t(`alarm.${alarm.code}.text`, alarm.params), detailLanguage: locale,
     ageS: (Date.now() - alarm.sinceMs) / 1000, clearedS: null, untilMs: shelved.get(`page ${alarm.code}`) ?? null, aircraft: "",
   };
 }
@@ -64,9 +64,13 @@ export function listAlarms(feed) {
     .sort(([a], [b]) => a[0] - b[0] || a[1] - b[1] || a[2] - b[2] || a[3] - b[3] || a[4] - b[4]).map(([, one]) => one);
 }
 
+// Names of devices are names; parts of the service have none that the name of the alarm does not say.
+const PARTS = new Set(["service", "disk", "power", "exposures", "guidance", "triangulation"]);
+const deviceText = (name) => PARTS.has(name) ? "" : name.replace(/^disk (.+)$/, (_, disk) => t("disk.name", { disk }));
+
 const titleOf = (alarm) => {
   const name = knows(`alarm.${alarm.code}`) ? t(`alarm.${alarm.code}`) : "";
-  const where = [alarm.aircraft, alarm.device].filter(Boolean).join(" ");
+  const where = [alarm.aircraft, deviceText(alarm.device)].filter(Boolean).join(" ");
   return [name, where].filter(Boolean).join(": ") || alarm.id;
 };
 
@@ -118,7 +122,7 @@ function item(alarm, feed) {
   const created = element("li", { className: `${alarm.isActive ? "active" : "cleared"} ${alarm.severity}`, dataset: { fault: alarm.id } },
     element("div", {}, element("strong", { textContent: `${labelOf(alarm)} · ${titleOf(alarm)}` }),
       element("span", { className: "about", textContent: stateText(alarm) })),
-    element("div", { lang: alarm.isService ? "en" : locale, textContent: alarm.detail }));
+    element("div", { lang: alarm.detailLanguage, textContent: alarm.detail }));
   created.append(...explanation(alarm));
   const buttons = shelfButtons(alarm, feed);
   if (!alarm.isAcknowledged) {

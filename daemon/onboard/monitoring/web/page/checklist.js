@@ -1,7 +1,7 @@
 // Before the flight: what a flight needs, item by item with a live lamp, and a test exposure with the setting it suggests.
 
 import { by, button, element, redraw } from "./dom.js";
-import { t } from "./i18n.js";
+import { serverText, t } from "./i18n.js";
 import { bytes, number, percent } from "./format.js";
 import { fetchJson } from "./http.js";
 import { lampStates } from "./lamps.js";
@@ -75,7 +75,7 @@ function items(feed) {
   listed.push(plan?.lines ? { name: "plan", state: "good", text: t("check.plan", { n: plan.lines.length }) }
     : { name: "plan", state: "off", text: t("check.no_plan") });
   for (const fault of brief.faults.filter((one) => one.code === "prerequisite" && one.stands)) {
-    listed.push({ name: fault.id, state: "caution", text: fault.sentence });
+    listed.push({ name: fault.id, state: "caution", text: serverText(fault) });
   }
   const verdict = test && feed.flight.exposures.get(test.number)?.verdict;
   const VERDICTS = { good: "good", usable: "caution", refly: "warning" };

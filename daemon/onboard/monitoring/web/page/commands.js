@@ -1,7 +1,7 @@
 // Commands: sent with an access token; the answer is shown as one sentence.
 
 import { flight } from "./telemetry.js";
-import { serverText, t } from "./i18n.js";
+import { serverText, serverTexts, t } from "./i18n.js";
 
 const answer = document.getElementById("answer");
 const ANSWER_MS = 15000;
@@ -28,8 +28,8 @@ export async function requestToken() {
 
 // The reason for an override. The dialog lists each missing item with its corrective action.
 function requestReason(refusal) {
-  const missing = flight.brief?.status?.missing;
-  document.getElementById("missing-items").replaceChildren(...(missing?.length ? missing : [refusal]).map((one) =>
+  const missing = serverTexts(flight.brief?.status || {}, "missing");
+  document.getElementById("missing-items").replaceChildren(...(missing.length ? missing : [refusal]).map((one) =>
     Object.assign(document.createElement("li"), { textContent: one })));
   return openDialog("ask-override", "reason");
 }
@@ -73,9 +73,10 @@ export async function command(name, body = {}) {
     showAnswer(t("command.done", { sentence: serverText(result) }), false);
     return true;
   }
-  showAnswer(`${result.title}: ${serverText({ ...result, sentence: result.detail })}`, true);
+  const detail = serverText(result, result.detail);
+  showAnswer(`${serverText({ message: result.title_message }, result.title)}: ${detail}`, true);
   if (response.status !== 409 || !result.detail.includes("override")) return false;
-  const reason = await requestReason(result.detail);
+  const reason = await requestReason(detail);
   return reason ? command(name, { ...body, override: true, reason }) : false;
 }
 

@@ -1,7 +1,7 @@
 // Devices by kind, disks, and temperatures.
 
 import { by, element, redraw } from "./dom.js";
-import { knows, t } from "./i18n.js";
+import { knows, serverText, serverTexts, t } from "./i18n.js";
 import { temperature } from "./format.js";
 import { fetchJson } from "./http.js";
 import { confirmCommand } from "./commands.js";
@@ -31,7 +31,7 @@ function deviceItem(device) {
     element("span", { textContent: DEVICE_MARKS[device.state] || "○", ariaHidden: "true" }),
     element("span", { textContent: device.name }),
     element("span", { className: "detail", textContent:
-      device.state === "ready" ? stateText("ready") : `${stateText(device.state)}. ${device.sentence}` }),
+      device.state === "ready" ? stateText("ready") : `${stateText(device.state)}. ${serverText(device)}` }),
     element("span", { className: "counters", textContent: countersText(device.name) }));
 }
 
@@ -64,8 +64,8 @@ function diskItem(disk, isMirrored) {
   if (disk.exposures_to_copy) details.push(t("disk.to_copy", { n: disk.exposures_to_copy }));
   if (disk.temperature_c != null) details.push(temperature(disk.temperature_c, 0));
   if (disk.wear_percent != null) details.push(t("disk.wear", { percent: disk.wear_percent }));
-  if (disk.problems) details.push(...disk.problems);
-  if (disk.sentence) details.push(disk.sentence);
+  if (disk.problems) details.push(...serverTexts(disk, "problems"));
+  if (disk.sentence) details.push(serverText(disk));
   const item = element("li", { className: isUsed && disk.healthy !== false ? "ready" : "lost" },
     element("span", { textContent: isUsed ? "●" : "✖", ariaHidden: "true" }),
     element("span", { textContent: `${disk.disk} ${disk.path}` }),

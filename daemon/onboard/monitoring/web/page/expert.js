@@ -1,7 +1,7 @@
 // Values for experts, each with one line of explanation, its limit and a colour; and charts over the flight.
 
 import { by, element, redraw, text } from "./dom.js";
-import { t } from "./i18n.js";
+import { serverText, t } from "./i18n.js";
 import { angle, number, percent, sigma, speed } from "./format.js";
 import { lastWhere } from "./feed.js";
 import { presentPosition } from "./lamps.js";
@@ -14,7 +14,7 @@ const RANK = { refly: "warning", usable: "caution" };
 function judged(latest, ...flags) {
   const found = (latest?.findings || []).filter((one) => flags.includes(one.flag));
   const worst = found.some((one) => one.verdict === "refly") ? "refly" : found.some((one) => one.verdict === "usable") ? "usable" : "";
-  return worst ? { state: RANK[worst], limit: found[0].sentence } : { state: latest ? "good" : "", limit: "" };
+  return worst ? { state: RANK[worst], limit: serverText(found[0]) } : { state: latest ? "good" : "", limit: "" };
 }
 
 // Code, text, flags that judge it, and id of each value. The texts explain each in one line.

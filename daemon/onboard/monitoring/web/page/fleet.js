@@ -1,7 +1,7 @@
 // Several aircraft on one page: one row each, alarms merged. Commands are given on the page of the aircraft.
 
 import { by, element, redraw } from "./dom.js";
-import { fill, knows, t } from "./i18n.js";
+import { fill, knows, serverLanguage, serverText, t } from "./i18n.js";
 import { clock, number } from "./format.js";
 import { fetchJson } from "./http.js";
 
@@ -36,7 +36,7 @@ function alarm(one) {
   const label = one.stands ? `${one.severity === "caution" ? "▲" : "✖"} ${t(`severity.${one.severity}`)}` : `● ${t("alarm.cleared")}`;
   return element("li", { className: `${one.stands ? "active" : "cleared"} ${one.severity}` },
     element("div", {}, element("strong", { textContent: [label, one.aircraft, name, one.device].filter(Boolean).join(" · ") })),
-    element("div", { lang: "en", textContent: one.sentence }));
+    element("div", { lang: serverLanguage(one), textContent: serverText(one) }));
 }
 
 let unreachable = 0;

@@ -3,6 +3,8 @@
 export const LANGUAGES = { en: "English", de: "Deutsch", fr: "Français", es: "Español", zh: "中文" };
 const PSEUDO = "qps";
 const CATALOGS = ["page", "map", "alarm", "landing"];
+// Sentences of the service. Their English is in every record; only other languages need the catalog.
+const SERVER_CATALOG = "server";
 const PSEUDO_LETTERS = { a: "å", e: "é", i: "î", o: "ö", u: "ü", A: "Å", E: "É", I: "Î", O: "Ö", U: "Ü", n: "ñ", c: "ç" };
 
 function preferred() {
@@ -27,7 +29,8 @@ async function load(name) {
   }
 }
 
-const messages = Object.assign({}, ...await Promise.all(CATALOGS.map(load)));
+const isServerTranslated = isPseudo || locale !== "en";
+const messages = Object.assign({}, ...await Promise.all([...CATALOGS, ...(isServerTranslated ? [SERVER_CATALOG] : [])].map(load)));
 
 // Accented and a third longer, so that untranslated and clipped texts are seen. Placeholders are kept.
 function pseudo(text) {
@@ -53,11 +56,25 @@ export function t(code, parameters = {}) {
     .replace(/\{(\w+)\}/g, (whole, name) => name in parameters ? String(parameters[name]) : whole);
 }
 
-// The text of a message of the service: translated if its code is known, else its English sentence.
-export function serverText(message) {
-  return message?.code && knows(`server.${message.code}`)
-    ? t(`server.${message.code}`, message.parameters || {}) : message?.sentence ?? "";
+// The text of a message of the service; a parameter is a text, a message or a list of both. Undefined if its code is unknown.
+function messageText(message) {
+  if (typeof message === "string") return message;
+  if (Array.isArray(message)) return message.map(messageText).join("; ");
+  if (!knows(`server.${message.code}`)) return undefined;
+  const parameters = Object.entries(message.parameters).map(([name, value]) => [name, messageText(value) ?? ""]);
+  return t(`server.${message.code}`, Object.fromEntries(parameters));
 }
+
+const isTranslated = (record) => isServerTranslated && Boolean(record?.message) && knows(`server.${record.message.code}`);
+
+// The text of a record of the service: translated if it has a message, else its English sentence.
+export const serverText = (record, sentence = record?.sentence) => isTranslated(record) ? messageText(record.message) : sentence ?? "";
+
+// Texts of a list of the service, such as `missing`.
+export const serverTexts = (record, key) => (isServerTranslated && record[`${key}_messages`]?.map((one) => messageText(one))) || record[key] || [];
+
+// The language of the text of a record.
+export const serverLanguage = (record) => isTranslated(record) ? locale : "en";
 
 // Fill the elements of a document that name a code.
 export function fill(root = document) {

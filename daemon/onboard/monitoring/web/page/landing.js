@@ -1,7 +1,7 @@
 // After landing: the summary of the flight, what to fly again, and what comes next. Its data are kept when the service ends.
 
 import { by, button, element, redraw } from "./dom.js";
-import { t } from "./i18n.js";
+import { serverLanguage, serverText, t } from "./i18n.js";
 import { bytes, clock, distance, number, percent, temperature } from "./format.js";
 import { fetchJson, fetchOk } from "./http.js";
 
@@ -91,10 +91,11 @@ const commandOf = (name, path) => ({ verify: `syntopic verify ${path}`, copy: `s
   report: `syntopic report ${path}`, shutdown: "systemctl poweroff" })[name];
 const STATE_MARKS = { running: "▲", done: "●", failed: "■" };
 
-function stateOf({ state, done_bytes: done, total_bytes: total, sentence }) {
+function stateOf(action) {
+  const { state, done_bytes: done, total_bytes: total, sentence } = action;
   const share = state === "running" && total ? percent(done / total) : "";
   return [element("strong", { className: state === "failed" ? "warning" : "", textContent: `${STATE_MARKS[state]} ${t(`landing.state.${state}`, { share })}` }),
-    sentence && element("span", { lang: "en", textContent: sentence })];
+    sentence && element("span", { lang: serverLanguage(action), textContent: serverText(action) })];
 }
 
 async function saveReport() {

@@ -3,7 +3,7 @@
 import { fetchJson } from "./http.js";
 import { flight } from "./telemetry.js";
 import { drawGaps, drawPlan } from "./map.js";
-import { t } from "./i18n.js";
+import { serverTexts, t } from "./i18n.js";
 import { distance, number, percent } from "./format.js";
 import { button } from "./dom.js";
 
@@ -33,7 +33,7 @@ function shortfallsOf(one) {
 function row(one) {
   const tableRow = document.createElement("tr");
   for (const text of [one.line, one.from_m.toFixed(0), one.to_m.toFixed(0),
-    (areaOf(one) / 1e4).toFixed(2), `✖ ${[...shortfallsOf(one), ...one.reasons].join("; ")}`]) {
+    (areaOf(one) / 1e4).toFixed(2), `✖ ${[...shortfallsOf(one), ...serverTexts(one, "reasons")].join("; ")}`]) {
     const cell = document.createElement("td");
     cell.textContent = text;
     tableRow.append(cell);
@@ -54,7 +54,7 @@ async function updateAdvice() {
   coverageText.textContent = [
     t("lines.covered", { share: percent(share), length: distance(advice.planned_m) }),
     found.length ? t("lines.gaps", { n: found.length, ha: number(advice.hole_m2 / 1e4, 2) }) : t("lines.no_gap"),
-    ...advice.notes,
+    ...serverTexts(advice, "notes"),
   ].join(". ");
   // Unchanged gaps are not drawn again.
   if (gapsFound && JSON.stringify(gapsFound) === JSON.stringify(found)) return;

@@ -1,7 +1,7 @@
 // The verdict of the last exposure, with its findings; and the table of exposures.
 
 import { by, element } from "./dom.js";
-import { knows, t } from "./i18n.js";
+import { knows, serverText, t } from "./i18n.js";
 import { lastWhere } from "./feed.js";
 
 export const MARKS = { good: "●", usable: "▲", refly: "■", lost: "✖" };
@@ -13,7 +13,7 @@ export const verdictText = (word) => knows(`verdict.${word}`) ? t(`verdict.${wor
 // The sentence of the service, after the translated name of its flag.
 function findingText(finding) {
   const name = knows(`flag.${finding.flag}`) ? `${t(`flag.${finding.flag}`)}: ` : "";
-  return `${MARKS[finding.verdict] || ""} ${name}${finding.sentence}`;
+  return `${MARKS[finding.verdict] || ""} ${name}${serverText(finding)}`;
 }
 
 function drawVerdict() {
@@ -28,7 +28,7 @@ function drawVerdict() {
   container.querySelector(".mark").textContent = MARKS[word] || "·";
   container.querySelector(".word").textContent = verdictText(word);
   container.querySelector(".which").textContent = which;
-  const lost = { verdict: "lost", sentence: latest?.sentence || t("verdict.lost_text") };
+  const lost = { verdict: "lost", message: latest?.message, sentence: latest?.sentence || t("verdict.lost_text") };
   const findings = (word === "lost" ? [lost] : [...(latest?.findings || [])])
     .sort((a, b) => SEVERITY_ORDER[a.verdict] - SEVERITY_ORDER[b.verdict]);
   by("findings").replaceChildren(...findings.map((finding) =>

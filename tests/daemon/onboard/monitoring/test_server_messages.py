@@ -1,0 +1,195 @@
+"""Codes and parameters of the sentences of the service: they agree with the English catalog."""
+
+from __future__ import annotations
+
+import ast
+import itertools
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from daemon.onboard.monitoring.server_messages import (
+    CATALOG,
+    NUMBERS,
+    english,
+    message_of,
+    with_messages,
+)
+
+ROOT = Path(__file__).parents[4]
+SOURCES = (
+    *("processing/quality/evaluation.py", "processing/quality/image_findings.py"),
+    *("processing/quality/stitching_findings.py", "processing/quality/level_steps.py"),
+    *("drivers/base/device.py", "drivers/receivers/fix_monitor.py"),
+    *("drivers/cameras/aravis/byte_order.py", "drivers/thermometers/modbus_rtu/frames.py"),
+    "drivers/transport/line_errors.py",
+    *("daemon/onboard/service/command_execution.py", "daemon/onboard/service/guidance_feed.py"),
+    *("daemon/onboard/service/service.py", "daemon/onboard/service/flight_line.py"),
+    *("daemon/onboard/service/override_record.py", "daemon/onboard/storage/mirror.py"),
+    *("daemon/onboard/storage/writer.py", "daemon/onboard/timing/gps_clock.py"),
+    *("daemon/onboard/timing/ptp_time.py", "daemon/onboard/flight/arming.py"),
+    *("daemon/onboard/pipeline/worker.py", "daemon/mission/mirror/mirrored.py"),
+    *("daemon/onboard/service/landed_stage.py", "daemon/onboard/service/operator_journal.py"),
+    *("daemon/onboard/service/triangulation_link.py", "daemon/onboard/flight/fault_latches.py"),
+)
+"""What writes the sentences of findings, faults, commands and landing."""
+WORDS_MIN = 5
+PARTS = (
+    r"\wSU11|SU11\w",
+    r"^[;.,:)( ]|[:(] ?$|coverage counts as a gap$|^by their places|^by the fixed pattern",
+    r"\(common scale .*cone SU11$|^Motion blur SU11|^probe SU11 reads|^A block of",
+    r"^SU11 m SU11 the planned",
+    r"^(rejected|accepted); |^has its computed|^parity SU11|^SU11 cannot be read",
+)
+"""Parts of sentences, which are in the sentences below."""
+REFUSALS = (
+    r"^arguments of|^(interval|distance|retake) needs|^SU11 holds SU11 decisions|^start although",
+)
+"""Refusals of commands that the page does not give."""
+SENTENCES = (
+    "Head SU11 sent no image; 9% of pan has no valid pixels, which coverage counts as a gap. "
+    "Check power and cable.",
+    "12% of SU11 was not read out: it is below black; 3% of red has no valid pixels, which "
+    "coverage counts as a gap. Check head and cable.",
+    "The exposure's time is uncertain; check strobe cable and receiver. Fly it again.",
+    "Probe and stitching disagree on the temperature of cone C0: probe P1 reads 2.0 K too high, "
+    "or sensor SU11 has moved; check the probe after landing.",
+    "The frame of SU10 comes from head SU11, the frame of SU11 comes from head SU10, by the fixed "
+    "pattern of their pixels: heads or cables are exchanged, and bands or parts of the image are "
+    "wrong. Check cables, addresses and serial numbers. The pixels stored are good; process them "
+    "again with the frames in their places.",
+    "A block of SU11 differs by +14 DN (+2%): an edge after row 812, columns 5 to 900, follows a "
+    "line of pixels and no other head shows it. Radiometry of this frame is wrong. Check the head "
+    "and its cable.",
+    "In the frame of SU11 (or SU12, which sees the same ground), rows 5 to 9 lie 1.2 px off the "
+    "rest: lines were lost or repeated in read-out. Also shifted: SU13. Check the head and its "
+    "cable. Fly this exposure again.",
+    "Motion blur along track; shorten the exposure, check TDI, speed, mount and crab.",
+    "Tilted by 4.1 deg, 3.0 deg allowed; fly this part again, level.",
+    "The signal changes by +8% after line 812 of the rows of SU11: gain or offset changed during "
+    "read-out. Radiometry of this frame is wrong. Check the head. 3 frames step while other heads "
+    "show no such ground: check what these heads share, supply and clock.",
+    "12 m right of line A3 at the next exposure (limit 10 m). Steer left. 40 m above the planned "
+    "height (limit 30 m). Descend",
+    "the PTP clock of SU11 is not used: its status is LISTENING. Check that the grandmaster runs, "
+    "is on the same network, and has the better priority",
+    "no edge of the pulse per second for 12 s: the clock coasts, its time is good to 0.2 ms now; "
+    "check the PPS cable and the receiver's fix",
+    "not armed: GPS time is not known (wait for the receiver's fix; check its antenna); no "
+    "temperature of probe 1 (check the probes and their module); override to fly without",
+    "Exposure 7: no head sent a frame",
+    "exposure 12 rejected; it is to be flown again",
+    "gnss: port /dev/ttyUSB0 cannot be opened: there is no such port; check the cable and the "
+    "port's name. Retrying automatically.",
+    "The head SU11 at 10.0.0.5 was lost (it has not answered for 5 s). Check its power and cable. "
+    "Reconnecting automatically.",
+    "12 exposures and 156 frames are verified; nothing is wrong",
+    "the ledger does not balance: SU11: 3 pending after landing; 2 exposures are open after "
+    "landing",
+)
+
+
+def test_a_code_renders_the_sentence_that_it_was_found_for() -> None:
+    for sentence in SENTENCES:
+        message = message_of(sentence)
+        assert message is not None, sentence
+        assert english(message) == sentence
+        assert not re.search(r"[a-z]{3,} [a-z]{3,} [a-z]{3,}", " ".join(texts_of(message))), message
+
+
+def texts_of(value: Any) -> list[str]:
+    """The texts of a message that are not of the catalog."""
+    if isinstance(value, dict):
+        return [text for one in value["parameters"].values() for text in texts_of(one)]
+    if isinstance(value, list):
+        return [text for one in value for text in texts_of(one)]
+    return [value]
+
+
+def test_every_text_of_the_catalog_is_found_by_itself() -> None:
+    for code, text in json.loads(CATALOG.read_text("utf-8")).items():
+        names = re.findall(r"\{(\w+)\}", text)
+        assert len(set(names)) == len(names), code
+        sentence = text
+        for name in names:
+            sentence = sentence.replace(f"{{{name}}}", "7" if name in NUMBERS else f"X{name}")
+        message = message_of(sentence)
+        if message is None:  # It only joins others.
+            assert not re.search(r"[A-Za-z]{3}", re.sub(r"\{\w+\}", "", text)), code
+            continue
+        assert english(message) == sentence
+        assert f"server.{message['code']}" == code, sentence
+
+
+@pytest.mark.parametrize("source", SOURCES)
+def test_every_sentence_of_a_source_has_a_code(source: str) -> None:
+    """A sentence that is new or changed here needs its text in `messages/*/server.json`."""
+    missing = [
+        variants[0]
+        for variants in sentences_of(ROOT / source)
+        if all(message_of(one) is None for one in variants)
+        and not any(re.search(part, variants[0]) for part in (*PARTS, *REFUSALS))
+    ]
+    assert missing == []
+
+
+def sentences_of(source: Path) -> Iterator[list[str]]:
+    """Each text of a module in all variants: a number or a name for every value in it."""
+    tree = ast.parse(source.read_text("utf-8"))
+    documents = {id(n.value) for n in ast.walk(tree) if isinstance(n, ast.Expr)}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.JoinedStr):
+            documents |= {id(part) for part in node.values}
+    for node in ast.walk(tree):
+        if id(node) in documents:
+            continue
+        if isinstance(node, ast.Constant) and isinstance(node.value, str):
+            choices: list[tuple[str, ...]] = [(node.value,)]
+        elif isinstance(node, ast.JoinedStr):
+            choices = [
+                (str(part.value),) if isinstance(part, ast.Constant) else _values(part)
+                for part in node.values
+            ]
+        else:
+            continue
+        variants = ["".join(one) for one in itertools.product(*choices)]
+        if len(variants[0].split()) >= WORDS_MIN:
+            yield [re.sub(r"\{\d:[^}]*\}", "7", re.sub(r"\{\d\}", "SU11", v)) for v in variants]
+
+
+def _values(part: ast.expr) -> tuple[str, ...]:
+    assert isinstance(part, ast.FormattedValue)
+    is_share = part.format_spec is not None and "%" in ast.unparse(part.format_spec)
+    return ("7%",) if is_share else ("SU11", "7")
+
+
+def test_a_text_where_a_number_is_expected_is_not_this_message() -> None:
+    assert message_of("Tilted by much deg, 3.0 deg allowed; fly this part again, level.") is None
+    assert message_of("") is None
+    assert message_of("x" * 5000) is None
+
+
+def test_the_records_of_the_api_have_messages_next_to_their_sentences() -> None:
+    sentence = "Head SU11 sent no image. Check power and cable."
+    message = {"code": "finding.head_missing", "parameters": {"head": "SU11"}}
+    record = {
+        "faults": [{"sentence": sentence}, {"sentence": "Unknown."}],
+        "status": {"missing": ["token rejected", "Unknown."]},
+    }
+    found = with_messages(record)
+    assert found["faults"] == [{"sentence": sentence, "message": message}, {"sentence": "Unknown."}]
+    assert found["status"]["missing"] == ["token rejected", "Unknown."]
+    assert found["status"]["missing_messages"] == [
+        {"code": "command.token_rejected", "parameters": {}},
+        "Unknown.",
+    ]
+
+
+def test_a_long_sentence_of_a_device_costs_no_time() -> None:
+    """Matching is linear: what a device sends cannot hold up the page."""
+    for text in ("; ".join(["a (b"] * 400), "the " * 500, ": " * 900, "(" * 1900, "7 m of " * 250):
+        assert message_of(text) is None or english(message_of(text) or {}) == text
