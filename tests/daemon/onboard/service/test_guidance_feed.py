@@ -102,13 +102,13 @@ def test_the_service_handles_guidance_after_every_message() -> None:
         task = asyncio.create_task(service._run_sequence())
         counts = []
         for _ in range(3):
-            await settle()
+            await run_pending()
             counts.append(steps)
             service._dispatch("message")
         task.cancel()
         return counts
 
-    async def settle() -> None:
+    async def run_pending() -> None:
         for _ in range(10):
             await asyncio.sleep(0)
 
