@@ -25,6 +25,7 @@ def triangulate_live(
 ) -> None:
     """Replay the live triangulation of a mission and write its files."""
     from daemon.mission.layout import Mission
+    from daemon.onboard.live_orthomosaic.mission_map import MissionMap
     from daemon.onboard.triangulation.live_record import summary_json, write_live
     from daemon.onboard.triangulation.measured_images import SensorSigmas
     from daemon.onboard.triangulation.mission_triangulation import MissionTriangulation
@@ -40,17 +41,23 @@ def triangulate_live(
         None if trajectory is None else trajectory_of(folder, read.results.values(), trajectory)
     )
     done = MissionTriangulation(folder, LiveSettings(), sigmas, source)
+    problems: list[str] = []
+    growing = MissionMap(done, lambda _event: None, on_failure=problems.append)
     seconds: list[float] = []
     with folder.held(), Progress(console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("triangulating", total=len(read.results))
         for number in sorted(read.results):
+            blocks = done.block_count
             one = done.add(read.results[number])
+            if done.block_count != blocks:
+                growing.block_adjusted()
             if one.orientation is not None:
                 seconds.append(one.seconds)
             progress.advance(task)
         begun = time.perf_counter()
         done.land()
         write_live(done)
+        growing.deliver()
         landing_s = time.perf_counter() - begun
     found = summary_json(done) | {
         "exposure_seconds": {
@@ -60,6 +67,9 @@ def triangulate_live(
         "landing_seconds": landing_s,
         "failures": [failure.as_json() for failure in read.failures],
         "folder": str(done.folder),
+        "orthomosaic": None
+        if growing.live is None
+        else growing.live.as_json() | {"folder": str(growing.folder), "problems": problems},
     }
     if as_json:
         typer.echo(json.dumps(found))
@@ -95,6 +105,16 @@ def _print(found: dict[str, Any]) -> None:
         console.print(table)
     for one in found["findings"]:
         console.print(f"{one['name']}: {one['sentence']}", highlight=False)
+    orthomosaic = found["orthomosaic"]
+    if orthomosaic is not None and orthomosaic["gsd_m"] is not None:
+        console.print(
+            f"Preliminary orthomosaic of {orthomosaic['images']} images, "
+            f"{orthomosaic['gsd_m']:.2f} m: {orthomosaic['folder']}",
+            soft_wrap=True,
+            highlight=False,
+        )
+        for sentence in orthomosaic["problems"]:
+            console.print(sentence, highlight=False)
     console.print(
         f"Results: {found['folder']}, report {Path(found['folder']) / 'report.html'}",
         soft_wrap=True,

@@ -311,7 +311,12 @@ class TriangulationSection(ConfigurationSection):
     memory_max_mb: int = Field(default=1500, ge=500)
     """Private memory of the process."""
     landing_timeout_s: float = Field(default=10.0, gt=0, le=600)
-    """Time for the last adjustment after landing."""
+    """Time for the last adjustment and the files after landing."""
+    orthomosaic: bool = True
+    """Whether a preliminary orthomosaic grows on the map."""
+    orthomosaic_gsd_m: float | None = Field(default=None, gt=0)
+    """Its ground sampling distance, as near as a level of the web map comes (default: 8 times that
+    of the images, or more for images wider than 4096 pixels)."""
 
 
 class LimitsSection(ConfigurationSection):

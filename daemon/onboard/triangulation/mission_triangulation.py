@@ -7,11 +7,13 @@ Used in flight and to replay a mission. It reads records and Level-2, and writes
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from daemon import DaemonError
 from daemon.configuration.model import MountSection, PlanSection
@@ -90,6 +92,7 @@ class MissionTriangulation:
         settings: of the triangulation.
         sigmas: of navigation, where the receiver states none.
         trajectory: in place of the navigation in the records.
+        on_image: receives each image that was added with its orientation.
 
     Raises:
         LiveTriangulationError: the rig has no stitched image.
@@ -100,6 +103,7 @@ class MissionTriangulation:
     settings: LiveSettings = field(default_factory=LiveSettings)
     sigmas: SensorSigmas = field(default_factory=SensorSigmas)
     trajectory: NavigationSource | None = None
+    on_image: Callable[[LiveOrientation, NDArray[np.uint16]], None] | None = None
 
     def __post_init__(self) -> None:
         self.rig: Rig = load_rig(self.mission.rig_path)
@@ -121,7 +125,7 @@ class MissionTriangulation:
         self.block_count = 0
         self.has_landed = False
         self.is_simulated = False
-        self._relief = self._read_relief()
+        self.relief = self._read_relief()
         self._planned_lines = self._read_plan()
         self._lines = FlownLines(self._planned_lines)
 
@@ -180,6 +184,8 @@ class MissionTriangulation:
         except ProcessingError as error:
             return self._skip(number, f"it cannot be tied ({error})", begun)
         self.skipped.pop(number, None)
+        if self.on_image is not None:
+            self.on_image(orientation, pixels)
         return ExposureTriangulated(number, orientation, "", time.perf_counter() - begun)
 
     def adjust_block(self) -> None:
@@ -278,7 +284,7 @@ class MissionTriangulation:
 
     def _check_heights(self) -> HeightModelCheck | None:
         """Tie points against the height model."""
-        if self._relief is None or self.live is None or self.frame is None:
+        if self.relief is None or self.live is None or self.frame is None:
             return self.heights
         _, xyz, sigma = self.live.tied_points()
         if not len(xyz):
@@ -286,8 +292,8 @@ class MissionTriangulation:
         step = max(1, len(xyz) // _HEIGHT_SAMPLES)
         differences = []
         for latitude, longitude, height in self.frame.to_geodetic(xyz[::step]):
-            place = self._relief.system.place(float(latitude), float(longitude), float(height))
-            model = self._relief.model.at(np.array([[place.east_m, place.north_m]]))
+            place = self.relief.system.place(float(latitude), float(longitude), float(height))
+            model = self.relief.model.at(np.array([[place.east_m, place.north_m]]))
             differences.append(place.height_m - float(model[0]))
         known = np.array(differences)
         known = known[np.isfinite(known)]

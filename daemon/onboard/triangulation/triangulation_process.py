@@ -21,6 +21,8 @@ from typing import Any, Final
 from daemon import DaemonError
 from daemon.configuration.model import TriangulationSection
 from daemon.mission.layout import Mission
+from daemon.onboard.live_orthomosaic.live_orthomosaic import warm_up
+from daemon.onboard.live_orthomosaic.mission_map import MissionMap
 from daemon.onboard.service.messages import (
     FinishTriangulation,
     Ping,
@@ -123,12 +125,19 @@ class _Work:
         sigmas = SensorSigmas(
             section.position_sigma_m, section.height_sigma_m, section.attitude_sigma_mdeg
         )
+        self._map: MissionMap | None = None
         try:
             self._done: MissionTriangulation | None = MissionTriangulation(folder, settings, sigmas)
         except (OSError, DaemonError) as error:
             self._done = None
             self._failed(str(error))
             return
+        if section.orthomosaic:
+            warm_up()
+            self._map = MissionMap(
+                self._done, lambda event: self._link.send(ServiceEvent(event)),
+                section.orthomosaic_gsd_m, self._report,
+            )  # fmt: skip
 
     def run(self) -> None:
         if self._done is not None:
@@ -161,6 +170,8 @@ class _Work:
         blocks = done.block_count
         one = done.add(exposure)
         if done.block_count != blocks:
+            if self._map is not None:
+                self._map.block_adjusted()
             self._write(done)
             self._emit("triangulation", **summary_json(done))
         self._emit_exposure(one)
@@ -190,6 +201,8 @@ class _Work:
             self._done.land()
             written = self._write(self._done)
             self._emit("triangulation", **summary_json(self._done))
+            if self._map is not None:
+                written &= self._map.deliver()
         self._link.send(TriangulationFinished(time.monotonic() - begun, written))
 
     def _write(self, done: MissionTriangulation) -> bool:
@@ -205,6 +218,9 @@ class _Work:
             f"The live triangulation failed: {why}. Capture goes on. Run `syntopic triangulate "
             "MISSION --live` after landing."
         )
+        self._report(sentence)
+
+    def _report(self, sentence: str) -> None:
         self._emit("triangulation-failed", fault=True, sentence=sentence)
 
     def _emit(self, event: str, **content: Any) -> None:

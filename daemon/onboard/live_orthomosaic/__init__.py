@@ -1,0 +1,1 @@
+"""The orthomosaic that grows in flight: map tiles, and its files at landing."""
