@@ -55,7 +55,11 @@ from daemon.onboard.service.messages import (
     UseMission,
 )
 from daemon.onboard.service.monitoring_link import NAME as WATCH
-from daemon.onboard.service.monitoring_link import MonitoringLink, status_event
+from daemon.onboard.service.monitoring_link import (
+    MonitoringLink,
+    present_temperatures_c,
+    status_event,
+)
 from daemon.onboard.service.notify import Notifier
 from daemon.onboard.service.operator_journal import OperatorJournal
 from daemon.onboard.service.override_record import OverrideRecord
@@ -373,8 +377,9 @@ class Service:
             disk=self.line.guard.check(),
             exposures_planned=self.line.remaining,
             position=self.flight.track.last,
-            temperatures=self.flight.temperatures.at(now_ns),
-            temperature_stale_s=self.configuration.limits.temperature_stale_s,
+            temperatures_c=present_temperatures_c(
+                self.flight.temperatures.at(now_ns), self.configuration.limits.temperature_stale_s
+            ),
             time_now=self.flight.clock.gps_at(now_ns),
             queue=len(self.pipeline),
             missing=list(map(str, self.preflight.missing_prerequisites())),
