@@ -37,7 +37,6 @@ from daemon.onboard.service.messages import (
     WorkerSettings,
 )
 from daemon.orientation.local_frame import LocalFrame
-from daemon.postflight.export.camera_certificate import CameraCertificateError, certificate_of
 from daemon.postflight.replay.flight_replay import ReplayResult
 from daemon.postflight.triangulation.triangulation import (
     TriangulationError,
@@ -396,16 +395,6 @@ def test_every_head_is_certified_with_axes_and_signs(flown) -> None:
     assert output["simulated"] and "the camera looks along -z" in output["axes"]
     page = (folder / "mission/export/certificate.html").read_text()
     assert "SIMULATED" in page and "Axes and signs" in page
-
-
-def test_the_certificate_of_a_stitched_rig_is_that_of_its_virtual_camera() -> None:
-    output = certificate_of(load_rig(shipped_rigs()["ultracam-x"]))
-    pan, colour = output["cameras"]
-    assert (pan["width_px"], pan["height_px"], pan["pixel_size_um"]) == (14430, 9420, 7.2)
-    assert pan["principal_distance_mm"] == 100.5
-    assert colour["pixel_size_um"] == pytest.approx(21.6) and colour["width_px"] == 4810
-    with pytest.raises(CameraCertificateError, match="no camera to certify"):
-        certificate_of(load_rig(shipped_rigs()["rededge"]))
 
 
 def test_footprints_follow_a_height_model(flown, tmp_path: Path) -> None:
