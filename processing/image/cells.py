@@ -326,11 +326,16 @@ def fetch_straight(
         phases[1, y] = c0 - left
         steps[1, y] = dc - 1.0
     start = (top + first) * width + left - 2
-    # With a count known to the compiler nothing is left over, and rows go in pairs.
-    if columns == 72:
-        down_strip(flat, start, width, phases[0], steps[0], table, lines, rows, 72)
+    # With a count known to the compiler nothing is left over, and rows go in pairs. Where the frame
+    # has them, some columns more make the widest vectors whole; their values are not used.
+    if columns == 72 and left + 78 <= width:
+        down_strip(flat, start, width, phases[0], steps[0], table, lines, rows, 72, 80)
+    elif columns == 40 and left + 46 <= width:
+        down_strip(flat, start, width, phases[0], steps[0], table, lines, rows, 40, 48)
+    elif columns == 72:
+        down_strip(flat, start, width, phases[0], steps[0], table, lines, rows, 72, 72)
     elif columns == 40:
-        down_strip(flat, start, width, phases[0], steps[0], table, lines, rows, 40)
+        down_strip(flat, start, width, phases[0], steps[0], table, lines, rows, 40, 40)
     else:
         for y in range(rows):
             line = lines[y * LINE_LENGTH :]

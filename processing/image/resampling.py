@@ -383,8 +383,13 @@ def _resample(frames, valid, lattices, cell, weights, gains, offsets, table, rea
                     n,
                 )
         # By itself, so that rows of both rasters are never written side by side.
-        for y in range(band * cell, band * cell + rows):
-            for column in range(columns):
-                if straight[column, 0] >= 0:
-                    source_index = source[y, column * cell : (column + 1) * cell]
-                    source_index[:] = np.uint8(straight[column, 0] + 1)
+        begin = np.int64(0)
+        while begin < columns:
+            end = begin + 1
+            while end < columns and straight[end, 0] == straight[begin, 0]:
+                end += 1
+            if straight[begin, 0] >= 0:
+                name = np.uint8(straight[begin, 0] + 1)
+                for y in range(band * cell, band * cell + rows):
+                    source[y, begin * cell : end * cell] = name
+            begin = end

@@ -130,7 +130,7 @@ def middle_and_span(phases, steps, rows, n):
 
 
 @njit(cache=True, fastmath=True, nogil=True)
-def down_strip(flat, start, width, phases, steps, table, lines, rows, n):
+def down_strip(flat, start, width, phases, steps, table, lines, rows, n, wide):
     """As `down` for target rows whose taps lie one raw row apart, with one row of the table.
 
     Row y has the phases phases[y] + steps[y] * j.
@@ -145,6 +145,7 @@ def down_strip(flat, start, width, phases, steps, table, lines, rows, n):
         lines: receives row y from y * `LINE_LENGTH` on, float32.
         rows: target rows.
         n: columns.
+        wide: columns that are computed, `n` or some more; those beyond `n` have no meaning.
     """
     middle, span = middle_and_span(phases, steps, rows, n)
     if span > _SPAN:
@@ -158,19 +159,19 @@ def down_strip(flat, start, width, phases, steps, table, lines, rows, n):
     for y in range(0, rows - 1, 2):
         # Raw pixels are converted once for two rows.
         begin = start + (y - 2) * width
-        a0 = flat[begin : begin + n]
-        a1 = flat[begin + width : begin + width + n]
-        a2 = flat[begin + 2 * width : begin + 2 * width + n]
-        a3 = flat[begin + 3 * width : begin + 3 * width + n]
-        a4 = flat[begin + 4 * width : begin + 4 * width + n]
-        a5 = flat[begin + 5 * width : begin + 5 * width + n]
-        a6 = flat[begin + 6 * width : begin + 6 * width + n]
+        a0 = flat[begin : begin + wide]
+        a1 = flat[begin + width : begin + width + wide]
+        a2 = flat[begin + 2 * width : begin + 2 * width + wide]
+        a3 = flat[begin + 3 * width : begin + 3 * width + wide]
+        a4 = flat[begin + 4 * width : begin + 4 * width + wide]
+        a5 = flat[begin + 5 * width : begin + 5 * width + wide]
+        a6 = flat[begin + 6 * width : begin + 6 * width + wide]
         line = lines[y * LINE_LENGTH :]
         p0 = phases[y] - at
         p1 = phases[y + 1] - at
         s0 = steps[y]
         s1 = steps[y + 1]
-        for j in range(n):
+        for j in range(wide):
             b0 = np.float32(np.int32(a0[j]))
             b1 = np.float32(np.int32(a1[j]))
             b2 = np.float32(np.int32(a2[j]))

@@ -263,3 +263,20 @@ def test_a_sensor_far_away_is_outside_of_every_node() -> None:
     fill_lattice(image, pan_raster(image), nominal_placements(rig, {}, {})["SU00"], 32, lattice)
     assert np.all(lattice[-1, -1] == OUTSIDE)
     assert np.mean(lattice[..., 0] == OUTSIDE) > 0.75
+
+
+@pytest.mark.parametrize(("cell", "beyond"), [(64, 76), (32, 44)])
+def test_columns_computed_beyond_the_taps_do_not_reach_the_image(cell: int, beyond: int) -> None:
+    rng = np.random.default_rng(12)
+    frame = (rng.integers(2000, 20000, (cell + 16, 200)) // 2 * 2).astype(np.uint16)
+    changed = frame.copy()
+    changed[:, beyond:] = 65534
+    matrix = (5.3, 1.0009, 0.0, 6.4, 0.0005, 1.0)
+    images = [
+        fetch(given[None], [matrix], interpolation="phase-corrected", shape=(cell, cell), cell=cell)
+        for given in (frame, changed, frame[:, :beyond].copy())
+    ]
+    for out, source in images[1:]:
+        assert np.array_equal(out, images[0][0])
+        assert np.array_equal(source, images[0][1])
+    assert np.all(images[0][1] == 1)
