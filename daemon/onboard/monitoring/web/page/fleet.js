@@ -53,6 +53,7 @@ async function update() {
 }
 
 fill();
+document.body.dataset.ready = "";
 document.documentElement.dataset.theme = localStorage.getItem("cabin") === "dark" ? "dark" : "";
 update();
 setInterval(update, REFRESH_MS);

@@ -20,12 +20,19 @@ const isPseudo = language === PSEUDO;
 const plurals = new Intl.PluralRules(isPseudo ? "en" : language);
 export const locale = isPseudo ? "en" : language;
 
+const RETRY_MS = 1000;
+
+// A page without its texts would show codes: tried until the catalog comes.
 async function load(name) {
-  try {
-    const response = await fetch(`messages/${locale}/${name}.json`);
-    return response.ok ? await response.json() : {};
-  } catch {
-    return {};
+  for (;;) {
+    try {
+      const response = await fetch(`messages/${locale}/${name}.json`);
+      if (response.ok) return await response.json();
+      if (response.status === 404) return {};
+    } catch {
+      // The network changed or is down.
+    }
+    await new Promise((resolve) => setTimeout(resolve, RETRY_MS));
   }
 }
 

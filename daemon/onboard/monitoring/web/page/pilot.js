@@ -74,6 +74,7 @@ by("pilot-sound").addEventListener("click", () => {
   unlockSound();
 });
 setInterval(drawState, AGE_MS);
+document.body.dataset.ready = "";
 followGuidance((frame) => {
   last = frame;
   due ??= requestAnimationFrame(draw);

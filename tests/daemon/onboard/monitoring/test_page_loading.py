@@ -1,0 +1,80 @@
+"""A page of which a file did not come recovers by itself, in a real browser."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.daemon.onboard.monitoring import flight_events
+from tests.daemon.onboard.monitoring.page_service import WITHIN_S, Service
+from tests.support.browser import Browser, chromium
+
+CONNECTED = "document.querySelector('#link')?.innerText === 'connected'"
+READY = "document.body?.dataset.ready !== undefined"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    chromium()
+    return tmp_path_factory.mktemp("loading")
+
+
+@pytest.fixture(scope="module")
+def service(folder: Path) -> Iterator[Service]:
+    service = Service(folder)
+    service.emit(flight_events.mission())
+    yield service
+    service.end()
+
+
+@pytest.fixture
+def browser(tmp_path: Path) -> Iterator[Browser]:
+    with Browser(tmp_path / "profile") as browser:
+        browser.call("Network.setBypassServiceWorker", bypass=True)
+        browser.call("Network.setCacheDisabled", cacheDisabled=True)
+        yield browser
+
+
+@pytest.mark.parametrize(
+    "blocked",
+    ["*/strip.js", "*/vendor/leaflet.js", "*/panels.css", "*/messages/en/map.json"],
+    ids=["module", "library", "style", "catalog"],
+)
+def test_a_file_that_did_not_come_is_loaded_again(
+    service: Service, browser: Browser, blocked: str
+) -> None:
+    browser.call("Network.setBlockedURLs", urls=[blocked])
+    browser.open(service.address)
+    name = blocked.split("/")[-1]
+    browser.wait_for("document.readyState === 'complete'", WITHIN_S)
+    browser.wait_for(f"!({READY}) || document.querySelector('#link').textContent !== ''", WITHIN_S)
+    browser.call("Network.setBlockedURLs", urls=[])
+    loaded = (
+        f"performance.getEntriesByType('resource').some((one) => one.name.endsWith('/{name}')"
+        " && one.responseStatus === 200)"
+    )
+    browser.wait_for(f"{CONNECTED} && {READY} && {loaded}", WITHIN_S)
+    assert browser.evaluate("getComputedStyle(document.querySelector('#bar')).display") != "block"
+
+
+@pytest.mark.parametrize("page", ["pilot.html", "fleet.html"])
+def test_the_other_pages_recover_too(service: Service, browser: Browser, page: str) -> None:
+    browser.call("Network.setBlockedURLs", urls=["*/format.js"])
+    browser.open(f"{service.address}{page}")
+    browser.wait_for("document.readyState === 'complete'", WITHIN_S)
+    browser.call("Network.setBlockedURLs", urls=[])
+    browser.wait_for(READY, WITHIN_S)
+
+
+def test_a_complete_page_is_not_loaded_again(service: Service, browser: Browser) -> None:
+    browser.open(service.address)
+    browser.wait_for(f"{CONNECTED} && {READY}", WITHIN_S)
+    browser.evaluate("window.isSame = true")
+    browser.evaluate(
+        "document.head.append(Object.assign(document.createElement('link'),"
+        " { rel: 'stylesheet', href: 'missing.css' }))"
+    )
+    browser.evaluate("new Promise((resolve) => setTimeout(resolve, 2500))")
+    assert browser.evaluate("window.isSame === true")
