@@ -151,6 +151,9 @@ class FaultLatches:
             self._clear_mirror(event)
             if event.get("missing") == []:
                 self.clear_fault_if_active("override")
+        elif kind == "triangulated":
+            # It works again: the process was started again and takes in exposures.
+            self.clear_fault_if_active("triangulation")
         elif kind == "previous-fault":
             latch = _latch(event)
             self.add_previous([latch] if latch else [], sequence=sequence)

@@ -216,6 +216,16 @@ def test_faults_whose_cause_is_gone_are_cleared_and_say_since_when() -> None:
     assert "prerequisite calibration rig" in latches
 
 
+def test_a_triangulation_that_works_again_is_cleared() -> None:
+    latches = latches_of(
+        {"event": "triangulation-failed", "fault": True, "sentence": "ended", "mono_ns": "3"},
+    )
+    assert latches.listed()[0]["stands"]
+    latches.apply({"event": "triangulated", "number": 7, "mono_ns": "8"})
+    (fault,) = latches.listed()
+    assert (fault["stands"], fault["cleared_mono_ns"]) == (False, "8")
+
+
 @pytest.mark.parametrize("event", ["ledger", "power", "fault"])
 def test_a_fault_that_ended_the_service_no_longer_stands_after_its_restart(event: str) -> None:
     before = latches_of({"event": event, "fault": True, "sentence": "the service ends"})
