@@ -25,6 +25,9 @@ _CONVERGED: Final = 1e-5
 _DAMPING: Final = 1e-4
 _DAMPING_MAX: Final = 1e8
 _NO_SIGMA: Final = 1e9
+_INTERIOR_MAX: Final = 5.0
+"""Largest change of a parameter over its standard deviation. Without it a principal distance of
+zero explains all image points, since residuals are measured in the plane of the ideal ones."""
 
 
 @dataclass(frozen=True)
@@ -143,6 +146,8 @@ class _Problem:
         size = np.linalg.norm(misclosure, axis=1) / self.sigma_mm
         huber = np.where(size <= _HUBER_PX, size**2, 2.0 * _HUBER_PX * size - _HUBER_PX**2)
         change = (block.interior - self.camera.interior)[self.free] / self.prior()
+        if (np.abs(change) > _INTERIOR_MAX).any():
+            return np.inf
         return float(huber.sum() + change @ change)
 
     def equations(self, block: FreeBlock, misclosure: Array) -> _Reduced:

@@ -215,10 +215,15 @@ class _Growing:
     def _resect(self, image: int) -> bool:
         rows = self.known_rows(image)
         known = self.xyz[self.tracks.point[rows]]
-        found, rotation, shift, inside = cv2.solvePnPRansac(
-            known, self.ideal[rows], np.eye(3), None, iterationsCount=2000, confidence=0.9999,
-            reprojectionError=self.limit_px * self.pixel, flags=cv2.SOLVEPNP_SQPNP,
-        )  # fmt: skip
+        try:
+            found, rotation, shift, inside = cv2.solvePnPRansac(
+                known, self.ideal[rows], np.eye(3), None, iterationsCount=2000, confidence=0.9999,
+                reprojectionError=self.limit_px * self.pixel, flags=cv2.SOLVEPNP_SQPNP,
+            )  # fmt: skip
+        except cv2.error:
+            # Quirk: points of one place, from wrong tracks, end in an assertion of OpenCV.
+            # Upstream: no report known (2026-11-24); computeOmega in sqpnp.cpp of OpenCV 5.0.
+            return False
         if not found or inside is None or len(inside) < max(POINTS_MIN, 0.3 * len(rows)):
             return False
         own = inside.ravel()

@@ -6,8 +6,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from processing.bundle.incremental_orientation import PhotographTracks, orient_photographs
-from processing.bundle.network import CameraModel
+from processing.bundle.damped_adjustment import FreeBlock, damped_adjustment
+from processing.bundle.incremental_orientation import (
+    PhotographTracks,
+    _Growing,
+    orient_photographs,
+)
+from processing.bundle.network import INTERIOR, CameraModel
 from processing.geometry.positions_fit import NotPlacedError, fit_positions
 
 F, PIXEL, K1 = 4.3, 0.002, -1.5e-3
@@ -107,3 +112,27 @@ def test_positions_on_one_line_are_refused() -> None:
     line = np.outer(np.arange(6.0), [30.0, 10.0, 0.0])
     with pytest.raises(NotPlacedError, match="one line"):
         fit_positions(model, line)
+
+
+def test_wrong_tracks_do_not_shrink_the_principal_distance_to_nothing() -> None:
+    """With none, all image points would coincide and every track would fit."""
+    tracks, place, turn = scene(12.0, images=4)
+    tied = np.bincount(tracks.point)[tracks.point] >= 2
+    points, point = np.unique(tracks.point[tied], return_inverse=True)
+    random = np.random.default_rng(7)
+    xy_mm = random.uniform(-1, 1, (len(point), 2)) * HALF
+    xyz = random.uniform(-60, 60, (len(points), 3))
+    started = FreeBlock(place[:4], turn[:4], xyz, np.zeros(10))
+    found = damped_adjustment(camera(), started, tracks.image[tied], point, xy_mm)
+    df = found.interior[INTERIOR.index("df")]
+    assert abs(df) <= 5.0 * camera().sigma["df"]
+    assert F + df > 0.8 * F
+
+
+def test_an_image_that_sees_points_of_one_place_only_is_left_without_orientation() -> None:
+    """OpenCV ends in an assertion then; points of wrong tracks come to lie so."""
+    tracks, *_ = scene(12.0)
+    block = _Growing(camera(), tracks)
+    own = block._rows[0]
+    block.xyz[tracks.point[own]] = 1e-5 * np.column_stack([block.ideal[own], np.ones(len(own))])
+    assert not block._resect(0)
