@@ -40,6 +40,7 @@ def triangulate_photographs(
     from daemon.postflight.calibration.rig_writer import rig_toml
     from daemon.postflight.triangulation.control_mistakes import control_mistakes, doubtful_control
     from daemon.postflight.triangulation.ground_control import control_of
+    from daemon.postflight.triangulation.held_interior import free_principal_point
     from daemon.postflight.triangulation.photograph_block import photograph_block_of
     from daemon.postflight.triangulation.photograph_project import (
         adjusted_rig,
@@ -92,7 +93,14 @@ def triangulate_photographs(
             peak_mib=_peak_mib(),
         )
         report["triangulation"] = triangulation_of(found.block, found.tied, project, result)
-        section = photographs_section(found, control, result)
+        image = found.block.image
+        free = free_principal_point(
+            result,
+            pitch_mm=image.pitch_mm,
+            longer_side_px=max(image.width_px, image.height_px),
+            progress=show,
+        )
+        section = photographs_section(found, control, result, free)
         report["photographs"] = section
         report["cautions"] += photograph_cautions(section)
         write_triangulation(results, found.block, project, result, report)

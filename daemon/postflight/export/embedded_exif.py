@@ -15,6 +15,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
+from daemon import DaemonError
 from daemon.postflight.export.exif import (
     EXIF_IFD,
     GPS_IFD,
@@ -30,7 +31,7 @@ JP2_UUID: Final = b"JpgTiffExif->JP2"
 _ENTRY: Final = struct.Struct("<HHII")
 
 
-class EmbeddedExifError(ValueError):
+class EmbeddedExifError(DaemonError, ValueError):
     """A file in which EXIF has no place; the message states why."""
 
 

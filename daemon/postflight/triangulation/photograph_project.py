@@ -1,8 +1,8 @@
 """The adjustment of a block of photographs: network, report section, adjusted rig.
 
-All parameters of the interior orientation are estimated with the orientations. Positions of EXIF
-are observations; their standard deviations are estimated as variance components, and with control
-their common shift, such as that between heights above the ellipsoid and the geoid.
+Principal distance and distortion are estimated with the orientations, the principal point is held.
+Positions of EXIF are observations; their standard deviations are estimated as variance components,
+and with control their common shift, such as that between heights above the ellipsoid and the geoid.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from daemon.postflight.adjustment.project_file import AdjustSection, CameraSecti
 from daemon.postflight.importers.photographs import CONE
 from daemon.postflight.triangulation.control_mistakes import shift_to_control, unmeasured
 from daemon.postflight.triangulation.ground_control import GroundControl
+from daemon.postflight.triangulation.held_interior import FreePrincipalPoint
 from daemon.postflight.triangulation.photograph_block import FREE, PhotographBlock
 from processing.bundle.adjust import Adjustment, AdjustmentSettings
 from processing.bundle.network import (
@@ -139,9 +140,19 @@ def adjusted_rig(rig: Rig, result: Adjustment) -> Rig:
 
 
 def photographs_section(
-    found: PhotographBlock, control: GroundControl, result: Adjustment
+    found: PhotographBlock,
+    control: GroundControl,
+    result: Adjustment,
+    free: FreePrincipalPoint | None = None,
 ) -> dict[str, Any]:
-    """The section `photographs` of the report; lengths in px and m as named."""
+    """The section `photographs` of the report; lengths in px and m as named.
+
+    Args:
+        found: oriented photographs.
+        control: control and check points.
+        result: of the adjustment.
+        free: the same with an estimated principal point; None where it was not estimated.
+    """
     block = found.block
     pitch = block.image.pitch_mm
     interior = dict(zip(INTERIOR, (float(v) for v in result.state.interior[0]), strict=True))
@@ -162,6 +173,8 @@ def photographs_section(
         "f_exif_px": block.image.f_mm / pitch,
         "f_px": f_mm / pitch,
         "f_sigma_px": sigma["df"] / pitch,
+        "principal_point_free": None if free is None else vars(free),
+        "f_depends_on_principal_point": free is not None and free.contradicts(sigma["df"] / pitch),
         "height_above_ground_m": height_m,
         "height_per_percent_m": 0.01 * height_m,
         "position_shift_m": [float(v) for v in result.state.shift[0]] if len(gnss.lines) else None,
@@ -198,6 +211,16 @@ def photograph_cautions(section: Mapping[str, Any]) -> list[str]:
             f"{section['f_sigma_px']:.1f} px, by {section['ground_sigma_of_f_m']:.2f} m "
             f"(correlation {section['f_ground_correlation']:.2f}). Give three control points or "
             "more, spread over the block (--points)"
+        )
+    if section["f_depends_on_principal_point"]:
+        free = section["principal_point_free"]
+        x, y = free["point_px"]
+        found.append(
+            f"the principal point is held in the middle; estimated, it moves by {x:.0f} "
+            f"columns and {y:.0f} rows and changes f by {free['change_px']:+.0f} px, "
+            f"{abs(free['change_px']) / section['f_sigma_px']:.0f} times the standard deviation of "
+            "f: stated standard deviations hold for these parameters only. Lines across, two "
+            "heights or control points separate them"
         )
     drift = abs(section["f_px"] / section["f_exif_px"] - 1.0)
     if drift > 0.05:

@@ -32,7 +32,12 @@ from daemon.postflight.importers.exif_tags import (
 )
 from daemon.postflight.triangulation import photograph_block
 from daemon.postflight.triangulation.control_mistakes import control_mistakes, doubtful_control
-from daemon.postflight.triangulation.ground_control import GroundControl, read_gcp_list
+from daemon.postflight.triangulation.ground_control import (
+    GroundControl,
+    no_control,
+    read_gcp_list,
+)
+from daemon.postflight.triangulation.held_interior import free_principal_point
 from daemon.postflight.triangulation.photograph_block import PhotographBlock
 from daemon.postflight.triangulation.photograph_project import (
     photograph_cautions,
@@ -279,6 +284,40 @@ def section_of(block: PhotographBlock, control: GroundControl) -> dict:
     )
     result = adjust(completed(project.network), project.settings)
     return photographs_section(block, control, result)
+
+
+def perspective_block(block: PhotographBlock, middle_px: tuple[float, float]) -> PhotographBlock:
+    """The same places seen by a camera without distortion whose principal point is elsewhere.
+
+    Photographs are tilted by up to 20 degrees, which separates it from the attitudes.
+    """
+    random = np.random.default_rng(4)
+    image, tied = block.block.image, block.tied
+    tilt = [rotation_matrix(*random.uniform(-0.35, 0.35, 2), 0.0) for _ in block.block.names]
+    level = np.array([rotation_matrix(0.0, 0.0, random.uniform(-3, 3)) for _ in tilt])
+    rotation = level @ np.array(tilt)
+    seen = block.xyz_m[tied.point] - block.block.station_m[tied.image]
+    x, y, z = np.einsum("nji,nj->ni", rotation[tied.image], seen).T
+    f_px = image.f_mm / image.pitch_mm
+    col = (image.width_px - 1) / 2 + middle_px[0] - f_px * x / z
+    row = (image.height_px - 1) / 2 + middle_px[1] + f_px * y / z
+    px = np.column_stack([col, row]) + random.normal(0.0, 0.3, (len(x), 2))
+    return replace(block, tied=replace(tied, px=px), block=replace(block.block, rotation=rotation))
+
+
+@pytest.mark.parametrize("middle_px", [(0.0, 0.0), (6.0, -5.0)])
+def test_a_principal_point_off_the_middle_is_named_with_what_it_does_to_f(block, middle_px) -> None:
+    elsewhere = perspective_block(block, middle_px)
+    project = photograph_project(
+        elsewhere, no_control(), position_sigma_m=(3.0, 3.0, 5.0), reject_beyond=3.5
+    )
+    result = adjust(completed(project.network), project.settings)
+    image = block.block.image
+    free = free_principal_point(result, pitch_mm=image.pitch_mm, longer_side_px=image.width_px)
+    section = photographs_section(elsewhere, no_control(), result, free)
+    assert free.point_px == pytest.approx(middle_px, abs=4 * max(free.point_sigma_px))
+    named = [one for one in photograph_cautions(section) if "principal point is held" in one]
+    assert bool(named) == (middle_px != (0.0, 0.0)) == section["f_depends_on_principal_point"]
 
 
 @pytest.mark.parametrize(("count", "views"), [(1, None), (3, None), (3, 1)])

@@ -1,0 +1,103 @@
+"""What holding the principal point of photographs does to the estimated principal distance.
+
+A photograph's principal point is not known from EXIF and is held in the middle: with few lines over
+flat ground it is hardly separated from the tilts. If photographs contradict this, the stated
+standard deviation of the principal distance holds for the chosen parameters only.
+
+Source: Fraser (1997), section 5 (projective coupling of interior and exterior orientation).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from daemon.postflight.adjustment.adjusted_project import used_network
+from processing.bundle.adjust import Adjustment, AdjustmentSettings, adjust
+from processing.bundle.network import INTERIOR, NetworkError
+from processing.bundle.rank_diagnosis import RankDefectError
+
+SIGNIFICANT: Final = 4.0
+"""Of the principal point in its standard deviations; 6 in 100,000 of right ones are beyond."""
+F_CHANGE: Final = 3.0
+"""Change of the principal distance in its standard deviations that is worth a caution."""
+PRINCIPAL_POINT_SHARE: Final = 0.01
+"""A priori standard deviation of the principal point, of the image's longer side."""
+_POINT: Final = ("dx0", "dy0")
+
+
+@dataclass(frozen=True)
+class FreePrincipalPoint:
+    """The interior orientation with an estimated principal point, in pixels.
+
+    `change_px` is that of the principal distance against the held principal point, `point_px` the
+    principal point's column and row from the middle.
+    """
+
+    change_px: float
+    point_px: tuple[float, float]
+    point_sigma_px: tuple[float, float]
+
+    def contradicts(self, f_sigma_px: float) -> bool:
+        """Whether the point is off the middle and f changes beyond its standard deviation."""
+        pairs = zip(self.point_px, self.point_sigma_px, strict=True)
+        is_off = any(abs(value) > SIGNIFICANT * sigma for value, sigma in pairs)
+        return is_off and abs(self.change_px) > F_CHANGE * f_sigma_px
+
+
+def free_principal_point(
+    result: Adjustment,
+    *,
+    pitch_mm: float,
+    longer_side_px: int,
+    progress: Callable[[str, int, float], None] | None = None,
+) -> FreePrincipalPoint | None:
+    """Adjust the used observations once more, with the principal point free.
+
+    Args:
+        result: adjusted photographs of one camera.
+        pitch_mm: pixel size.
+        longer_side_px: of the photographs; the principal point has a standard deviation of 1 % of
+            it a priori.
+        progress: see `adjust`.
+
+    Returns:
+        The change; None where that adjustment has no solution.
+    """
+    network, state = used_network(result), result.state
+    (camera,) = network.cameras
+    sigma_mm = PRINCIPAL_POINT_SHARE * longer_side_px * pitch_mm
+    network = replace(
+        network,
+        cameras=(
+            replace(
+                camera,
+                interior=state.interior[0],
+                free=camera.free | set(_POINT),
+                sigma={**camera.sigma, **dict.fromkeys(_POINT, sigma_mm)},
+            ),
+        ),
+        stations=replace(network.stations, position_m=state.station),
+        attitudes=replace(network.attitudes, rotation=state.attitude),
+        points=replace(
+            network.points,
+            xyz_m=np.where(np.isfinite(network.points.sigma_m), network.points.xyz_m, state.points),
+        ),
+    )
+    try:
+        free = adjust(network, AdjustmentSettings(variance_components=True), progress=progress)
+    except (NetworkError, RankDefectError):
+        return None
+    columns = free.layout.interior[0]
+    at = {name: INTERIOR.index(name) for name in ("df", *_POINT)}
+    change = state.interior[0][at["df"]] - free.state.interior[0][at["df"]]
+    x, y = (float(free.state.interior[0][at[name]]) / pitch_mm for name in _POINT)
+    sx, sy = (
+        free.sigma0 * float(np.sqrt(free.cofactor[columns[at[name]], columns[at[name]]])) / pitch_mm
+        for name in _POINT
+    )
+    # Coordinates are corrected by dx0 and dy0, and y is up.
+    return FreePrincipalPoint(float(change) / pitch_mm, (-x, y), (sx, sy))
