@@ -1,4 +1,4 @@
-"""The house keeps its rules: names, imports, processes."""
+"""Rules of the code: names, imports, processes."""
 
 from __future__ import annotations
 
