@@ -82,6 +82,30 @@ def test_footprints_do_not_keep_what_was_removed_alive(page: tuple[Service, Brow
     assert parents == 0
 
 
+def test_an_answer_that_is_not_read_is_released(page: tuple[Service, Browser]) -> None:
+    """Chromium keeps the request of each body that is neither read nor cancelled."""
+    _, browser = page
+    found = browser.evaluate(
+        """(async () => {
+          const { fetchOk, isRefused } = await import('/http.js');
+          const real = window.fetch;
+          const answers = [];
+          window.fetch = async (...given) => {
+            answers.push(await real(...given));
+            return answers.at(-1);
+          };
+          try {
+            await fetchOk('/api/v1/images/4711');
+            await isRefused();
+          } finally {
+            window.fetch = real;
+          }
+          return answers.map((one) => [one.status, one.bodyUsed]);
+        })()"""
+    )
+    assert found == [[404, True], [200, True]]
+
+
 @pytest.mark.parametrize(
     ("expression", "expected"),
     [

@@ -7,10 +7,15 @@ export function headers() {
 
 const REFUSAL_TIMEOUT_MS = 5000;
 
+// A body that nobody reads keeps its request in memory until the page is closed.
+const discard = (response) => response.body?.cancel().catch(() => {});
+
 // Whether reading requires another token than the present one.
 export async function isRefused() {
   try {
-    return (await fetch("/api/v1/brief", { headers: headers(), signal: AbortSignal.timeout(REFUSAL_TIMEOUT_MS) })).status === 401;
+    const response = await fetch("/api/v1/brief", { headers: headers(), signal: AbortSignal.timeout(REFUSAL_TIMEOUT_MS) });
+    discard(response);
+    return response.status === 401;
   } catch {
     return false;
   }
@@ -20,7 +25,9 @@ export async function isRefused() {
 export async function fetchOk(address) {
   try {
     const response = await fetch(address, { headers: headers() });
-    return response.ok ? response : null;
+    if (response.ok) return response;
+    discard(response);
+    return null;
   } catch {
     return null;
   }
