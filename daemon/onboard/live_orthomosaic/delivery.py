@@ -11,9 +11,9 @@ from typing import Any, Final
 
 from daemon.mission.store import durable
 from daemon.onboard.live_orthomosaic.live_orthomosaic import LiveOrthomosaic
+from daemon.onboard.live_orthomosaic.map_layout import TileId, tile_file
 from daemon.onboard.live_orthomosaic.pmtiles_file import write_pmtiles
-from daemon.onboard.live_orthomosaic.tile_files import tile_file
-from daemon.onboard.live_orthomosaic.web_tiles import TileId, pixel_m
+from daemon.onboard.live_orthomosaic.web_tiles import pixel_m
 from daemon.onboard.monitoring.maps.tiles import EARTH_HALF_M, TILE_PX, Bounds, tile_bounds
 from drivers.base.extras import require
 

@@ -20,6 +20,7 @@ from daemon.onboard.live_orthomosaic.block_gains import (
     owners_of,
 )
 from daemon.onboard.live_orthomosaic.map_ground import MapGround
+from daemon.onboard.live_orthomosaic.map_layout import TileId
 from daemon.onboard.live_orthomosaic.placed_image import (
     CELL_PX,
     PlacedImage,
@@ -30,7 +31,6 @@ from daemon.onboard.live_orthomosaic.placed_image import (
 )
 from daemon.onboard.live_orthomosaic.tile_files import TileFiles, merged
 from daemon.onboard.live_orthomosaic.web_tiles import (
-    TileId,
     gsd_m,
     map_grid,
     map_px,

@@ -30,6 +30,7 @@ from daemon.onboard.live_orthomosaic.map_ground import (
     PlaneGround,
     plane_through,
 )
+from daemon.onboard.live_orthomosaic.map_layout import FOLDER, STATE_FILE
 from daemon.onboard.live_orthomosaic.tile_files import TileFiles
 from daemon.onboard.triangulation.mission_triangulation import MissionTriangulation
 from daemon.orientation.geodesy import metres_per_degree
@@ -37,9 +38,6 @@ from drivers import DriverError
 from processing import ProcessingError
 from processing.pipelines.live_triangulation import LiveOrientation
 
-FOLDER: Final = "live-orthomosaic"
-"""Below a mission's `export`."""
-STATE_FILE: Final = "orthomosaic.json"
 FORMAT: Final = 1
 TILES_PER_EVENT: Final = 200
 POINTS_MAX: Final = 2000

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from daemon.mission.store import durable
-from daemon.onboard.live_orthomosaic.web_tiles import TileId
+from daemon.onboard.live_orthomosaic.map_layout import TileId
 from daemon.onboard.monitoring.maps.pmtiles import HEADER_BYTES, tile_id
 from daemon.onboard.monitoring.maps.tiles import Bounds
 

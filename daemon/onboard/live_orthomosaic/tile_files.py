@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.mission.store import durable
-from daemon.onboard.live_orthomosaic.web_tiles import TileId
+from daemon.onboard.live_orthomosaic.map_layout import TILES_FOLDER, TileId, tile_file
 from daemon.onboard.monitoring.maps.tiles import TILE_PX
 
 Words = NDArray[np.uint16]
@@ -27,7 +27,6 @@ QUALITY: Final = 65
 IN_MEMORY: Final = 96
 """Signals in memory, 131 kB each."""
 IMAGES_IN_MEMORY: Final = 32
-TILES_FOLDER: Final = "tiles"
 WORK_FOLDER: Final = "work"
 
 
@@ -148,12 +147,6 @@ class TileFiles:
 
     def _image_file(self, number: int) -> Path:
         return self.folder / WORK_FOLDER / f"image-{number:06d}.npy"
-
-
-def tile_file(folder: Path, tile: TileId) -> Path:
-    """Where the picture of a tile is."""
-    zoom, x, y = tile
-    return folder / TILES_FOLDER / str(zoom) / str(x) / f"{y}.webp"
 
 
 def encoded(grey: NDArray[np.uint8], alpha: NDArray[np.uint8]) -> bytes:

@@ -24,9 +24,6 @@ HEIGHT_STEP_PX: Final = 4
 """Heights are read at every so many pixels; bilinear between."""
 _RADIUS_M: Final = EARTH_HALF_M / math.pi
 
-TileId = tuple[int, int, int]
-"""Level, column, row."""
-
 
 def pixel_m(zoom: int) -> float:
     """Size of a pixel of a level in metres of the web Mercator plane."""

@@ -19,6 +19,7 @@ from daemon.onboard.flight.fault_latches import (
     FaultLatches,
 )
 from daemon.onboard.flight.phases import Phase
+from daemon.onboard.monitoring.live_map_state import LiveMapState
 from daemon.onboard.monitoring.previews import Preview
 
 PHASES = frozenset(phase.value for phase in Phase)
@@ -93,6 +94,7 @@ class FlightState:
         self._track: deque[Json] = deque(maxlen=HISTORY_MAX)
         self._retakes: list[Json] = []
         self._triangulation: Json = {}
+        self.live_map = LiveMapState()
         self._landing: Json = {}
         self.guidance: Mapping[str, Any] = {}
         """The last guidance; it has no sequence, since the next one replaces it."""
@@ -117,6 +119,7 @@ class FlightState:
             "processed",
             "triangulated",
             "triangulation",
+            "orthomosaic",
             "landing-action",
         ):
             self._events.append({"sequence": self.sequence, **event})
@@ -135,6 +138,7 @@ class FlightState:
             "verdicts": self._verdict_counts(),
             **({"retakes": len(self._retakes)} if self._retakes else {}),
             **({"landing": self._landing} if self._landing else {}),
+            **({"orthomosaic": self.live_map.version} if self.live_map.version else {}),
         }
 
     def changed(self, part: str, after: int) -> list[Json]:
@@ -235,6 +239,7 @@ class FlightState:
         self._phase = "idle"
         self._retakes.clear()
         self._triangulation = {}
+        self.live_map.clear()
         self._landing = {}
 
     def _on_bound(self, event: Mapping[str, Any]) -> None:
@@ -359,6 +364,9 @@ class FlightState:
         block = {key: value for key, value in event.items() if key not in ("event", "mono_ns")}
         self._triangulation = {**self._triangulation, "block": block}
 
+    def _on_orthomosaic(self, event: Mapping[str, Any]) -> None:
+        self.live_map.apply(event)
+
     def _on_not_processed(self, event: Mapping[str, Any]) -> None:
         record = self._exposure(event)
         record |= {"step": "not processed", "sentence": event.get("sentence")}
@@ -453,6 +461,7 @@ _HANDLERS: Mapping[str, Callable[[FlightState, Mapping[str, Any]], None]] = {
     "processed": FlightState._on_processed,
     "triangulated": FlightState._on_triangulated,
     "triangulation": FlightState._on_triangulation,
+    "orthomosaic": FlightState._on_orthomosaic,
     "not-processed": FlightState._on_not_processed,
     "manual-verdict": FlightState._on_manual_verdict,
     "retake": FlightState._on_retake,

@@ -37,6 +37,7 @@ from daemon.onboard.monitoring.coverage import Coverage
 from daemon.onboard.monitoring.flight_state import EXPOSURES_MAX, PARTS, PREVIEW_PARTS, FlightState
 from daemon.onboard.monitoring.guidance_routes import add_guidance
 from daemon.onboard.monitoring.image_routes import add_images
+from daemon.onboard.monitoring.live_map import add_live_map
 from daemon.onboard.monitoring.map_routes import add_maps
 from daemon.onboard.monitoring.maps.map_library import MapLibrary
 from daemon.onboard.monitoring.metrics import exposition
@@ -47,7 +48,7 @@ from daemon.onboard.monitoring.web.connections import (
     Connections,
     source_of,
 )
-from daemon.onboard.monitoring.web.page_files import PAGE, add_security_headers
+from daemon.onboard.monitoring.web.page_files import PAGE, PRODUCT_POLICY, add_security_headers
 from daemon.onboard.monitoring.web.problems import (
     documented_problem,
     http_problem,
@@ -74,8 +75,6 @@ IMAGES = {
     "histogram.json": "application/json",
     "quality.json": "application/json",
 }
-PRODUCT_POLICY = "sandbox; default-src 'none'; style-src 'unsafe-inline'; img-src data:"
-"""Headers of a file from a mission, so that no browser treats it as a page."""
 
 
 class CommandResponse(BaseModel):
@@ -158,6 +157,7 @@ def create_app(
     _add_telemetry(app, state, access)
     add_guidance(app, state, access, PAGE / "pilot.html")
     add_maps(app, maps or MapLibrary(()), Depends(access.watch))
+    add_live_map(app, state, Depends(access.watch))
     add_images(app, state, Depends(access.watch))
     add_plan(app, state, coverage or Coverage(state), Depends(access.watch))
     _add_page(app)

@@ -13,6 +13,8 @@ CONTENT_SECURITY_POLICY = (
     "connect-src 'self'; frame-ancestors 'none'; base-uri 'none'; form-action 'none'; "
     "object-src 'none'; require-trusted-types-for 'script'; trusted-types default"
 )
+PRODUCT_POLICY = "sandbox; default-src 'none'; style-src 'unsafe-inline'; img-src data:"
+"""Of a file from a mission, so that no browser treats it as a page."""
 
 
 async def add_security_headers(

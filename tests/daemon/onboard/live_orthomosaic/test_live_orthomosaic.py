@@ -18,8 +18,9 @@ from daemon.onboard.live_orthomosaic import mission_map
 from daemon.onboard.live_orthomosaic.block_gains import owners_of
 from daemon.onboard.live_orthomosaic.live_orthomosaic import BYTES_PER_EXPOSURE
 from daemon.onboard.live_orthomosaic.map_ground import PlaneGround, plane_through
+from daemon.onboard.live_orthomosaic.map_layout import tile_file
 from daemon.onboard.live_orthomosaic.mission_map import MissionMap
-from daemon.onboard.live_orthomosaic.tile_files import merged, relative_change, tile_file
+from daemon.onboard.live_orthomosaic.tile_files import merged, relative_change
 from daemon.onboard.monitoring.maps.pmtiles import PmtilesMap
 from daemon.onboard.triangulation.mission_triangulation import MissionTriangulation
 from daemon.orientation.exterior_orientation import sealed_exposures

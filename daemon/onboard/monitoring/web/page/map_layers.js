@@ -4,6 +4,7 @@ import { fetchJson, fetchOk } from "./http.js";
 import { t } from "./i18n.js";
 import { element } from "./dom.js";
 import { drawTile } from "./mvt.js";
+import { startLiveMap } from "./live_map.js";
 import { startSelection } from "./map_selection.js";
 import { thumbnailOf } from "./thumbnails.js";
 
@@ -150,6 +151,7 @@ export function startLayers(map, feed) {
     placeThumbnails(map, feed.flight);
   });
   tools.append(button);
+  startLiveMap(map, feed, tools);
   // On a phone the tools cover the map only while they are wanted.
   const more = document.getElementById("map-more");
   more.addEventListener("click", () => more.setAttribute("aria-expanded", String(tools.classList.toggle("opened"))));

@@ -21,6 +21,7 @@ import * as landing from "./landing.js";
 import * as wakeLock from "./wake_lock.js";
 import * as install from "./install.js";
 import * as expert from "./expert.js";
+import * as triangulation from "./triangulation.js";
 import * as map from "./map.js";
 import * as plan from "./plan.js";
 import * as quicklook from "./quicklook.js";
@@ -36,6 +37,7 @@ const MODULES = [
   [landing, "landing"], [wakeLock, "settings"], [install, "settings"], [devices, "page-devices"],
   [exposure, "exposure-panel"], [map, "map-panel"], [plan, "reflights"], [quicklook, "image-panel"],
   [guidance, "guidance"], [strip, "strip"], [deepzoom, "image-panel"], [manual, "image-panel"], [expert, "page-expert"],
+  [triangulation, "triangulation"],
 ];
 
 fill();
