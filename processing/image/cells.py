@@ -30,6 +30,7 @@ from processing.image.taps import (
     values_strip,
     weights_at,
 )
+from processing.radiometry.unclean_blocks import BLOCK_PX
 
 Array = NDArray[Any]
 
@@ -220,7 +221,7 @@ def _is_near_identity(corners):
 
 
 @njit(cache=True, nogil=True)
-def straight_taps(frame, valid, lattice, band, column, cell, reach):
+def straight_taps(frame, valid, lattice, band, column, cell, reach, unclean):
     """Whether a cell's taps are one rectangle of raw pixels, and none of them marred.
 
     Args:
@@ -231,6 +232,8 @@ def straight_taps(frame, valid, lattice, band, column, cell, reach):
         column: column of the cell in the lattice.
         cell: side of the cell, px.
         reach: of a `processing.image.kernels.Kernel`.
+        unclean: marks of the frame's blocks (`processing.radiometry.unclean_blocks`); only where
+            one is set are the pixels looked at.
 
     Returns:
         Raw column and row that the taps of the cell's first pixel lie around; -1, -1 where the cell
@@ -263,8 +266,12 @@ def straight_taps(frame, valid, lattice, band, column, cell, reach):
         return -1, -1
     if left - 2 + _columns(cell) > width or top - 2 + cell + _EXTRA > height:
         return -1, -1
+    marked = False
+    for i in range((top - 2) // BLOCK_PX, (top + cell + 2) // BLOCK_PX + 1):
+        for j in range((left - 2) // BLOCK_PX, (left + cell + 2) // BLOCK_PX + 1):
+            marked |= unclean[i, j] != 0
     first = (top - 2) * width + left - 2
-    if not is_clean(frame.reshape(-1), first, width, cell + _EXTRA, cell + _EXTRA):
+    if marked and not is_clean(frame.reshape(-1), first, width, cell + _EXTRA, cell + _EXTRA):
         return -1, -1
     return left, top
 

@@ -40,6 +40,7 @@ from processing.image.resampling import (
 from processing.image.seams import seam_labels, seam_weights
 from processing.radiometry.demosaic import BAYER_BANDS, demosaic, is_bayer
 from processing.radiometry.level1 import exposed_rows
+from processing.radiometry.unclean_blocks import unknown_blocks
 from processing.rig import Rig, Sensor, VirtualImage
 
 Array = NDArray[Any]
@@ -116,6 +117,8 @@ class PanComposer:
         per_cell = self.cell_px // WEIGHT_STEP_PX
         nodes = ((rows - 1) * per_cell + 1, (columns - 1) * per_cell + 1)
         self._frames = _stack(self.sensors)
+        one = unknown_blocks(*self._frames.shape[1:])
+        self._unclean = np.ones((count, *one.shape), np.uint8)
         self._lattices = np.full((count, rows, columns, 2), OUTSIDE)
         self._spare = np.full((rows, columns, 2), OUTSIDE)
         self._valid = np.tile(np.array(_OUTSIDE_LATTICE), (count, 1))
@@ -136,6 +139,22 @@ class PanComposer:
         index = self.names.index(name)
         sensor = self.sensors[index]
         view: Array = self._frames[index, : sensor.height_px, : sensor.width_px]
+        return view
+
+    def unclean(self, name: str) -> Array:
+        """Where the blocks of a sensor's frame that hold saturated pixels or holes may be marked.
+
+        Every block counts as such until it is written, and again after each image.
+
+        Args:
+            name: name of the sensor.
+
+        Returns:
+            View of the marks (`processing.radiometry.unclean_blocks`), (rows, columns) uint8.
+        """
+        sensor = self.sensors[self.names.index(name)]
+        rows, columns = unknown_blocks(sensor.height_px, sensor.width_px).shape
+        view: Array = self._unclean[self.names.index(name), :rows, :columns]
         return view
 
     def compose(
@@ -182,7 +201,9 @@ class PanComposer:
             interpolation=interpolation,
             out=self._pan,
             source=self._source,
+            unclean=self._unclean,
         )
+        self._unclean[:] = 1
         return Composition(self._pan, self._source, balance)
 
     def geometry(self, placements: Mapping[str, SensorPlacement] | None = None) -> dict[str, Array]:
@@ -247,10 +268,12 @@ class ColourComposer:
         self._raw: dict[str, Array] = {}
         self._planes: dict[str, Array] = {}
         self._frames: dict[str, Array] = {}
+        self._unclean: dict[str, Array] = {}
         for head in self.heads:
             one = _stack([head.sensor])
             name = head.sensor.name
             self._raw[name] = one[0]
+            self._unclean[name] = unknown_blocks(*one.shape[1:])[None]
             self._planes[name] = one
             if is_bayer(head.sensor):
                 self._planes[name] = _stack([head.sensor] * len(BAYER_BANDS))
@@ -272,6 +295,21 @@ class ColourComposer:
             The buffer, (h, w) uint16.
         """
         return self._raw[head.sensor.name]
+
+    def unclean(self, head: ColourHead) -> Array:
+        """Where the blocks of a head's frame that hold saturated pixels or holes may be marked.
+
+        They do not count for a Bayer head. Every block counts as such until it is written, and
+        again after each image.
+
+        Args:
+            head: one of the composer's heads.
+
+        Returns:
+            The marks (`processing.radiometry.unclean_blocks`), (rows, columns) uint8.
+        """
+        marks: Array = self._unclean[head.sensor.name][0]
+        return marks
 
     def leading(self, head: ColourHead) -> Array:
         """The frame of the band that a head is matched by, once its own frame is written.
@@ -329,7 +367,9 @@ class ColourComposer:
             interpolation=interpolation,
             out=self._bands[band],
             source=self._source,
+            unclean=None if is_bayer(placement.sensor) else self._unclean[placement.sensor.name],
         )
+        self._unclean[placement.sensor.name][:] = 1
         return self._bands[band]
 
     @property

@@ -22,6 +22,7 @@ from processing.image.cells import MAX_CELL_PX, fetch_cell, fetch_straight, stra
 from processing.image.kernels import KERNELS, Interpolation
 from processing.image.lattice import OUTSIDE
 from processing.image.taps import LINE_LENGTH, MISSING
+from processing.radiometry.unclean_blocks import unknown_blocks
 
 Array = NDArray[Any]
 
@@ -49,6 +50,7 @@ def resample(
     interpolation: Interpolation,
     out: Array,
     source: Array,
+    unclean: Array | None = None,
 ) -> None:
     """Fetch every target pixel from the frames.
 
@@ -64,6 +66,8 @@ def resample(
         out: (height, width) uint16; 0 is no data.
         source: (height, width) uint8: 0 no data, else 1 + index of the frame of greatest weight,
             with `SATURATED_SOURCE` set where one of the four nearest raw pixels was saturated.
+        unclean: marks of the frames' blocks (`processing.radiometry.unclean_blocks`), (n, rows,
+            columns) uint8; None looks at all pixels.
 
     Raises:
         ValueError: a cell that is no multiple of the weight step, or larger than `MAX_CELL_PX`.
@@ -75,6 +79,9 @@ def resample(
             f"cell of {cell_px} px; it is a multiple of {WEIGHT_STEP_PX}, at most {MAX_CELL_PX}"
         )
     kernel = KERNELS[interpolation]
+    if unclean is None:
+        one = unknown_blocks(*frames.shape[1:])
+        unclean = np.ones((len(frames), *one.shape), np.uint8)
     _resample(
         frames,
         valid,
@@ -87,6 +94,7 @@ def resample(
         kernel.reach,
         out,
         source,
+        unclean,
     )
 
 
@@ -296,7 +304,9 @@ def _mixed_cell(
 
 
 @njit(cache=True, parallel=True, fastmath=True, nogil=True)
-def _resample(frames, valid, lattices, cell, weights, gains, offsets, table, reach, out, source):
+def _resample(
+    frames, valid, lattices, cell, weights, gains, offsets, table, reach, out, source, unclean
+):
     height, width = out.shape
     nodes = cell // WEIGHT_STEP_PX
     columns = (width + cell - 1) // cell
@@ -321,7 +331,7 @@ def _resample(frames, valid, lattices, cell, weights, gains, offsets, table, rea
             if found == 1:
                 s = chosen[0]
                 left, top = straight_taps(
-                    frames[s], valid[s], lattices[s], band, column, cell, reach
+                    frames[s], valid[s], lattices[s], band, column, cell, reach, unclean[s]
                 )
                 if left >= 0:
                     straight[column, 0] = s

@@ -89,6 +89,7 @@ class ExposureInput:
         tdi_shifts: int = 0,
         scale: float = 1.0,
         measure_lines: bool = False,
+        unclean: Array | None = None,
     ) -> FrameStatistics:
         """Level-1 of one frame.
 
@@ -98,6 +99,7 @@ class ExposureInput:
             tdi_shifts: of the frame.
             scale: factor of the signal.
             measure_lines: whether the means of bundles along lines are wanted.
+            unclean: marks of the frame's blocks (`processing.radiometry.unclean_blocks`), written.
 
         Returns:
             What the correction counted and measured in the frame.
@@ -112,6 +114,7 @@ class ExposureInput:
             scale=scale,
             out=out,
             measure_lines=measure_lines,
+            unclean=unclean,
         )
 
 

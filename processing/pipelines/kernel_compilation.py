@@ -39,6 +39,7 @@ _KERNEL_MODULES: Final = (
     "processing.matching.least_squares",
     "processing.radiometry.defects",
     "processing.radiometry.level1",
+    "processing.radiometry.unclean_blocks",
     "processing.matching.patches",
     "processing.matching.prefetch",
     "processing.matching.sampling",

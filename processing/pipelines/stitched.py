@@ -206,17 +206,23 @@ class Pipeline(
             if name not in frames:
                 continue
             sensor = self._correctors[name].sensor
+            unclean = (
+                self._colour.unclean(heads[name]) if name in heads else self._pan.unclean(name)
+            )
             statistics[name] = exposure.correct(
                 self._correctors[name],
                 out=out,
                 tdi_shifts=conditions.tdi_shifts.get(name, 0),
                 scale=scales.get(name, 1.0),
                 measure_lines=name not in heads or not is_bayer(sensor),
+                unclean=unclean,
             )
             level1[name] = self._colour.leading(heads[name]) if name in heads else out
             level1_frame = self._colour.planes(heads[name]) if name in heads else (out,)
             unread = statistics[name].unread_fraction
             changed = blank_unread(sensor, frames[name], unread, *level1_frame)
+            if changed:
+                unclean[:] = 1
             if changed or level1[name] is not out:
                 rows = exposed_rows(sensor, conditions.tdi_shifts.get(name, 0))
                 lines = line_means(level1[name], rows)

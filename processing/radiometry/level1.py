@@ -30,6 +30,8 @@ from processing.radiometry.calibration import (
     neutral_radiometry,
 )
 from processing.radiometry.defects import interpolate_defects, spread_defects
+from processing.radiometry.fixed_point import fixed_point, quantised
+from processing.radiometry.unclean_blocks import begin_marks, mark_line, mark_pixels
 from processing.rig import Sensor
 
 Array = NDArray[Any]
@@ -134,11 +136,11 @@ def corrector_for(sensor: Sensor, calibration: RadiometricCalibration | None) ->
     least_dark, dark_unit = float(calibration.dark_dn_per_s.flat[0]), 0.0
     if not flat:
         good = calibration.defect == 0
-        bias, least_bias, bias_unit = _quantised(calibration.bias_dn, good, _BIAS_STEP_DN)
-        dark, least_dark, dark_unit = _quantised(
+        bias, least_bias, bias_unit = quantised(calibration.bias_dn, good, _BIAS_STEP_DN)
+        dark, least_dark, dark_unit = quantised(
             calibration.dark_dn_per_s, good, _DARK_STEP_DN_PER_S
         )
-        response = _fixed_point(1.0 / calibration.gain, 1.0 / _RESPONSE_UNIT)
+        response = fixed_point(1.0 / calibration.gain, 1.0 / _RESPONSE_UNIT)
     return Corrector(
         sensor=sensor,
         bias=bias,
@@ -166,6 +168,7 @@ def level1_from_level0(
     out: Array,
     scale: float = 1.0,
     measure_lines: bool = False,
+    unclean: Array | None = None,
 ) -> FrameStatistics:
     """Fill `out` with the Level-1 words of a raw frame.
 
@@ -183,6 +186,7 @@ def level1_from_level0(
         scale: multiplies the signal, after the offset was taken off. What it carries beyond the
             range of words counts as saturated.
         measure_lines: whether the means of bundles along lines are wanted.
+        unclean: marks as of `processing.radiometry.unclean_blocks.unknown_blocks`, overwritten.
 
     Returns:
         What the pass saw of the frame.
@@ -230,6 +234,8 @@ def level1_from_level0(
     least = min_raw_value(sensor)
     out[:first] = 0
     out[end:] = 0
+    marks = np.zeros((0, 0), np.uint8) if unclean is None else unclean
+    begin_marks(marks, sensor.height_px, exposed)
     if corrector.bias is None or corrector.dark is None or corrector.response is None:
         _flat_pass(
             raw,
@@ -242,6 +248,7 @@ def level1_from_level0(
             sums,
             by_row,
             by_column,
+            marks,
         )
     else:
         _map_pass(
@@ -262,6 +269,7 @@ def level1_from_level0(
             sums,
             by_row,
             by_column,
+            marks,
         )
     if corrector.defect is not None:
         if shifts not in corrector.defects_by_shifts:
@@ -273,6 +281,8 @@ def level1_from_level0(
         add_pixels(out, places, first, -1, by_row, by_column)
         interpolate_defects(out, mask, places, period)
         add_pixels(out, places, first, 1, by_row, by_column)
+        if unclean is not None:
+            mark_pixels(out, places, unclean)
     pixels = max((end - first) * sensor.width_px, 1)
     total, saturated, unread = (int(value) for value in sums.sum(axis=0))
     for rows in (raw[:first], raw[end:]):
@@ -341,33 +351,10 @@ def exposed_rows(sensor: Sensor, tdi_shifts: int) -> tuple[int, int]:
     return 0, sensor.height_px - 1 - shifts
 
 
-def _fixed_point(
-    values: Array, unit: float, kind: type[np.unsignedinteger[Any]] = np.uint16
-) -> Array:
-    quantised: Array = np.clip(
-        np.rint(np.asarray(values) / np.float32(unit)), 0, np.iinfo(kind).max
-    )
-    return np.ascontiguousarray(quantised.astype(kind))
-
-
-def _quantised(values: Array, good: Array, coarsest: float) -> tuple[Array, float, float]:
-    """A map as words above its least value, in 8 bits where steps stay below the coarsest allowed.
-
-    Half the bytes are half the time: the pass waits for memory. Words of defects, which are not
-    read, are cut off to the range of good pixels.
-
-    Returns:
-        The words, the least value, the unit of a word.
-    """
-    of_good = values[good] if good.any() else values
-    least, most = float(np.min(of_good)), float(np.max(of_good))
-    kind = np.uint8 if most - least <= coarsest * np.iinfo(np.uint8).max else np.uint16
-    unit = max(most - least, 1e-6) / np.iinfo(kind).max
-    return _fixed_point(values - np.float32(least), unit, kind), least, unit
-
-
 @njit(cache=True, parallel=True, fastmath=_MATHEMATICS, nogil=True)
-def _flat_pass(raw, offset, factor, full_scale, least, first_row, out, sums, by_row, by_column):
+def _flat_pass(
+    raw, offset, factor, full_scale, least, first_row, out, sums, by_row, by_column, unclean
+):
     """The pass where one offset and one gain hold for all pixels.
 
     Corrects as many rows from `first_row` on as `by_row` has, in as many bands as `by_column`.
@@ -401,6 +388,8 @@ def _flat_pass(raw, offset, factor, full_scale, least, first_row, out, sums, by_
             saturated += row_saturated
             unread += _unread(source, least)
             add_line(target, row - first_row, row - begin, by_row, by_column[band])
+            if row_saturated > 0:
+                mark_line(target, row, unclean)
         sums[band, 0], sums[band, 1], sums[band, 2] = total, saturated, unread
 
 
@@ -423,6 +412,7 @@ def _map_pass(
     sums,
     by_row,
     by_column,
+    unclean,
 ):
     """The pass with maps; running sums along the column give the means over the pixels visited.
 
@@ -438,6 +428,8 @@ def _map_pass(
         end = first_row + height if band == bands - 1 else begin + tall
         dark_sum = np.zeros(width, np.int32)
         response_sum = np.zeros(width, np.int32)
+        no_dark = np.zeros(width, dark.dtype)
+        no_response = np.zeros(width, response.dtype)
         if begin < end:
             for visited in range(begin - back, begin - back + shifts + 1):
                 dark_row = dark[visited]
@@ -452,13 +444,26 @@ def _map_pass(
             source = raw[row]
             target = out[row]
             bias_row = bias[row]
+            # Sums move on by a row before they are used; nothing leaves or comes in the first row.
+            leaving = row - 1 - back
+            dark_leaving = no_dark if row == begin else dark[leaving]
+            dark_coming = no_dark if row == begin else dark[leaving + shifts + 1]
+            response_leaving = no_response if row == begin else response[leaving]
+            response_coming = no_response if row == begin else response[leaving + shifts + 1]
             row_total = np.int32(0)
             row_saturated = np.int32(0)
             for k in range(width):
+                darkness = dark_sum[k] + (np.int32(dark_coming[k]) - np.int32(dark_leaving[k]))
+                responses = response_sum[k] + (
+                    np.int32(response_coming[k]) - np.int32(response_leaving[k])
+                )
+                darkness, responses = np.int32(darkness), np.int32(responses)
+                dark_sum[k] = darkness
+                response_sum[k] = responses
                 dn = np.int32(source[k])
                 offset = base + np.float32(bias_row[k]) * bias_unit
-                offset += np.float32(dark_sum[k]) * dark_unit
-                signal = (np.float32(dn) - offset) * (factor / np.float32(response_sum[k]))
+                offset += np.float32(darkness) * dark_unit
+                signal = (np.float32(dn) - offset) * (factor / np.float32(responses))
                 half = np.int32(signal + np.float32(0.5))
                 half = min(max(half, np.int32(1)), np.int32(32767))
                 full = np.int32((dn >= ceiling) | (half >= 32767))
@@ -469,10 +474,8 @@ def _map_pass(
             saturated += row_saturated
             unread += _unread(source, least)
             add_line(target, row - first_row, row - begin, by_row, by_column[band])
-            if row + 1 < end:
-                leaving = row - back
-                _slide(dark_sum, dark[leaving], dark[leaving + shifts + 1])
-                _slide(response_sum, response[leaving], response[leaving + shifts + 1])
+            if row_saturated > 0:
+                mark_line(target, row, unclean)
         sums[band, 0], sums[band, 1], sums[band, 2] = total, saturated, unread
 
 
@@ -483,10 +486,3 @@ def _unread(line, least):
     for k in range(0, len(line), _UNREAD_STEP_PX):
         count += line[k] < least
     return count
-
-
-@njit(cache=True, nogil=True)
-def _slide(sums, leaving, coming):
-    """Move running sums on by one row."""
-    for k in range(len(sums)):
-        sums[k] += np.int32(coming[k]) - np.int32(leaving[k])
