@@ -10,6 +10,7 @@ from fastapi.params import Depends
 
 from daemon.onboard.monitoring.coverage import Coverage, advice_json
 from daemon.onboard.monitoring.flight_state import FlightState
+from daemon.onboard.monitoring.limits import limits_json
 from daemon.onboard.monitoring.remaining import remaining_json
 from daemon.onboard.monitoring.server_messages import with_messages
 from daemon.planning import reflight_files
@@ -32,6 +33,12 @@ def add_plan(app: FastAPI, state: FlightState, coverage: Coverage, watcher: Depe
     async def plan() -> dict[str, Any]:
         """Planned lines and the specification; an empty object without a plan."""
         return coverage.plan_json() or {}
+
+    @app.get("/api/v1/limits", dependencies=[watcher], tags=["plan"])
+    async def limits() -> dict[str, Any]:
+        """Limits of figures, `most` or `least`, by thresholds and plan."""
+        specification = (coverage.plan_json() or {}).get("specification", {})
+        return limits_json(state.mission_path, specification)
 
     @app.get("/api/v1/plan/stations/{number}", dependencies=[watcher], tags=["plan"])
     async def station(number: Number) -> dict[str, Any]:

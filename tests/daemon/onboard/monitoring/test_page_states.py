@@ -69,6 +69,11 @@ def test_an_absent_value_has_no_state_of_a_good_one(service: Service, browser: B
     service.emit(flight_events.status(triggers=1))
     rows = "[...document.querySelectorAll('#expert > div')]"
     browser.wait_for(f"{rows}.some((one) => one.innerText.includes('0.010 px'))", WITHIN_S)
+    # Each value that is judged has its limit next to it.
+    browser.wait_for(
+        f"{rows}.some((one) => one.innerText.includes('Limit: at most 0.30 px.'))", WITHIN_S
+    )
+    assert browser.evaluate(f"{rows}.filter((one) => one.innerText.includes('Limit:')).length") >= 7
     dashes = f"{rows}.filter((one) => one.querySelector('dt').innerText.endsWith('–'))"
     # Neither saturation, tilt, overlap nor others are in the report of this exposure.
     assert browser.evaluate(f"{dashes}.length") >= 6

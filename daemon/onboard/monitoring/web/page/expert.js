@@ -4,6 +4,7 @@ import { by, element, redraw, text } from "./dom.js";
 import { serverText, t } from "./i18n.js";
 import { angle, number, percent, sigma, speed } from "./format.js";
 import { lastWhere } from "./feed.js";
+import { fetchJson } from "./http.js";
 import { presentPosition } from "./lamps.js";
 import { drawCharts, fitCharts } from "./charts.js";
 
@@ -15,6 +16,32 @@ function judged(latest, ...flags) {
   const found = (latest?.findings || []).filter((one) => flags.includes(one.flag));
   const worst = found.some((one) => one.verdict === "refly") ? "refly" : found.some((one) => one.verdict === "usable") ? "usable" : "";
   return worst ? { state: RANK[worst], limit: serverText(found[0]) } : { state: latest ? "good" : "", limit: "" };
+}
+
+// Figure that limits a value, and how the limit is written.
+const LIMITS = {
+  clock_sigma: ["time_sigma_ns", sigma], time_sigma: ["time_sigma_ns", sigma],
+  sigma0: ["sigma0_px", (value) => `${number(value, 2)} px`], tie_points: ["tie_points_pp", number],
+  saturated: ["saturated_fraction", (value) => percent(value, 1)], tilt: ["tilt_deg", (value) => angle(value, 1)],
+  crab: ["crab_deg", (value) => angle(value, 1)], overlap: ["forward_overlap", percent],
+  gsd: ["gsd_m", (value) => `${number(100 * value, 1)} cm`], sun: ["sun_deg", angle],
+};
+let limits = {};
+let limitsOf = null;
+
+function limitText(code) {
+  const [figure, shown] = LIMITS[code] || [];
+  const { most, least } = limits[figure] || {};
+  if (most != null) return t("expert.most", { limit: shown(most) });
+  return least == null ? "" : t("expert.least", { limit: shown(least) });
+}
+
+// The limits of a mission are read once.
+async function readLimits(mission, redrawn) {
+  if (mission === limitsOf) return;
+  limitsOf = mission;
+  limits = (mission && await fetchJson("/api/v1/limits")) || {};
+  redrawn();
 }
 
 // Code, text, flags that judge it, and id of each value. The texts explain each in one line.
@@ -68,11 +95,12 @@ export function start(_root, feed) {
     text("speed", velocity && speed(Math.hypot(velocity[0], velocity[1])));
     text("triggers", status.ledger?.triggers?.triggers);
     text("lost", status.ledger?.triggers?.lost);
+    readLimits(feed.flight.brief.mission?.id ?? null, feed.refresh);
     const rows = values(feed.flight);
-    redraw(by("expert"), JSON.stringify(rows), () => rows.map(([code, shown, { state, limit }, id]) => element("div", { className: state },
+    redraw(by("expert"), JSON.stringify([rows, limits]), () => rows.map(([code, shown, { state, limit }, id]) => element("div", { className: state },
       element("dt", {}, element("span", { textContent: t(`expert.${code}`) }),
         element("span", { id: id || "", textContent: `${MARKS[state] || ""} ${shown}` })),
-      element("dd", { textContent: [t(`expert.${code}.text`), limit].filter(Boolean).join(" ") }))));
+      element("dd", { textContent: [t(`expert.${code}.text`), limitText(code), limit].filter(Boolean).join(" ") }))));
     if (isFirstRecord || !record || record.exposures) drawRows(feed.flight);
     if (isFirstRecord || !record || record.history) drawCharts();
     if (!record) fitCharts();
