@@ -22,8 +22,8 @@ squares: `charuco:COLUMNSxROWS:SQUARE:MARKER[:DICTIONARY]` counts squares,
 
 Focus the lenses as in flight and fix the focus ring. Take ten pictures or more with each head:
 corners in all parts of the image, the board tilted by 20 to 40 degrees in all four directions, and
-turned by 90 and 180 degrees. `--watch` follows a folder into which pictures arrive, and prints what
-is still missing. For the relative orientation, heads see the board at the same instant.
+rotated by 90 and 180 degrees. `--watch` follows a folder into which pictures arrive, and prints
+what is still missing. For the relative orientation, heads see the board at the same instant.
 
 The new folder holds a dated rig file, the covariance, a report with plots, and the comparison with
 a previous calibration. The rig becomes calibrated when every head has a lens and an orientation.

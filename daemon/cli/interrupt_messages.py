@@ -35,7 +35,7 @@ SENTENCES = {
         "compute the others"
     ),
     "orthomosaic": (
-        f"the tiles computed so far are kept and an earlier orthomosaic is as before; {RETRY_HINT} "
+        f"the tiles computed so far stay and an earlier orthomosaic is as before; {RETRY_HINT} "
         "to continue"
     ),
     "repair": f"every step done so far is complete; {RETRY_HINT} to finish",

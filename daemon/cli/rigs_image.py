@@ -101,7 +101,7 @@ def _print(console: Console, proposal: ImageProposal, refined: dict[str, Any]) -
     image = proposal.image
     for head, one in refined.items():
         console.print(
-            f"{head}: turned by {one['turned_deg']:.3f} degrees against the rig file, "
+            f"{head}: rotated by {one['turned_deg']:.3f} degrees against the rig file, "
             f"{one['ties']} tie points, {one['rms_px']:.2f} px",
             markup=False,
         )

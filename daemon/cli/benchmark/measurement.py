@@ -1,4 +1,4 @@
-"""Times of runs that take turns, and the machine they were taken on."""
+"""Times of runs that alternate, and the machine they were taken on."""
 
 from __future__ import annotations
 

@@ -196,7 +196,7 @@ def _datum(rig: Rig) -> str:
 
 def _verdict(rig: Rig, cone: CalibratedConeMounting) -> str:
     return (
-        f"cone {cone.cone}: turned by {np.linalg.norm(cone.correction_rad) * 1e6:.1f} urad "
+        f"cone {cone.cone}: rotated by {np.linalg.norm(cone.correction_rad) * 1e6:.1f} urad "
         f"({shift_px(rig, cone.correction_rad):.2f} px), known to "
         f"{float(np.max(cone.correction_sigma_rad)) * 1e6:.1f} urad from {len(cone.corrections)} "
         "exposures"
@@ -230,13 +230,13 @@ def _warnings(
     ]
     if flown.rig.timing == "syntopic":
         warnings.append(
-            "the cones fire one after the other: what the aircraft turned in between is part of "
-            "the turns as far as it does not average out; fly long and calm, and lines both ways, "
-            "which take out the crab of the wind. A speed, delay or crab that is always off the "
-            "same way stays in (see the table)"
+            "the cones fire one after the other: the rotation of the aircraft in between is part "
+            "of the angles as far as it does not average out; fly long and calm, and lines both "
+            "ways, which take out the crab of the wind. A speed, delay or crab that is always "
+            "off the same way stays in (see the table)"
         )
     warnings += [
-        f"cone {c.cone} turns by up to {float(np.max(c.unexplained_rad)) * 1e6:.0f} urad from "
+        f"cone {c.cone} rotates by up to {float(np.max(c.unexplained_rad)) * 1e6:.0f} urad from "
         "exposure to exposure, more than tie points explain: a loose head"
         for c in calibration.cones
         if flown.rig.timing != "syntopic"
@@ -320,5 +320,5 @@ def _plot(cone: CalibratedConeMounting) -> Plot:
         Curve(f"about {axis}", x, cone.corrections[:, k] * 1e6, joined=False)
         for k, axis in enumerate("xyz")
     ]
-    title = f"Cone {cone.cone}: turns of single exposures"
+    title = f"Cone {cone.cone}: rotations of single exposures"
     return Plot(title, chart_svg(title, ("exposure", "urad"), curves))

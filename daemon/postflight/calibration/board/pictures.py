@@ -211,7 +211,7 @@ def _pixels(file: PictureFile, cone: Cone) -> NDArray[Any]:
         height, width = pixels.shape[:2]
         raise BoardError(
             f"{file.path}: has {width} x {height} px, head {cone.name} {sensor.width_px} x "
-            f"{sensor.height_px}: a picture of another head, scaled, cropped or turned"
+            f"{sensor.height_px}: a picture of another head, scaled, cropped or rotated"
         )
     return np.asarray(pixels)
 

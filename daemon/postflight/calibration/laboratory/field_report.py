@@ -187,7 +187,7 @@ def field_report(
             f"{point_count} image points, redundancy {result.redundancy}; sigma of an image "
             f"coordinate {found.sigma_px:.4f} px, sigma0 {result.sigma0:.3f}.",
             "Datum: principal distance and point of every cone as they were, the first CCD of "
-            "each cone not turned, the master cone not rotated.",
+            "each cone not rotated, the master cone not rotated.",
         ],
         warnings=warnings,
         tables=[_parameters(rows, sigma), correlation_table(rows, covariance), _cones(found)],
