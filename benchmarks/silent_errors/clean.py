@@ -20,7 +20,7 @@ from scipy.stats import chi2
 from benchmarks.flags import MAX_TRUE_SMEAR_PX, true_smear_px
 from benchmarks.silent_errors.cases import named_causes
 from benchmarks.silent_errors.exposures import remeasured, world_of
-from benchmarks.silent_errors.limits import DMC, L, X
+from benchmarks.silent_errors.limits import DMC, MIDAS, L, X
 from benchmarks.silent_errors.scenes import SCENES
 from benchmarks.silent_errors.truth import CleanImage, compare
 from processing.quality.report import Verdict
@@ -32,6 +32,8 @@ DRAWS: Final = 10
 FIRST: Final = 100
 RIGS: Final = (X, X, X, L, DMC)
 """Each light's rig in turn."""
+STITCHED_LIGHTS: Final = 2 * len(RIGS) * len(SCENES)
+"""Lights from this number on are of `midas-mini`, whose heads share no image."""
 
 
 def clean_rows(count: int, seed: int, file: Path | None) -> Iterator[Row]:
@@ -54,9 +56,10 @@ def clean_rows(count: int, seed: int, file: Path | None) -> Iterator[Row]:
 def clean_row(number: int, seed: int) -> Row:
     """One healthy exposure by number and seed: its flags, false alarms and normalised errors."""
     light = number // DRAWS
-    rig = RIGS[light % len(RIGS)]
-    scene = list(SCENES)[light // len(RIGS) % len(SCENES)]
-    place = first_without_smear(rig, scene, FIRST + 10 * light)
+    rig, scene = rig_and_scene(light)
+    place = FIRST + 10 * light
+    if rig != MIDAS:
+        place = first_without_smear(rig, scene, place)
     emulated = remeasured(rig, place, seed * 1_000_000 + number, scene=scene)
     product = emulated.process()
     report = product.report
@@ -80,6 +83,14 @@ def clean_row(number: int, seed: int) -> Row:
         else float(np.sum(found.normalised.whitened**2)),
         "rank": 0 if found.normalised is None else len(found.normalised.whitened),
     }
+
+
+def rig_and_scene(light: int) -> tuple[str, str]:
+    """Rig and scene of a light by its number."""
+    scenes = list(SCENES)
+    if light >= STITCHED_LIGHTS:
+        return MIDAS, scenes[light % len(scenes)]
+    return RIGS[light % len(RIGS)], scenes[light // len(RIGS) % len(scenes)]
 
 
 def first_without_smear(rig: str, scene: str, first: int) -> int:

@@ -146,16 +146,28 @@ def _lit(rig: str, number: int, scene: str, place: int) -> RenderedExposure:
 
 
 def _toned(snapshot: Snapshot, tone: Tone, seed: int) -> dict[str, Array]:
-    """The light times a tone of the ground, which all sensors see at its place."""
+    """The light times a tone of the ground, which all sensors of one image see at its place.
+
+    Heads without a common image have ground of their own, whose edges run along their pixels.
+    """
     truth, light = snapshot.truth, {}
-    for name, seen in snapshot.light.items():
-        places = []
-        for key in ("vip_column", "vip_row"):
-            spline = RectBivariateSpline(
-                truth[f"{name}.rows"], truth[f"{name}.columns"], truth[f"{name}.{key}"], kx=1, ky=1
-            )
-            places.append(spline(np.arange(seen.shape[0]), np.arange(seen.shape[1])))
-        factor = tone(places[0], places[1], np.random.default_rng([seed, 31]))
+    for number, (name, seen) in enumerate(snapshot.light.items()):
+        rows, columns = np.meshgrid(*(np.arange(size) for size in seen.shape), indexing="ij")
+        places: list[Array] = [columns, rows]
+        seeds = [seed, 31, number]
+        if f"{name}.vip_column" in truth:
+            seeds = [seed, 31]
+            places = []
+            for key in ("vip_column", "vip_row"):
+                spline = RectBivariateSpline(
+                    truth[f"{name}.rows"],
+                    truth[f"{name}.columns"],
+                    truth[f"{name}.{key}"],
+                    kx=1,
+                    ky=1,
+                )
+                places.append(spline(np.arange(seen.shape[0]), np.arange(seen.shape[1])))
+        factor = tone(places[0], places[1], np.random.default_rng(seeds))
         light[name] = np.asarray(seen * factor, np.float32)
     return light
 

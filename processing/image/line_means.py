@@ -18,6 +18,8 @@ Array = NDArray[Any]
 BUNDLE_PX: Final = 32
 BUNDLES: Final = 39
 """So many bundles of pixels of a line are averaged, or as many as fit in it."""
+_TILE_ROWS: Final = 16
+"""Rows that are transposed at once: their words of one bundle fill a line of cache."""
 
 
 @dataclass(frozen=True)
@@ -58,9 +60,10 @@ def line_sums(height: int, width: int) -> tuple[Array, Array]:
         width: columns, px.
 
     Returns:
-        Sums along rows (bundles, height) and along columns (bundles, width), uint32.
+        Sums along rows (height, bundles) and along columns (bundles, width), uint32.
     """
-    by_row = np.zeros((min(BUNDLES, width // BUNDLE_PX), height), np.uint32)
+    # The bundles of a row lie side by side: one row is written at a time.
+    by_row = np.zeros((height, min(BUNDLES, width // BUNDLE_PX)), np.uint32)
     by_column = np.zeros((min(BUNDLES, height // BUNDLE_PX), width), np.uint32)
     return by_row, by_column
 
@@ -69,7 +72,7 @@ def means_of_sums(by_row: Array, by_column: Array, first_row: int) -> LineMeans:
     """Means of bundles from their sums.
 
     Args:
-        by_row: sums along rows, (bundles, rows) uint32.
+        by_row: sums along rows, (rows, bundles) uint32.
         by_column: sums along columns, (bundles, columns) uint32.
         first_row: row of the frame with which `by_row` begins.
 
@@ -77,9 +80,25 @@ def means_of_sums(by_row: Array, by_column: Array, first_row: int) -> LineMeans:
         Means, float32.
     """
     share = np.float32(1.0 / BUNDLE_PX)  # a power of two: exact
-    return LineMeans(
-        by_row.astype(np.float32) * share, by_column.astype(np.float32) * share, first_row
+    means = LineMeans(
+        np.empty(by_row.shape[::-1], np.float32), np.empty(by_column.shape, np.float32), first_row
     )
+    _divide_sums(by_row, by_column, share, means.by_row, means.by_column)
+    return means
+
+
+@njit(cache=True, nogil=True)
+def _divide_sums(by_row, by_column, share, means_by_row, means_by_column):
+    rows, bundles = by_row.shape
+    for first in range(0, rows, _TILE_ROWS):
+        last = min(first + _TILE_ROWS, rows)
+        for k in range(bundles):
+            for r in range(first, last):
+                means_by_row[k, r] = np.float32(by_row[r, k]) * share
+    for k in range(len(by_column)):
+        sums, means = by_column[k], means_by_column[k]
+        for c in range(len(sums)):
+            means[c] = np.float32(sums[c]) * share
 
 
 @njit(cache=True, parallel=True, nogil=True)
@@ -91,21 +110,20 @@ def _sum_lines(frame, by_row, by_column):
         first = block * tall
         last = height if block == blocks - 1 else first + tall
         for r in range(first, last):
-            add_line(frame[r], r, r - first, by_row, by_column[block])
+            add_line(frame[r], r - first, by_row[r], by_column[block])
 
 
 @njit(cache=True, nogil=True)
-def add_line(line, row, row_of_block, by_row, by_column):
-    """Add one line to the sums.
+def add_line(line, row_of_block, of_row, by_column):
+    """Sum the bundles of one line, and add it to those of the columns.
 
     Args:
         line: (w,) uint16.
-        row: where its sums go in `by_row`.
         row_of_block: its place within the block of rows that a bundle of each column is of.
-        by_row: (bundles, h) uint32, written.
+        of_row: (bundles,) uint32, overwritten.
         by_column: (w,) uint32, sums of this block's bundle; without columns nothing is added.
     """
-    bundles = len(by_row)
+    bundles = len(of_row)
     wide = len(line) // max(bundles, 1)
     for k in range(bundles):
         # Sums stay 32 bits wide, so that vectors hold eight of them and not four.
@@ -113,7 +131,7 @@ def add_line(line, row, row_of_block, by_row, by_column):
         part = line[k * wide : k * wide + BUNDLE_PX]
         for c in range(BUNDLE_PX):
             total = np.uint32(total + part[c])
-        by_row[k, row] = total
+        of_row[k] = total
     if row_of_block < BUNDLE_PX:
         for c in range(len(by_column)):
             by_column[c] += line[c]
@@ -128,10 +146,10 @@ def add_pixels(frame, places, first_row, sign, by_row, by_column):
         places: row and column in the frame, (n, 2).
         first_row: row of the frame with which `by_row` begins.
         sign: 1 adds, -1 subtracts.
-        by_row: sums along rows, changed in place, (bundles, rows) uint32.
+        by_row: sums along rows, changed in place, (rows, bundles) uint32.
         by_column: sums along columns, changed in place, (bundles, columns) uint32.
     """
-    bundles, height = by_row.shape
+    height, bundles = by_row.shape
     blocks = len(by_column)
     if bundles == 0 or blocks == 0:
         return
@@ -145,6 +163,6 @@ def add_pixels(frame, places, first_row, sign, by_row, by_column):
         value = np.uint32(sign * np.int64(frame[row, column]))
         k, block = column // wide, r // tall
         if k < bundles and column - k * wide < BUNDLE_PX:
-            by_row[k, r] += value
+            by_row[r, k] += value
         if block < blocks and r - block * tall < BUNDLE_PX:
             by_column[block, column] += value

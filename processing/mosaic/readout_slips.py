@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.matching.tie_points import PAN_TO_COLOUR, PAN_TO_PAN, TiePoints
+from processing.mosaic.slip_bins import bin_residuals, order_along, points_of_frame, shifted_runs
 from processing.quality.figures.stitching import SlipFigures
 from processing.rig import Rig
 
@@ -25,8 +26,6 @@ Array = NDArray[np.float64]
 Axis = Literal["rows", "columns"]
 
 _MAD_TO_SIGMA: Final = 1.4826
-_MEDIAN_EFFICIENCY_FACTOR: Final = 1.2533
-"""Standard deviation of a median over that of a mean, for normal errors."""
 MIN_SIGMA_PX: Final = 0.02
 MIN_COMMON_FRACTION: Final = 0.3
 """A point of a band has its shift within this share of it and three standard deviations."""
@@ -309,13 +308,17 @@ def _bands(
     settings: SlipSettings,
 ) -> list[tuple[Slip, float]]:
     """The most shifted bands of a frame along rows and columns, and what each explains."""
-    of_a = (tie_points.sensor_a == number) & usable
-    rows = np.flatnonzero(of_a | ((tie_points.sensor_b == number) & usable))
+    rows, raw, own = points_of_frame(
+        tie_points.sensor_a,
+        tie_points.sensor_b,
+        tie_points.raw_a,
+        tie_points.raw_b,
+        residuals,
+        usable,
+        number,
+    )
     if len(rows) < 6 * settings.bin_points:
         return []
-    in_a = of_a[rows]
-    own = np.where(in_a[:, None], residuals[rows], -residuals[rows])
-    raw = np.where(in_a[:, None], tie_points.raw_a[rows], tie_points.raw_b[rows])
     sensor = rig.sensor(tie_points.names[number])
     own_px = _own_px(rig, sensor.name)
     axes: tuple[tuple[Axis, int, int], ...] = (
@@ -359,15 +362,16 @@ def _best_band(
     """
     per = settings.bin_points
     bins = len(at) // per
-    order = np.argsort(at, kind="stable")[: bins * per]
-    at, residuals, sigma = at[order], residuals[order], sigma[order]
-    medians = np.median(residuals.reshape(bins, per, 2), axis=1)
-    information = np.sum(1.0 / sigma.reshape(bins, per) ** 2, axis=1)
-    level = np.median(residuals, axis=0)
-    sums = np.concatenate([np.zeros((1, 2)), np.cumsum(medians * information[:, None], axis=0)])
-    weight = np.concatenate([[0.0], np.cumsum(information)])
+    order = order_along(at, size)[: bins * per]
+    residuals, sigma = residuals[order], sigma[order]
+    medians, sums, weight, level = bin_residuals(residuals, sigma, per)
+    runs = shifted_runs(sums, weight, level, settings.limit)
+    if not len(runs):
+        return None
+    at = at[order]
     best: tuple[Slip, float] | None = None
-    for at_bin, width, score in _shifted_runs(sums, weight, level, settings.limit):
+    for run in runs:
+        at_bin, width, score = int(run[0]), int(run[1]), float(run[2])
         band = slice(at_bin, at_bin + width)
         shift = _shift_of_run(sums, weight, level, band)
         if np.abs(shift).max() > settings.min_shift_px(width * per):
@@ -400,41 +404,6 @@ def _best_band(
                 slip = Slip(name, axis, start, stop, float(dx), float(dy), share, score, points)
                 best = slip, explained
     return best
-
-
-def _shifted_runs(
-    sums: Array, weight: Array, level: Array, limit: float
-) -> list[tuple[int, int, float]]:
-    """First bin, width and score of the most shifted run of bins of each width, over a limit.
-
-    `sums` (bins + 1, 2) cumulates medians times information, `weight` (bins + 1,) information.
-    """
-    bins = len(weight) - 1
-    widths = [2] if bins > 2 else []
-    while widths and (width := max(widths[-1] + 1, math.ceil(widths[-1] * 1.2))) <= (bins + 1) // 2:
-        widths.append(width)
-    if not widths:
-        return []
-    # All runs of all widths at once: one array operation for each step.
-    counts = bins + 1 - np.array(widths)
-    first = np.concatenate([np.arange(count) for count in counts])
-    last = first + np.repeat(widths, counts)
-    held = weight[last] - weight[first]
-    reach = np.zeros(len(first))
-    for axis in (0, 1):
-        inside = sums[last, axis] - sums[first, axis]
-        means = inside / held
-        rest = (sums[-1, axis] - inside) / (weight[-1] - held)
-        np.maximum(reach, np.abs(means - level[axis]), out=reach)
-        np.maximum(reach, np.abs(means - rest), out=reach)
-    scores = reach * np.sqrt(held) / _MEDIAN_EFFICIENCY_FACTOR
-    starts = np.concatenate([[0], np.cumsum(counts)[:-1]])
-    runs = []
-    for k in np.flatnonzero(np.maximum.reduceat(scores, starts) > limit):
-        of_width = scores[starts[k] : starts[k] + counts[k]]
-        at_bin = int(np.argmax(of_width))
-        runs.append((at_bin, widths[k], float(of_width[at_bin])))
-    return runs
 
 
 def _shift_of_run(sums: Array, weight: Array, level: Array, run: slice) -> Array:

@@ -37,6 +37,7 @@ _KERNEL_MODULES: Final = (
     "processing.quality.signal_steps",
     "processing.quality.valid_area",
     "processing.matching.least_squares",
+    "processing.mosaic.slip_bins",
     "processing.radiometry.defects",
     "processing.radiometry.level1",
     "processing.radiometry.unclean_blocks",

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from processing.geometry.placement import (
     SensorPlacement,
-    raw_from_vip_mm,
     vip_mm_from_px,
     vip_mm_from_raw,
 )
@@ -33,8 +32,14 @@ WINDOWS: Final = (56, 36)
 WINDOW_PX: Final = 16
 """Side of a window, colour pixels."""
 _COLUMNS: Final = 10
-_BORDER_POINTS: Final = 9
 _BORDER_SHARE: Final = 0.02
+"""Of its sides by which the rectangle around a frame is widened: the lens bends the border."""
+_ORDER: Final = 4
+_LATTICE: Final = np.stack(
+    [share.ravel() for share in np.meshgrid(np.linspace(0.0, 1.0, 7), np.linspace(0.0, 1.0, 7))],
+    axis=1,
+)
+"""Places (49, 2) as shares of a frame."""
 _NO_DATA_LESS_ONE: Final = np.uint32(1 << 31)
 _PART: Final = 64
 """Windows that one thread measures in a row; the next one is fetched meanwhile."""
@@ -49,7 +54,8 @@ class CommonWindows:
     counts, `noise` (f, n) the variance of a pixel that light and read-out explain. The rest is
     along columns and along rows, (f, n, 2): `near` and `far` the mean squared differences of pixels
     one and two apart, `curved` the mean square of the second difference, all three in pixels of
-    colour and less noise; `fine` that of neighbouring pixels of the frame itself.
+    colour and less noise; `fine` that of neighbouring pixels of the frame itself, along one line of
+    each colour pixel.
     """
 
     names: tuple[str, ...]
@@ -117,34 +123,36 @@ def measure_common_windows(
 
 
 def _inside(placement: SensorPlacement, vip_mm: Array, half_px: int) -> tuple[Array, Array]:
-    """Raw places (m, 2) of the windows that lie whole in a frame, and which (n,) those are."""
+    """Raw places (m, 2) of the windows that lie whole in a frame, and which (n,) those are.
+
+    A polynomial through places of a lattice of the frame suffices: windows begin at whole pixels.
+    """
     sensor = placement.sensor
     first, last = exposed_rows(sensor, placement.tdi_shifts)
-    inside = _near(placement, vip_mm)
-    with np.errstate(invalid="ignore"):
-        at = raw_from_vip_mm(placement, vip_mm[inside])
-        whole = (at[:, 0] > half_px) & (at[:, 0] < sensor.width_px - half_px - 1)
-        whole &= (at[:, 1] > first + half_px) & (at[:, 1] < last - half_px)
+    size = np.array([sensor.width_px - 1.0, sensor.height_px - 1.0])
+    lattice_mm = vip_mm_from_raw(placement, _LATTICE * size)
+    low, high = lattice_mm.min(axis=0), lattice_mm.max(axis=0)
+    margin = _BORDER_SHARE * (high - low)
+    inside: Array = np.all((vip_mm > low - margin) & (vip_mm < high + margin), axis=1)
+    middle, half = 0.5 * (low + high), 0.5 * (high - low)
+    terms = _terms((lattice_mm - middle) / half)
+    coefficients = np.linalg.solve(terms.T @ terms, terms.T @ _LATTICE)
+    at = _terms((vip_mm[inside] - middle) / half) @ coefficients * size
+    whole = (at[:, 0] > half_px) & (at[:, 0] < sensor.width_px - half_px - 1)
+    whole &= (at[:, 1] > first + half_px) & (at[:, 1] < last - half_px)
     inside[inside] = whole
     return at[whole], inside
 
 
-def _near(placement: SensorPlacement, vip_mm: Array) -> Array:
-    """Which points (n,) lie in the rectangle around a frame's border in the virtual image.
-
-    The border is bent by the lens: the rectangle of some of its points is widened by
-    `_BORDER_SHARE` of its sides.
-    """
-    sensor = placement.sensor
-    along = np.linspace(0.0, 1.0, _BORDER_POINTS)
-    ends = np.repeat([0.0, 1.0], _BORDER_POINTS)
-    share = np.stack([np.tile(along, 4), np.tile(ends, 2)], axis=1)
-    share[2 * _BORDER_POINTS :] = share[2 * _BORDER_POINTS :, ::-1]
-    border = vip_mm_from_raw(placement, share * (sensor.width_px - 1.0, sensor.height_px - 1.0))
-    low, high = border.min(axis=0), border.max(axis=0)
-    margin = _BORDER_SHARE * (high - low)
-    near: Array = np.all((vip_mm > low - margin) & (vip_mm < high + margin), axis=1)
-    return near
+def _terms(places: Array) -> Array:
+    """Terms of a polynomial of order `_ORDER` in two coordinates (n, 2) within -1 to 1."""
+    powers = [np.ones(len(places)), places[:, 0]]
+    others = [powers[0], places[:, 1]]
+    for _ in range(_ORDER - 1):
+        powers.append(powers[-1] * places[:, 0])
+        others.append(others[-1] * places[:, 1])
+    columns = [powers[i] * others[k - i] for k in range(_ORDER + 1) for i in range(k + 1)]
+    return np.stack(columns, axis=1)
 
 
 def _variance(sensor: Sensor, signal: Array) -> Array:
@@ -175,19 +183,21 @@ def _window_sums(frame, corners, step, size, out):
             for y in range(size):
                 column[:] = 0
                 for r in range(top + y * step, top + (y + 1) * step):
-                    line = frame[r, left : left + side + 1]
-                    after = frame[r + 1, left : left + side]
+                    line = frame[r, left : left + side]
                     for j in range(side):
                         word = np.uint32(line[j])
                         column[j] += word
                         # The lowest bit of a saturated word, the highest one of no data less one.
                         union[j] |= word | ((word - np.uint32(1)) & _NO_DATA_LESS_ONE)
-                    for j in range(side):
-                        here = np.float32(line[j])
-                        down = np.float32(after[j]) - here
-                        right = np.float32(line[j + 1]) - here
-                        fine_y += down * down
-                        fine_x += right * right
+                # One line of each colour pixel suffices for the detail of pixels of the frame.
+                line = frame[top + y * step, left : left + side + 1]
+                after = frame[top + y * step + 1, left : left + side]
+                for j in range(side):
+                    here = np.float32(line[j])
+                    down = np.float32(after[j]) - here
+                    right = np.float32(line[j + 1]) - here
+                    fine_y += down * down
+                    fine_x += right * right
                 into = window[y]
                 for x in range(size):
                     total = np.uint32(0)
@@ -217,7 +227,7 @@ def _window_sums(frame, corners, step, size, out):
             out[i, 0], out[i, 1] = near_y * square, near_x * square
             out[i, 2], out[i, 3] = far_y * square, far_x * square
             out[i, 4], out[i, 5] = curved_y * square, curved_x * square
-            pixels = np.float64(size * size) * pixel
+            pixels = np.float64(size * side)
             out[i, 6], out[i, 7] = fine_y / pixels, fine_x / pixels
             out[i, 8] = mean / (inner * pixel)
             out[i, 9] = 1.0 if good else 0.0

@@ -229,7 +229,7 @@ def level1_from_level0(
     first, end = exposed[0], exposed[1] + 1
     by_row, by_column = line_sums(end - first, sensor.width_px)
     if not measure_lines or not by_row.size or not by_column.size:
-        by_row, by_column = np.zeros((0, end - first), np.uint32), np.zeros((_BANDS, 0), np.uint32)
+        by_row, by_column = np.zeros((end - first, 0), np.uint32), np.zeros((_BANDS, 0), np.uint32)
     sums = np.zeros((len(by_column), 3), np.int64)
     least = min_raw_value(sensor)
     out[:first] = 0
@@ -361,7 +361,7 @@ def _flat_pass(
     `sums` (bands, 3) takes half the Level-1 words, saturated and unread pixels.
     """
     width = raw.shape[1]
-    bands, height = len(by_column), by_row.shape[1]
+    bands, height = len(by_column), len(by_row)
     tall = height // bands
     # Sums and limits stay 32 bits wide, so that vectors hold eight pixels and not four.
     ceiling = np.int32(full_scale)
@@ -387,7 +387,7 @@ def _flat_pass(
             total += row_total
             saturated += row_saturated
             unread += _unread(source, least)
-            add_line(target, row - first_row, row - begin, by_row, by_column[band])
+            add_line(target, row - begin, by_row[row - first_row], by_column[band])
             if row_saturated > 0:
                 mark_line(target, row, unclean)
         sums[band, 0], sums[band, 1], sums[band, 2] = total, saturated, unread
@@ -420,7 +420,7 @@ def _map_pass(
     is as in `_flat_pass`.
     """
     width = raw.shape[1]
-    bands, height = len(by_column), by_row.shape[1]
+    bands, height = len(by_column), len(by_row)
     tall = height // bands
     ceiling = np.int32(full_scale)
     for band in prange(bands):
@@ -473,7 +473,7 @@ def _map_pass(
             total += row_total
             saturated += row_saturated
             unread += _unread(source, least)
-            add_line(target, row - first_row, row - begin, by_row, by_column[band])
+            add_line(target, row - begin, by_row[row - first_row], by_column[band])
             if row_saturated > 0:
                 mark_line(target, row, unclean)
         sums[band, 0], sums[band, 1], sums[band, 2] = total, saturated, unread

@@ -1,0 +1,171 @@
+"""Residuals of one frame in bins along an axis, and runs of bins that are shifted.
+
+What follows from such runs is in `processing.mosaic.readout_slips`. These loops run for every frame
+of every exposure, also where nothing is found.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Final
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
+
+MEDIAN_EFFICIENCY_FACTOR: Final = 1.2533
+"""Standard deviation of a median over that of a mean, for normal errors."""
+
+
+@njit(cache=True, nogil=True)
+def points_of_frame(
+    sensor_a: Array,
+    sensor_b: Array,
+    raw_a: Array,
+    raw_b: Array,
+    residuals: Array,
+    usable: Array,
+    number: int,
+) -> tuple[Array, Array, Array]:
+    """The usable tie points of one frame, with residuals as seen from this frame.
+
+    Args:
+        sensor_a: number of the first frame of each point, (n,).
+        sensor_b: of the second one, (n,).
+        raw_a: places in the first frame, (n, 2), px.
+        raw_b: in the second one, (n, 2), px.
+        residuals: place of a less place of b, (n, 2).
+        usable: which points count, (n,).
+        number: of the frame.
+
+    Returns:
+        Indices of its m points (m,), their places in the frame (m, 2), and the residuals (m, 2),
+        of the other sign where the frame is the second one.
+    """
+    rows = np.empty(len(sensor_a), np.int64)
+    count = 0
+    for i in range(len(sensor_a)):
+        if usable[i] and (sensor_a[i] == number or sensor_b[i] == number):
+            rows[count] = i
+            count += 1
+    raw, own = np.empty((count, 2)), np.empty((count, 2))
+    for k in range(count):
+        i = rows[k]
+        is_first = sensor_a[i] == number
+        for axis in range(2):
+            raw[k, axis] = raw_a[i, axis] if is_first else raw_b[i, axis]
+            own[k, axis] = residuals[i, axis] if is_first else -residuals[i, axis]
+    return rows[:count].copy(), raw, own
+
+
+@njit(cache=True, nogil=True)
+def order_along(at: Array, size: int) -> Array:
+    """Order of points along an axis, equal ones as they are: a stable sort.
+
+    Args:
+        at: places, (n,), px; few lie in the same pixel.
+        size: of the frame along the axis, px.
+
+    Returns:
+        Indices of the points, (n,) int64.
+
+    Example:
+        >>> order_along(np.array([5.0, 0.5, 5.0, 0.25]), 10)
+        array([3, 1, 0, 2])
+    """
+    pixel = np.empty(len(at), np.int64)
+    first = np.zeros(size + 2, np.int64)
+    for i in range(len(at)):
+        pixel[i] = min(max(math.floor(at[i]), -1), size) + 1
+        if pixel[i] <= size:
+            first[pixel[i] + 1] += 1
+    for k in range(1, len(first)):
+        first[k] += first[k - 1]
+    order = np.empty(len(at), np.int64)
+    for i in range(len(at)):
+        order[first[pixel[i]]] = i
+        first[pixel[i]] += 1
+    # Within a pixel the order is that of the points; now that of their places.
+    for j in range(1, len(order)):
+        i, k = order[j], j
+        while k > 0 and at[order[k - 1]] > at[i]:
+            order[k] = order[k - 1]
+            k -= 1
+        order[k] = i
+    return order
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def bin_residuals(residuals: Array, sigma: Array, per: int) -> tuple[Array, Array, Array, Array]:
+    """Medians of residuals in bins, running sums over the bins, and the median of all.
+
+    Args:
+        residuals: in the order of the axis, (bins * per, 2).
+        sigma: standard deviation of a coordinate of each, (bins * per,).
+        per: points of a bin.
+
+    Returns:
+        Medians (bins, 2), sums of medians times information (bins + 1, 2), sums of information
+        (bins + 1,), the first of which are zero, and the median of all (2,). Information is the
+        sum of 1 / sigma^2.
+    """
+    bins = len(sigma) // per
+    medians = np.empty((bins, 2))
+    sums, weight = np.zeros((bins + 1, 2)), np.zeros(bins + 1)
+    values = np.empty(per)
+    for b in range(bins):
+        information = 0.0
+        for k in range(b * per, (b + 1) * per):
+            information += 1.0 / sigma[k] ** 2
+        weight[b + 1] = weight[b] + information
+        for axis in range(2):
+            for k in range(per):
+                value, place = residuals[b * per + k, axis], k
+                while place > 0 and values[place - 1] > value:
+                    values[place] = values[place - 1]
+                    place -= 1
+                values[place] = value
+            medians[b, axis] = (values[(per - 1) // 2] + values[per // 2]) / 2.0
+            sums[b + 1, axis] = sums[b, axis] + medians[b, axis] * information
+    level = np.array([np.median(residuals[:, 0].copy()), np.median(residuals[:, 1].copy())])
+    return medians, sums, weight, level
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def shifted_runs(sums: Array, weight: Array, level: Array, limit: float) -> Array:
+    """The most shifted run of bins of each width whose score is over a limit.
+
+    A run is shifted against the frame's level or against the mean of the rest, whichever is more.
+
+    Args:
+        sums: of medians times information, (bins + 1, 2).
+        weight: sums of information, (bins + 1,).
+        level: of the frame, (2,).
+        limit: of the score: the shift over its standard deviation.
+
+    Returns:
+        First bin, width and score by run, (runs, 3).
+    """
+    bins = len(weight) - 1
+    found = np.empty((bins, 3))
+    count, width = 0, 2 if bins > 2 else bins + 1
+    while width <= max((bins + 1) // 2, 2) and width <= bins:
+        best, at_bin = -1.0, 0
+        for first in range(bins + 1 - width):
+            held = weight[first + width] - weight[first]
+            reach = 0.0
+            for axis in range(2):
+                inside = sums[first + width, axis] - sums[first, axis]
+                mean = inside / held
+                rest = (sums[bins, axis] - inside) / (weight[bins] - held)
+                reach = max(reach, abs(mean - level[axis]), abs(mean - rest))
+            score = reach * math.sqrt(held) / MEDIAN_EFFICIENCY_FACTOR
+            if score > best:
+                best, at_bin = score, first
+        if best > limit:
+            found[count, 0], found[count, 1], found[count, 2] = at_bin, width, best
+            count += 1
+        width = max(width + 1, math.ceil(width * 1.2))
+    return found[:count]
