@@ -43,9 +43,11 @@ class FlownBlock:
     enu_from_camera: Array
 
 
-def flown_block(folder: Path, each: int, lines: int, *, seed: int = 5) -> FlownBlock:
-    """Render lines flown there and back; half the width of `ultracam-l-mini`."""
-    text = shipped_rigs()["ultracam-l-mini"].read_text()
+def flown_block(
+    folder: Path, each: int, lines: int, *, seed: int = 5, rig: str = "ultracam-l-mini"
+) -> FlownBlock:
+    """Render lines flown there and back; half the width of `ultracam-l-mini`, other rigs whole."""
+    text = shipped_rigs()[rig].read_text()
     file = folder / "rig.toml"
     file.write_text(text.replace("width_px = 2364", "width_px = 1182"))
     world = World(
