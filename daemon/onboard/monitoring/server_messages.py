@@ -59,7 +59,7 @@ class _Template:
 
     @property
     def is_frame(self) -> bool:
-        """Whether the text says nothing without the texts that it joins."""
+        """Whether the text has no meaning without the texts that it joins."""
         return bool(self.names) and not re.search(r"[A-Za-z]{3}", "".join(self.literals))
 
     def match(self, sentence: str) -> dict[str, str] | None:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from daemon.onboard.monitoring.web.connections import REQUESTS_BURST
 from tests.daemon.onboard.monitoring import flight_events
 from tests.daemon.onboard.monitoring.page_service import WITHIN_S, Service
 from tests.support.browser import Browser, chromium
@@ -66,6 +67,39 @@ def test_the_other_pages_recover_too(service: Service, browser: Browser, page: s
     browser.wait_for("document.readyState === 'complete'", WITHIN_S)
     browser.call("Network.setBlockedURLs", urls=[])
     browser.wait_for(READY, WITHIN_S)
+
+
+def test_a_page_opens_although_its_address_has_sent_too_many_requests(
+    service: Service, tmp_path: Path
+) -> None:
+    with Browser(tmp_path / "profile") as browser:
+        browser.open(service.address)
+        browser.wait_for(f"{CONNECTED} && navigator.serviceWorker.controller !== null", WITHIN_S)
+        browser.evaluate("location.reload()")
+        browser.wait_for(f"{CONNECTED} && {READY}", WITHIN_S)
+        refused = browser.evaluate(
+            f"""(async () => {{
+              const ask = () => fetch('/api/v1/ledger').then((one) => one.status);
+              const all = await Promise.all(Array.from({{length: {2 * REQUESTS_BURST}}}, ask));
+              return all.filter((status) => status === 429).length;
+            }})()"""
+        )
+        assert refused > 0
+        browser.evaluate("location.reload()")
+        browser.wait_for(f"{CONNECTED} && {READY} && typeof L === 'object'", WITHIN_S)
+
+
+def test_a_thumbnail_that_is_missing_is_not_asked_for_with_each_record(
+    service: Service, browser: Browser
+) -> None:
+    browser.open(service.address)
+    browser.wait_for(f"{CONNECTED} && {READY}", WITHIN_S)
+    browser.evaluate(
+        """import('/thumbnails.js').then(async ({ thumbnailOf }) => {
+          for (let k = 0; k < 5; k += 1) await thumbnailOf(4711);
+        })"""
+    )
+    assert sum(one.endswith("/4711/thumbnail.jpg") for one in browser.requested) == 1
 
 
 def test_a_complete_page_is_not_loaded_again(service: Service, browser: Browser) -> None:

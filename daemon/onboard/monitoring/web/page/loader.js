@@ -38,10 +38,12 @@
   addEventListener("error", (event) => {
     if ((!isReady() || document.readyState !== "complete") && ["SCRIPT", "LINK"].includes(event.target?.tagName)) recover();
   }, true);
-  new PerformanceObserver(() => { lastFileMs = performance.now(); }).observe({ type: "resource" });
+  const files = new PerformanceObserver(() => { lastFileMs = performance.now(); });
+  files.observe({ type: "resource" });
   const watching = setInterval(() => {
     if (isReady()) {
       clearInterval(watching);
+      files.disconnect();
       sessionStorage.removeItem(STORE);
     } else if (performance.now() - lastFileMs > STALL_MS) recover();
   }, 500);

@@ -3,12 +3,18 @@
 import { fetchOk } from "./http.js";
 
 const CACHED_MAX = 80;
+// Until a thumbnail that there was not is requested again: each record of a flight asks for all that are shown.
+const RETRY_MS = 5000;
 const known = new Map();
 
 // Address of the thumbnail of an exposure; null if there is none.
 export function thumbnailOf(number) {
   if (!known.has(number)) {
-    known.set(number, load(number));
+    const loaded = load(number);
+    known.set(number, loaded);
+    loaded.then((address) => {
+      if (!address) setTimeout(() => { if (known.get(number) === loaded) known.delete(number); }, RETRY_MS);
+    });
     while (known.size > CACHED_MAX) {
       const [oldest, address] = known.entries().next().value;
       known.delete(oldest);
@@ -39,10 +45,7 @@ async function load(number) {
     const perByteMs = latencyMs / Math.max(picture.size, FIRST_WINDOW_BYTES) + bodyMs / Math.max(picture.size, 1);
     secondsPerByte = 0.6 * secondsPerByte + 0.4 * perByteMs / 1000;
   }
-  if (!picture) {
-    known.delete(number);
-    return null;
-  }
+  if (!picture) return null;
   return URL.createObjectURL(picture);
 }
 

@@ -42,6 +42,8 @@ async function fetchWhole(request, timeoutMs) {
 
 async function fromNetwork(request, timeoutMs) {
   const response = await fetchWhole(request, timeoutMs);
+  // Refused for a moment, as by the limit of requests: no file of the page.
+  if (response.status === 429 || response.status >= 500) throw new Error(`status ${response.status}`);
   if (response.ok) (await caches.open(CACHE)).put(request, response.clone());
   return response;
 }
