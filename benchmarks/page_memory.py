@@ -13,10 +13,11 @@ import importlib
 import json
 import os
 import shutil
+import statistics
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -191,19 +192,36 @@ def measure(exposures: int, samples: int) -> dict[str, Any]:
     finally:
         child.end(1.0)
         shutil.rmtree(folder, ignore_errors=True)
-    half = next(one for one in found if one["exposures"] >= exposures // 2)
     growth = {
-        key: round(100 * (found[-1][key] / half[key] - 1), 1)
+        key: growth_percent([one[key] for one in found])
         for key in ("heap_mb", "renderer_mb", "renderer_purged_mb")
     }
     return {"samples": found, "growth_second_half_percent": growth, "loaded_again": again}
+
+
+def growth_percent(values: Sequence[float]) -> float:
+    """Growth over the second half of a flight.
+
+    Args:
+        values: samples at equal intervals, the last at the end.
+
+    Returns:
+        Median of the last three over the median of the three in the middle, less one, in percent.
+
+    Example:
+        >>> growth_percent([10.0, 20.0, 20.0, 21.0, 22.0, 22.0])
+        10.0
+    """
+    middle = len(values) // 2 - 1
+    before = statistics.median(values[max(0, middle - 1) : middle + 2])
+    return round(100 * (statistics.median(values[-3:]) / before - 1), 1)
 
 
 def main() -> int:
     """Measure and print JSON."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--exposures", type=int, default=5000, help="default: 5000")
-    parser.add_argument("--samples", type=int, default=10, help="default: 10")
+    parser.add_argument("--samples", type=int, default=20, help="default: 20")
     given = parser.parse_args()
     print(json.dumps(measure(given.exposures, given.samples), indent=1))
     return 0
