@@ -218,7 +218,7 @@ class DescribedHead:
         except KeyError:
             self.counts["formats_unknown"] += 1
             return
-        if self._big_endian_words and pixels.dtype == np.uint16:
+        if self._sends_big_endian() and pixels.dtype == np.uint16:
             pixels = pixels.byteswap()
         header = FrameHeader(
             block_id, now_ns, int(self.registers.number_or("PixelFormat", 0)), width, height
@@ -226,6 +226,15 @@ class DescribedHead:
         frame = FramePackets(header, pixels, self._chunks(pixels.nbytes, now_ns), destination)
         self._stream.put(frame, 1.0, lambda: generation == self._generation)
         self.counts["frames"] += 1
+
+    def _sends_big_endian(self) -> bool:
+        """Whether the most significant byte of a word is sent first."""
+        registers = self.registers
+        return (
+            self._big_endian_words
+            or registers.number_or("GevSCPSBigEndian", 0) == 1
+            or registers.symbolic_or("DeviceStreamChannelEndianness", "") == "Big"
+        )
 
     def _chunks(self, image_nbytes: int, now_ns: int) -> bytes:
         """The chunk data of a frame; empty while chunk mode is off."""

@@ -151,7 +151,7 @@ def test_features_are_written_in_addition() -> None:
         ({"trigger_delay_us": 5.0}, "the head has no trigger delay"),
         ({"strobe_line": "Line2"}, "the head has no LineSelector"),
         ({"width_px": 1000, "height_px": 480}, "width_px = 1000 is refused"),
-        ({"preset": "unknown"}, "there are allied-vision-gige"),
+        ({"preset": "unknown"}, "there are allied-vision-alvium"),
     ],
 )
 def test_what_is_missing_is_named(settings: dict[str, object], expected: str) -> None:

@@ -28,6 +28,10 @@ BAYER = {
     **{"BayerRG8": 0x0108_0009, "BayerGB10": 0x0110_000E, "BayerRG12": 0x0110_0011},
     **{"BayerBG10p": 0x010A_0052, "BayerRG12p": 0x010C_0059, "BayerGR12Packed": 0x010C_002A},
     **{"BayerRG16": 0x0110_002F, "Mono16": 0x0110_0007},
+    **{"BayerGR10Packed": 0x010C_0026, "BayerRG10Packed": 0x010C_0027},
+    **{"BayerGB10Packed": 0x010C_0028, "BayerBG10Packed": 0x010C_0029},
+    **{"BayerRG12Packed": 0x010C_002B, "BayerGB12Packed": 0x010C_002C},
+    **{"BayerBG12Packed": 0x010C_002D},
 }
 """Codes of pixel formats. Source: PFNC 2.4, table of values."""
 

@@ -14,7 +14,8 @@ from typing import ClassVar, Final
 
 from drivers import DriverError
 from drivers.cameras.aravis.byte_order import swapped_sentence
-from drivers.cameras.aravis.camera import AravisCamera, ClockLatch, ControlDeniedError
+from drivers.cameras.aravis.camera import AravisCamera, ClockLatch
+from drivers.cameras.aravis.camera_access import ControlDeniedError
 from drivers.cameras.aravis.frame_record import frame_record, frame_status
 from drivers.cameras.aravis.gvcp import (
     ACTION_LATE,

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from drivers.cameras.aravis.camera_access import (
+    ControlDeniedError,
     endless_features,
     local_interface,
     open_camera,
@@ -67,10 +68,6 @@ class FrameGeometry:
     pixel_format_code: int
     packing: Packing
     payload_nbytes: int
-
-
-class ControlDeniedError(DeviceError):
-    """Another program controls the head."""
 
 
 class AravisCamera:

@@ -20,6 +20,12 @@ from drivers.contract import DeviceError
 
 DEVICE_ERRORS: Final = "arv-device-error-quark"
 """Domain of the errors of Aravis' devices."""
+ACCESS_DENIED: Final = "access-denied"
+"""In the message of Aravis for the status GEV_STATUS_ACCESS_DENIED."""
+
+
+class ControlDeniedError(DeviceError):
+    """Another program controls the head."""
 
 
 def local_interface(head_name: str, address: str) -> str:
@@ -56,6 +62,7 @@ def open_camera(head_name: str, interface: str, address: str) -> Any:
         The camera of Aravis.
 
     Raises:
+        ControlDeniedError: another program has exclusive access.
         DeviceError: it does not answer.
     """
     library, failed = aravis(), aravis_error()
@@ -71,6 +78,10 @@ def open_camera(head_name: str, interface: str, address: str) -> Any:
         not_found = (DEVICE_ERRORS, int(library.DeviceError.GENICAM_NOT_FOUND))
         if (getattr(error, "domain", ""), getattr(error, "code", -1)) == not_found:
             raise DeviceError(unreadable_description(head_name, message_of(error))) from None
+        if ACCESS_DENIED in message_of(error):
+            raise ControlDeniedError(
+                f"{head_name}: another program has exclusive access to the head; end that program"
+            ) from None
         raise DeviceError(
             f"{head_name}: the head cannot be opened ({message_of(error)}); check power, cable and "
             "address"

@@ -43,20 +43,35 @@ NEUTRAL: Final[tuple[tuple[str, FeatureValue], ...]] = (
     ("SaturationEnable", False),
     ("SaturationEnabled", False),
     ("NoiseReductionEnable", False),
+    ("DenoisingEnable", False),
     ("LUTEnable", False),
+    ("DigitalShift", 0),
     ("ColorTransformationEnable", False),
     ("ColorTransformationMode", "Off"),
     ("RgbTransformLightSource", "Off"),
     ("OnBoardColorProcessEnabled", False),
+    ("ProcessedRawEnable", False),
+    ("FlatFieldCorrection", "Off"),
+    ("FfcEnable", False),
+    ("ShadingEnable", False),
+    ("LensShadingCorrectionMode", "Off"),
+    ("VignettingCorrectionMode", "Off"),
+    ("CorrectionMode", "Off"),
     ("DefectCorrectionEnable", False),
     ("DefectCorrectStaticEnable", False),
     ("DefectMaskEnable", False),
     ("PixelDefectControl", "Off"),
     ("BSLPixelDefectCorrectionMode", "Off"),
+    ("BslStaticDefectPixelCorrectionMode", "Off"),
+    ("pgrDefectPixelCorrectionEnable", False),
     ("TestPattern", "Off"),
     ("TestImageSelector", "Off"),
     ("TestPatternGeneratorSelector", "Off"),
+    ("ImageCompressionMode", "Off"),
+    ("AdaptiveCompressionEnable", False),
     ("pgrPixelBigEndian", False),
+    ("GevSCPSBigEndian", False),
+    ("DeviceStreamChannelEndianness", "Little"),
     ("ReverseX", False),
     ("ReverseY", False),
     ("BinningHorizontal", 1),
@@ -76,6 +91,8 @@ WITHOUT_EFFECT_WHILE_LOCKED: Final = frozenset(
     | {"SaturationEnable", "ColorTransformationEnable", "RgbTransformLightSource"}
 )
 """Processing of colour images."""
+BINNING: Final = ("BinningHorizontal", "BinningVertical")
+BINNING_SELECTOR: Final = "BinningSelector"
 GATED: Final[Mapping[str, tuple[str, ...]]] = {"Gamma": ("GammaEnable", "GammaEnabled")}
 """Features that have no effect while one of these switches exists and is off."""
 
@@ -100,9 +117,7 @@ def switch_off(
         refused = {}
         for name in waiting:
             try:
-                wanted = _wanted(features, name)
-                if wanted is not None:
-                    held[name] = features.set(name, wanted)
+                _switch_off_one(features, name, held)
             except FeatureError as error:
                 if not (name in WITHOUT_EFFECT_WHILE_LOCKED and features.is_locked(name)):
                     refused[name] = str(error)
@@ -111,6 +126,19 @@ def switch_off(
         f"{reason}; switch {name} off in the head, or state its value under features"
         for name, reason in refused.items()
     ]
+
+
+def _switch_off_one(features: Features, name: str, held: dict[str, FeatureValue]) -> None:
+    """Write the neutral value of a feature, of each entry of its selector where it has one."""
+    places = features.entries(BINNING_SELECTOR) if name in BINNING else []
+    before = features.text(BINNING_SELECTOR) if places else ""
+    # The entry that is selected comes last, so that it stays selected.
+    for place in sorted(places, key=lambda entry: entry == before) or [""]:
+        if place and features.is_writable(BINNING_SELECTOR):
+            features.set(BINNING_SELECTOR, place)
+        wanted = _wanted(features, name)
+        if wanted is not None:
+            held[name] = features.set(name, wanted)
 
 
 def _wanted(features: Features, name: str) -> FeatureValue | None:

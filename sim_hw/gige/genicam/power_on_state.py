@@ -114,6 +114,8 @@ _USER_VALUES: Mapping[str, float] = {
     "Height": 240,
     "OffsetX": 32,
     "OffsetY": 16,
+    "DigitalShift": 2,
+    "GevSCPSBigEndian": 1,
 }
 _USER_ENTRIES: Mapping[str, tuple[str, ...]] = {
     "AcquisitionMode": ("SingleFrame", "MultiFrame"),
@@ -123,6 +125,8 @@ _USER_ENTRIES: Mapping[str, tuple[str, ...]] = {
     "TriggerSelector": ("AcquisitionStart", "FrameBurstStart"),
     "TestPattern": ("GreyHorizontalRamp", "HorizontalRamp", "Increasing"),
     "TestImageSelector": ("GreyHorizontalRamp", "Testimage1", "TestImage1", "TestPattern1"),
+    "DeviceStreamChannelEndianness": ("Big",),
+    "ImageCompressionMode": ("Lossless", "JPEG", "On"),
 }
 _NEEDED = (
     *("AcquisitionMode", "AcquisitionStart", "AcquisitionStop", "PayloadSize", "PixelFormat"),
