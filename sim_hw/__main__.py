@@ -39,6 +39,7 @@ def parser() -> argparse.ArgumentParser:
     add("--speed", type=float, help="ground speed, m/s")
     add("--heading", type=float, default=0.0, help="track of the first line, degrees")
     add("--exposures", type=int, default=13, help="exposures of a line; sizes the scene")
+    add("--scene-margin", type=float, default=0.0, help="further ground on all sides, m")
     add("--packet-loss", type=float, default=0.0, help="share of image packets lost")
     add(
         "--fault",
@@ -105,6 +106,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         ground_speed_mps=given.speed,
         heading_deg=given.heading,
         exposures=given.exposures,
+        scene_margin_m=given.scene_margin,
         scene_file=given.scene,
         ground=given.ground,
     )

@@ -80,8 +80,8 @@ def ground_points(
 def scene_positions(world: World, scene: Scene, flight: SimulatedFlight, ground_m: Array) -> Array:
     """Columns and rows in the scene of ground points, shape (..., 2).
 
-    The scene lies where the first line begins: its first image is centred END_MARGIN and half an
-    image above the lower edge.
+    The scene lies where the first line begins: its first image is centred END_MARGIN, half an
+    image and the margin of the world above the lower edge.
     """
     line = math.radians(flight.plan.heading_deg)
     east, north = ground_m[..., 0], ground_m[..., 1]
@@ -89,7 +89,7 @@ def scene_positions(world: World, scene: Scene, flight: SimulatedFlight, ground_
     along = east * math.sin(line) + north * math.cos(line) - flight.first_line_at_m
     height, width = scene.bands["pan"].shape
     sample = scene.settings.sample_m
-    first = height - world.image.height_px * (0.5 + END_MARGIN)
+    first = height - world.image.height_px * (0.5 + END_MARGIN) - world.scene_margin_px
     return np.stack([(width - 1) / 2 + right / sample, first - along / sample], axis=-1)
 
 

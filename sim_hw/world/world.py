@@ -39,6 +39,7 @@ WHITE_LEVEL = 0.8
 class WorldSettings:
     """All that makes a world. `displaced_px` moves sensors by (right, up) pixels in their layer.
 
+    `scene_margin_m` makes the scene larger on all sides, for lines after the first and for turns.
     `height_m` above mean ground and `ground_speed_mps` default to what suits the rig. `ground` is a
     name of `grounds.GROUNDS`; `cloud_over` names a sensor that a cloud hides the ground from, in
     the first image of the line.
@@ -53,6 +54,7 @@ class WorldSettings:
     ground_speed_mps: float | None = None
     heading_deg: float = 0.0
     exposures: int = 13
+    scene_margin_m: float = 0.0
     relative_relief: float = 0.003
     scene_file: str | None = None
     ground: str = "landscape"
@@ -139,9 +141,10 @@ class World:
     def scene_settings(self) -> scene.SceneSettings:
         """The scene a first line of `exposures` exposures needs."""
         image, plan, settings = self.image, self.plan, self.settings
-        width = round(image.width_px * (1 + 2 * SIDE_MARGIN))
+        margin = 2.0 * self.scene_margin_px
+        width = round(image.width_px * (1 + 2 * SIDE_MARGIN) + margin)
         along = (settings.exposures - 1) * plan.distance_m / plan.gsd_m
-        height = round(along + image.height_px * (1 + 2 * END_MARGIN))
+        height = round(along + image.height_px * (1 + 2 * END_MARGIN) + margin)
         height = min(height, SCENE_MAX_PX // width)
         return scene.SceneSettings(
             seed=settings.seed,
@@ -152,6 +155,11 @@ class World:
             file=settings.scene_file,
             ground=settings.ground,
         )
+
+    @property
+    def scene_margin_px(self) -> float:
+        """`scene_margin_m` in samples of the scene."""
+        return self.settings.scene_margin_m / self.plan.gsd_m
 
     @property
     def ground(self) -> GroundType:
