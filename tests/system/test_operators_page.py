@@ -53,6 +53,35 @@ MAX_DISTANCE_M = 6.0
 """A tenth of a second's flight: the machine may be busy. What was reached is printed."""
 
 
+OBSERVED = """(async () => {
+  const { onGuidance } = await import('/guidance.js');
+  const observed = window.observed = { thumbnails: {}, coverage: [], guidance: [] };
+  onGuidance(() => observed.guidance.push(Date.now()));
+  const strip = document.querySelector('#strip');
+  new MutationObserver(() => {
+    for (const one of document.querySelectorAll('#strip [data-shown-ms]')) {
+      const number = one.querySelector('.t-mark').textContent.match(/\\d+/)[0];
+      observed.thumbnails[number] ??= Number(one.dataset.shownMs);
+    }
+  }).observe(strip, { subtree: true, attributes: true, childList: true });
+  const real = window.fetch;
+  window.fetch = async (address, ...further) => {
+    const requestedMs = Date.now();
+    const answer = await real(address, ...further);
+    if (address !== '/api/v1/advice' || !answer.ok) return answer;
+    const json = answer.json.bind(answer);
+    answer.json = async () => {
+      const content = await json();
+      requestAnimationFrame(() => observed.coverage.push([requestedMs, Date.now()]));
+      return content;
+    };
+    return answer;
+  };
+})()"""
+"""Times, ms since 1970, at which the page shows a thumbnail, coverage and guidance. Coverage has
+the time of its request too: it includes the exposures that were processed before."""
+
+
 class Running:
     """A service and its output."""
 
@@ -184,6 +213,7 @@ def test_a_flight_is_flown_from_the_page(
         browser.click("#exposure button[type=submit]")
         service.wait_for(lambda e: e["event"] == "exposure-settings" and e["by"] == "operator", 10)
         busy = [busy_share()]
+        browser.evaluate(OBSERVED)
         browser.click("[data-command=start]")
         latencies_s = []
         for number in range(1, EXPOSURES + 1):
@@ -210,6 +240,9 @@ def test_a_flight_is_flown_from_the_page(
         service.wait_for(lambda e: e["event"] == "processed" and e["number"] == EXPOSURES, 10)
         for number in range(1, EXPOSURES + 1):
             print(f"exposure {number}, s after the trigger: {steps_s(service, number)}")
+        for name, value in observed_on_page(browser, service).items():
+            record_property(name, value)
+            print(f"{name}: {value}")
         busy.append(busy_share())
         is_idle_enough = max(busy) < OTHERS_BUSY
         details = "" if is_idle_enough else ": too busy to judge by"
@@ -255,6 +288,41 @@ def busy_share(over_s: float = 1.0) -> float:
     threading.Event().wait(over_s)
     total_after, idle_after = jiffies()
     return 1.0 - (idle_after - idle) / max(1, total_after - total)
+
+
+def observed_on_page(browser: Browser, service: Running) -> dict[str, Any]:
+    """From trigger to thumbnail and to coverage on the page, s; frames of guidance, 1/s."""
+    browser.wait_for(
+        f"Object.keys(window.observed.thumbnails).length >= {EXPOSURES}"
+        " && window.observed.coverage.length > 0",
+        20,
+    )
+    since_ns = time.time_ns() - time.monotonic_ns()
+
+    def ms_of(event: str, number: int) -> float:
+        found = next(e for e in service.events if (e["event"], e.get("number")) == (event, number))
+        return (int(found["mono_ns"]) + since_ns) * 1e-6
+
+    last_ms = ms_of("processed", EXPOSURES)
+    browser.wait_for(f"window.observed.coverage.some(([asked]) => asked > {last_ms})", 30)
+    seen = browser.evaluate("window.observed")
+    numbers = range(1, EXPOSURES + 1)
+    coverage_ms = [
+        min(shown for asked, shown in seen["coverage"] if asked > ms_of("processed", number))
+        for number in numbers
+    ]
+    guidance = [at for at in seen["guidance"] if at > ms_of("triggered", 1)]
+    return {
+        "trigger_to_thumbnail_s": [
+            round((seen["thumbnails"][str(number)] - ms_of("triggered", number)) * 1e-3, 2)
+            for number in numbers
+        ],
+        "trigger_to_coverage_s": [
+            round((at - ms_of("triggered", number)) * 1e-3, 2)
+            for number, at in zip(numbers, coverage_ms, strict=True)
+        ],
+        "guidance_hz": round((len(guidance) - 1) / max(1, guidance[-1] - guidance[0]) * 1e3, 1),
+    }
 
 
 def event_of(service: Running, name: str) -> dict[str, Any]:
