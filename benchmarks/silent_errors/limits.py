@@ -44,7 +44,7 @@ LIMITS: Final[Mapping[str, Limit]] = {
     "blur-region": Limit(
         "a quarter of a PAN frame blurred", "px (sigma)", _same_limit(STITCHED, 1.5)
     ),
-    "blur-band": Limit("a colour head blurred", "px (sigma)", {X: 2.5, L: 1.5, DMC: 1.5}),
+    "blur-band": Limit("a colour head blurred", "px (sigma)", {X: 2.5, L: 1.5, DMC: 2.5}),
     "smear": Limit("a PAN head smeared along or across", "px", _same_limit(STITCHED, 4.0)),
     "gain-step": Limit("signal of a PAN frame from one line on", "%", _same_limit(EVERY, 8.0)),
     "gain-step-colour": Limit(
