@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import tifffile
-from mcap.records import Metadata
+from mcap.records import Message, Metadata
 from mcap.stream_reader import StreamReader
 from numpy.typing import NDArray
 from pyubx2 import UBXReader
@@ -182,3 +182,18 @@ def test_the_report_is_self_contained_and_names_the_sensor(flown: DemoMission) -
     assert "Simulated flight" in html
     assert "Displaced sensor: SU02" in html
     assert 'src="http' not in html and 'href="http' not in html
+
+
+def test_the_log_of_the_mission_has_the_settings_that_every_head_holds(flown: DemoMission) -> None:
+    (log,) = (flown.mission / "log").glob("*.mcap")
+    opened: dict[str, str] = {}
+    with log.open("rb") as file:
+        for one in StreamReader(file).records:
+            if isinstance(one, Message) and b'"name":"opened"' in one.data:
+                event = json.loads(one.data)
+                opened[event["device"]] = event["sentence"]
+    heads = [name for name in opened if opened[name].startswith("The head ")]
+    assert len(heads) == 13
+    for name in heads:
+        for setting in ("PixelFormat = Mono", "ExposureTime = ", "Gain = ", "TriggerMode = On"):
+            assert setting in opened[name], name
