@@ -27,6 +27,8 @@ F_CHANGE: Final = 3.0
 PRINCIPAL_POINT_SHARE: Final = 0.01
 """A priori standard deviation of the principal point, of the image's longer side."""
 _POINT: Final = ("dx0", "dy0")
+_SETTINGS: Final = AdjustmentSettings(max_iterations=300, variance_components=True)
+"""Weak blocks come to rest slowly."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +90,7 @@ def free_principal_point(
         ),
     )
     try:
-        free = adjust(network, AdjustmentSettings(variance_components=True), progress=progress)
+        free = adjust(network, _SETTINGS, progress=progress)
     except (NetworkError, RankDefectError):
         return None
     columns = free.layout.interior[0]

@@ -151,7 +151,7 @@ def photographs_section(
         found: oriented photographs.
         control: control and check points.
         result: of the adjustment.
-        free: the same with an estimated principal point; None where it was not estimated.
+        free: the same with an estimated principal point; None where it cannot be estimated.
     """
     block = found.block
     pitch = block.image.pitch_mm
@@ -211,6 +211,12 @@ def photograph_cautions(section: Mapping[str, Any]) -> list[str]:
             f"{section['f_sigma_px']:.1f} px, by {section['ground_sigma_of_f_m']:.2f} m "
             f"(correlation {section['f_ground_correlation']:.2f}). Give three control points or "
             "more, spread over the block (--points)"
+        )
+    if section["principal_point_free"] is None:
+        found.append(
+            "the principal point is held in the middle, and these photographs do not determine it: "
+            "stated standard deviations hold for these parameters only. Lines across, two heights "
+            "or control points determine it"
         )
     if section["f_depends_on_principal_point"]:
         free = section["principal_point_free"]
