@@ -88,7 +88,7 @@ def fly(folder: Path, rig: str, each: int, lines: int) -> dict[str, Any]:
     delays = np.array([own[n][0] - sent[n] for n in sent if n in own])
     sizes = np.array([sum(t[4] for t in e["tiles"]) for _, e in own.values()])
     seconds = np.array([e["seconds"] for _, e in own.values()])
-    settled = [sum(t[4] for t in e["tiles"]) for _, e in events
+    levelled_bytes = [sum(t[4] for t in e["tiles"]) for _, e in events
                if e["event"] == "orthomosaic" and "number" not in e]  # fmt: skip
     folder_of_map = mission / "export/live-orthomosaic"
     return {
@@ -100,7 +100,7 @@ def fly(folder: Path, rig: str, each: int, lines: int) -> dict[str, Any]:
         "delay_s": _spread(delays),
         "map_seconds": _spread(seconds),
         "bytes_of_an_exposure": _spread(sizes),
-        "bytes_at_ends_of_lines": settled,
+        "bytes_at_ends_of_lines": levelled_bytes,
         "landing_s": finished[0][0] - sent[count],
         "is_written": finished[0][1].is_written,
         "peak_mb": peak_kb / 1024.0,
@@ -138,8 +138,8 @@ def remember(folder: Path, rig_name: str, count: int, each: int = 100) -> dict[s
         before = time.perf_counter()
         live.add(one, pixels, orientations)
         if at == each - 1:
-            live.settle(orientations, live.ground)
-            live.publish_settled()
+            live.level(orientations, live.ground)
+            live.publish_levelled()
         seconds.append(time.perf_counter() - before)
         if number % (count // 5) == 0:
             memory[str(number)] = _resident_mb() - begun

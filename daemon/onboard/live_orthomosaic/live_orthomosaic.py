@@ -55,8 +55,8 @@ BYTES_PER_EXPOSURE: Final = 60_000
 MOVED_PX: Final = 0.5
 CHANGED: Final = 0.02
 """A tile that moved or changed by so much is published again in flight."""
-SETTLED_PX: Final = 0.05
-SETTLED: Final = 0.002
+LINE_END_MOVED_PX: Final = 0.05
+LINE_END_CHANGED: Final = 0.002
 """At the end of a line, what moved or changed by more."""
 OVERVIEWS: Final = 5
 """Coarser levels."""
@@ -137,9 +137,9 @@ class LiveOrthomosaic:
         self._render(dirty | moved, moved=moved)
         return self._publish(CHANGED, BYTES_PER_EXPOSURE)
 
-    def settle(self, orientations: Sequence[LiveOrientation], ground: MapGround) -> None:
+    def level(self, orientations: Sequence[LiveOrientation], ground: MapGround) -> None:
         """After an adjustment of the block: level the images, follow their orientations, and
-        compute what changed. `publish_settled` publishes it.
+        compute what changed. `publish_levelled` publishes it.
 
         Args:
             orientations: of all images.
@@ -156,16 +156,16 @@ class LiveOrthomosaic:
         changed = {
             self._at[image.number]
             for image in levelled
-            if _gain_step(image, before[id(image)]) > SETTLED
+            if _gain_step(image, before[id(image)]) > LINE_END_CHANGED
         }
-        dirty = self._follow(orientations, SETTLED_PX)
+        dirty = self._follow(orientations, LINE_END_MOVED_PX)
         dirty |= {tile for k in changed for tile in self._tiles_of(self.images[k])}
         self._render(dirty, moved=set())
         self._set_tone()
 
-    def publish_settled(self, limit_bytes: float = math.inf) -> list[PublishedTile]:
+    def publish_levelled(self, limit_bytes: float = math.inf) -> list[PublishedTile]:
         """Publish what changed, coarse tiles first."""
-        return self._publish(SETTLED, limit_bytes)
+        return self._publish(LINE_END_CHANGED, limit_bytes)
 
     @property
     def pending(self) -> int:

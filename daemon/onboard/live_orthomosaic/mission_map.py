@@ -73,7 +73,7 @@ class MissionMap:
 
     def block_adjusted(self) -> None:
         """Level the images, follow their orientations, and publish what changed."""
-        self._guarded(self._settle)
+        self._guarded(self._level)
 
     def deliver(self) -> bool:
         """Write the files of the landing.
@@ -122,11 +122,11 @@ class MissionMap:
         self.seconds = time.perf_counter() - begun
         self._announce(published, one.image.number)
 
-    def _settle(self) -> None:
+    def _level(self) -> None:
         if self.live is None or self._done.live is None:
             return
-        self.live.settle(self._done.live.orientations, self._ground())
-        self._announce(self.live.publish_settled(), None)
+        self.live.level(self._done.live.orientations, self._ground())
+        self._announce(self.live.publish_levelled(), None)
 
     def _announce(self, published: Sequence[PublishedTile], number: int | None) -> None:
         assert self.live is not None
@@ -151,7 +151,7 @@ class MissionMap:
         live = self.live
         if live is None or not live.tiles:
             return
-        self._settle()
+        self._level()
         files: dict[str, int] = {}
         tags = {"SYNTOPIC_PRELIMINARY": "YES"}
         if self._done.is_simulated:

@@ -73,7 +73,7 @@ def write_pmtiles(
             file.write(piece)
         for tile in ordered:
             file.write(tiles[tile].read_bytes())
-        return file.tell()
+    return path.stat().st_size
 
 
 def _directories(entries: Sequence[Entry]) -> tuple[bytes, bytes]:

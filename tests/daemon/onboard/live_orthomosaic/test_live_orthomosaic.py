@@ -114,13 +114,13 @@ def test_each_exposure_publishes_coarse_tiles_first_and_at_most_60_kb(copied) ->
 def test_a_tile_that_hardly_changed_waits_for_the_end_of_the_line(copied) -> None:
     growing, _ = _flown_map(copied)
     files = growing.live.files
-    growing.live.publish_settled()
+    growing.live.publish_levelled()
     tile = growing.live.tiles[0]
     signal = files.signal(tile)
     brighter = np.rint(signal * 1.01).astype(np.uint16)
     files.put(tile, brighter)
     assert growing.live._publish(0.02, 1e9) == []
-    (sent,) = growing.live.publish_settled()
+    (sent,) = growing.live.publish_levelled()
     assert sent.tile == tile
     files.put(tile, np.rint(brighter * 1.03).astype(np.uint16))
     assert [one.tile for one in growing.live._publish(0.02, 1e9)] == [tile]
