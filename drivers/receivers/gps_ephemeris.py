@@ -24,7 +24,7 @@ _FIT_H: Final = (
     (range(497, 504), 26.0), (range(1021, 1024), 26.0), (range(504, 511), 50.0),
     (range(511, 512), 74.0), (range(752, 757), 74.0), (range(757, 758), 98.0),
 )  # fmt: skip
-"""Length of the curve fit by issue of data, where the flag says longer than four hours."""
+"""Length of the curve fit by issue of data, where the flag states more than four hours."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ def ephemerides_of(subframes: Iterable[Subframe], near_week: int) -> Iterator[Gp
 
     Args:
         subframes: of all satellites.
-        near_week: GPS week without rollover, to tell which week of 1,024 is meant.
+        near_week: GPS week without rollover, which decides the week of 1,024.
 
     Yields:
         An ephemeris as soon as its third subframe has come.

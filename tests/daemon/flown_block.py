@@ -10,6 +10,7 @@ import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,19 +88,22 @@ def write_image(mission: Path, number: int, pixels: NDArray[np.uint16]) -> None:
     (mission / f"L2/{number:06d}/pan.tif").write_bytes(b"".join(bytes(p) for p in parts))
 
 
-def read_record(mission: Path, number: int) -> dict:
+def read_record(mission: Path, number: int) -> dict[str, Any]:
     """The record of an exposure."""
-    return json.loads((mission / f"L0/{number:06d}/exposure.json").read_text())
+    record: dict[str, Any] = json.loads((mission / f"L0/{number:06d}/exposure.json").read_text())
+    return record
 
 
-def write_record(mission: Path, record: dict) -> None:
+def write_record(mission: Path, record: dict[str, Any]) -> None:
     """Write the record of an exposure."""
     folder = mission / f"L0/{record['number']:06d}"
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "exposure.json").write_text(json.dumps(record))
 
 
-def _record(world: World, flight: SimulatedFlight, number: int, mark: int, line: str) -> dict:
+def _record(
+    world: World, flight: SimulatedFlight, number: int, mark: int, line: str
+) -> dict[str, Any]:
     pose, later = flight.pose(mark), flight.pose(mark + 10_000_000)
     latitude, longitude, height = (float(v) for v in flight.geodetic(pose.position_enu_m))
     roll, pitch, heading = (float(v) for v in flight.attitude_rad(pose))
@@ -127,7 +131,9 @@ def _record(world: World, flight: SimulatedFlight, number: int, mark: int, line:
     }
 
 
-def _add_errors(navigation: dict, noise: np.random.Generator, boresight_deg: Array) -> None:
+def _add_errors(
+    navigation: dict[str, Any], noise: np.random.Generator, boresight_deg: Array
+) -> None:
     east, north, up = noise.normal(0.0, POSITION_M)
     metres = 6_371_000.0 * math.radians(1.0)
     navigation["latitude_deg"] += north / metres
