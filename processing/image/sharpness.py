@@ -17,8 +17,7 @@ Array = NDArray[Any]
 
 _EVERY_ROW: Final = 16
 _ROWS: Final = 1024
-_DETAIL_ROWS: Final = 512
-"""Of taller frames only every second, third .. row is looked at: for brightness, and for detail."""
+"""Of taller frames only every second, third .. row is looked at."""
 _BUNDLE: Final = 32
 _AHEAD: Final = 2
 """Rows looked at between the one whose pixels are fetched and the one that is measured."""
@@ -56,7 +55,7 @@ def sharpness(
     if last - first + 1 < _MIN_LENGTH or right - left + 1 < _MIN_LENGTH:
         return None, None
     height = last - first + 1
-    pace = max(1, height // _DETAIL_ROWS)
+    pace = max(1, height // _ROWS)
     sums = np.zeros((-(-height // pace), 2, 4))
     _difference_sums(frame[first : last + 1], left, right + 1, pace, sums)
     along, across = sums.sum(axis=0)

@@ -54,8 +54,7 @@ class CommonWindows:
     counts, `noise` (f, n) the variance of a pixel that light and read-out explain. The rest is
     along columns and along rows, (f, n, 2): `near` and `far` the mean squared differences of pixels
     one and two apart, `curved` the mean square of the second difference, all three in pixels of
-    colour and less noise; `fine` that of neighbouring pixels of the frame itself, along one line of
-    each colour pixel.
+    colour and less noise; `fine` that of neighbouring pixels of the frame itself.
     """
 
     names: tuple[str, ...]
@@ -183,21 +182,19 @@ def _window_sums(frame, corners, step, size, out):
             for y in range(size):
                 column[:] = 0
                 for r in range(top + y * step, top + (y + 1) * step):
-                    line = frame[r, left : left + side]
+                    line = frame[r, left : left + side + 1]
+                    after = frame[r + 1, left : left + side]
                     for j in range(side):
                         word = np.uint32(line[j])
                         column[j] += word
                         # The lowest bit of a saturated word, the highest one of no data less one.
                         union[j] |= word | ((word - np.uint32(1)) & _NO_DATA_LESS_ONE)
-                # One line of each colour pixel suffices for the detail of pixels of the frame.
-                line = frame[top + y * step, left : left + side + 1]
-                after = frame[top + y * step + 1, left : left + side]
-                for j in range(side):
-                    here = np.float32(line[j])
-                    down = np.float32(after[j]) - here
-                    right = np.float32(line[j + 1]) - here
-                    fine_y += down * down
-                    fine_x += right * right
+                    for j in range(side):
+                        here = np.float32(line[j])
+                        down = np.float32(after[j]) - here
+                        right = np.float32(line[j + 1]) - here
+                        fine_y += down * down
+                        fine_x += right * right
                 into = window[y]
                 for x in range(size):
                     total = np.uint32(0)
@@ -227,7 +224,7 @@ def _window_sums(frame, corners, step, size, out):
             out[i, 0], out[i, 1] = near_y * square, near_x * square
             out[i, 2], out[i, 3] = far_y * square, far_x * square
             out[i, 4], out[i, 5] = curved_y * square, curved_x * square
-            pixels = np.float64(size * side)
+            pixels = np.float64(size * size) * pixel
             out[i, 6], out[i, 7] = fine_y / pixels, fine_x / pixels
             out[i, 8] = mean / (inner * pixel)
             out[i, 9] = 1.0 if good else 0.0
