@@ -66,15 +66,20 @@ class ConnectionListener:
                 self._cancel_one_handshake()
             task = asyncio.create_task(self._admit(connection))
             self._handshakes[task] = str(address[0])
-            task.add_done_callback(self._handshakes.pop)
+            task.add_done_callback(self._forget)
+            # Many that wait are accepted without a pause: each one's task runs before the next,
+            # or those that need no handshake would be counted as unfinished.
+            await asyncio.sleep(0)
+
+    def _forget(self, task: asyncio.Task[None]) -> None:
+        self._handshakes.pop(task, None)
 
     def _cancel_one_handshake(self) -> None:
         count = Counter(self._handshakes.values())
         _, busiest = max((count[address], address) for address in count)
         oldest = next(task for task, address in self._handshakes.items() if address == busiest)
         oldest.cancel()
-        self._handshakes.pop(oldest)
-        oldest.remove_done_callback(self._handshakes.pop)
+        self._forget(oldest)
 
     async def _admit(self, connection: socket.socket) -> None:
         try:

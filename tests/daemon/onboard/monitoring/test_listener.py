@@ -141,3 +141,26 @@ async def _drained(reader: asyncio.StreamReader) -> None:
             pass
     except ConnectionError:
         pass
+
+
+def test_many_that_connect_at_once_without_tls_are_all_served() -> None:
+    """A ground station that starts again: all its pages connect before the first is accepted."""
+    count = 2 * HANDSHAKES_MAX
+
+    async def meet() -> list[bytes]:
+        plain = socket.create_server(("127.0.0.1", 0), backlog=256)
+        waiting = [socket.create_connection(plain.getsockname()) for _ in range(count)]
+        listener = ConnectionListener(plain, Echo, None)
+        try:
+            async with asyncio.timeout(WITHIN_S):
+                links = [await asyncio.open_connection(sock=one) for one in waiting]
+                for _, writer in links:
+                    writer.write(b"here")
+                received = [await reader.read(4) for reader, _ in links]
+            for _, writer in links:
+                writer.close()
+            return received
+        finally:
+            listener.close()
+
+    assert asyncio.run(meet()) == [b"here"] * count
