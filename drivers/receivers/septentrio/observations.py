@@ -162,17 +162,9 @@ def _satellite(
     elif first is None or name is None:
         counts.unknown_signals += 1
     else:
-        yield Observation(
-            name,
-            first.code,
-            code_m,
-            _phase(first, code_m, phase_high, phase_low),
-            doppler_hz,
-            _strength(first, strength),
-            0.0 if lock_s == _NOT_MEASURED["lock"] else float(lock_s),
-            half_cycle=bool(info & _HALF_CYCLE),
-            channel=first.channel,
-        )
+        phase = phase_high, phase_low
+        lock_s = 0 if lock_s == _NOT_MEASURED["lock"] else lock_s
+        yield _observation(name, first, code_m, phase, doppler_hz, strength, lock_s, info)
     for row in rows:
         (kind, lock_s, strength, high, phase_high, info, code_low, phase_low, doppler_low) = (
             _OTHER.unpack_from(body, row)
@@ -193,17 +185,32 @@ def _satellite(
         if doppler_hz is not None and first is not None and change != _DOPPLER_NOT_MEASURED:
             own_hz = doppler_hz * signal.hertz / first.hertz
             own_hz += (change[0] * 65_536 + change[1]) * 1e-4
-        yield Observation(
-            name,
-            signal.code,
-            own_m,
-            _phase(signal, own_m, phase_high, phase_low),
-            own_hz,
-            _strength(signal, strength),
-            0.0 if lock_s == _NOT_MEASURED["short_lock"] else float(lock_s),
-            half_cycle=bool(info & _HALF_CYCLE),
-            channel=signal.channel,
-        )
+        phase = phase_high, phase_low
+        lock_s = 0 if lock_s == _NOT_MEASURED["short_lock"] else lock_s
+        yield _observation(name, signal, own_m, phase, own_hz, strength, lock_s, info)
+
+
+def _observation(
+    name: str,
+    signal: _Signal,
+    code_m: float | None,
+    phase: tuple[int, int],
+    doppler_hz: float | None,
+    strength: int,
+    lock_s: int,
+    info: int,
+) -> Observation:
+    return Observation(
+        name,
+        signal.code,
+        code_m,
+        _phase(signal, code_m, *phase),
+        doppler_hz,
+        _strength(signal, strength),
+        float(lock_s),
+        half_cycle=bool(info & _HALF_CYCLE),
+        channel=signal.channel,
+    )
 
 
 def _name(number: int) -> str | None:
