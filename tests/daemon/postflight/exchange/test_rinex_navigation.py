@@ -230,3 +230,10 @@ def test_damaged_and_foreign_messages_are_left_out() -> None:
             for _ in range(6)
         ]
         navigation_text(found_of(*noise), version="3.04", made=MADE, comments=())
+
+
+def test_a_clock_before_the_end_of_the_week_of_an_orbit_after_it_is_in_its_own_week() -> None:
+    one = GpsEphemeris(7, WEEK + 1, 604_784.0, 0.0, (0.0,) * 29)
+    text = navigation_text([one], version="3.04", made=MADE, comments=())
+    at = GPS_EPOCH + timedelta(weeks=WEEK, seconds=604_784.0)
+    assert f"G07 {at:%Y %m %d %H %M %S}" in text

@@ -181,3 +181,11 @@ def test_no_content_of_a_sealed_block_raises() -> None:
         assert len(epochs) + counts.unreadable == 1
         for epoch in epochs:
             observation_text(RinexHeader("SBF"), [epoch], [], version="3.04")
+
+
+def test_a_satellite_of_a_high_orbit_needs_all_bits_of_its_range() -> None:
+    """38,000 km are beyond 2^35 mm."""
+    good = meas_epoch(antenna_at(START_NS), START_NS, TOE_S)
+    high, low = divmod(38_000_000_000, 1 << 32)
+    (epoch,), _ = decoded(resealed(good, BODY + 3, struct.pack("<BI", high, low)))
+    assert high == 8 and epoch.observations[0].pseudorange_m == pytest.approx(38_000_000.0)
