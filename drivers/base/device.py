@@ -22,8 +22,9 @@ class DeviceDriver(Configured):
     """A device that is run by one thread of the caller: opened, read, lost and reopened.
 
     A driver overrides three methods. `_open_device` opens the device if it is not open. `_serve`
-    delivers until `_closing` is set or the device is lost. `_release_device` releases the resources
-    of this opening. `close` and `statistics` may be called from any thread.
+    calls `_begin_delivery` as soon as the device does what it is asked for, and delivers until
+    `_closing` is set or the device is lost. `_release_device` releases the resources of this
+    opening. `close` and `statistics` may be called from any thread.
     """
 
     counted: ClassVar[tuple[str, ...]] = ()
@@ -70,8 +71,6 @@ class DeviceDriver(Configured):
                         sentence = f"{error}. Retrying automatically."
                         self._emit_lost(sentence, self._event_for(error))
                 else:
-                    self._emit_opened()
-                    self._is_lost = False
                     before = self.counters[self.delivery_counter]
                     self._serve(sink)
                     self._release_device()
@@ -100,6 +99,12 @@ class DeviceDriver(Configured):
         """
         return dict(self.counters)
 
+    def _begin_delivery(self) -> None:
+        """Become ACTIVE, and report it: from here on the device delivers what it is asked for."""
+        self._state = LifeCycle.ACTIVE
+        self._emit_opened()
+        self._is_lost = False
+
     def _emit_lost(self, sentence: str, event: str = "lost") -> None:
         """Report a loss once, until the device is open again."""
         if not self._is_lost:
@@ -113,7 +118,7 @@ class DeviceDriver(Configured):
         raise NotImplementedError
 
     def _serve(self, sink: Sink) -> None:
-        """Deliver until `_closing` is set or the device is lost; reports a loss itself."""
+        """Begin delivery, deliver until `_closing` is set or the device is lost, report the loss."""
         raise NotImplementedError
 
     def _release_device(self) -> None:

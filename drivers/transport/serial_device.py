@@ -444,7 +444,7 @@ class SerialDevice(DeviceDriver):
         """Listen until closing, loss, or a receive time-out, after which the port is reopened."""
         line = self._line
         assert line is not None
-        self._state = LifeCycle.ACTIVE
+        self._begin_delivery()
         self._last_message_ns = self.clock.mono_ns()
         silence_ns = round(self.silence_s * 1e9)
         while not self._closing.is_set():

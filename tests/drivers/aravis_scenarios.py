@@ -75,6 +75,7 @@ class Flight:
         self.frames: list[Frame] = []
         self.pictures: list[np.ndarray[Any, np.dtype[np.uint16]]] = []
         self.events: list[tuple[float, DeviceEvent]] = []
+        self.states_at_opened: list[str] = []
         self.start = time.monotonic()
         self.changed = threading.Condition()
         self.thread = threading.Thread(target=self.head.run, args=(self.sink,))
@@ -88,6 +89,8 @@ class Flight:
                     self.head.recycle(record.slot)
             elif isinstance(record, DeviceEvent):
                 self.events.append((time.monotonic() - self.start, record))
+                if record.name == "opened":
+                    self.states_at_opened.append(self.head.state.value)
             self.changed.notify_all()
 
     def wait(self, true: Callable[[], bool], timeout_s: float) -> bool:
@@ -159,6 +162,7 @@ def frames_land_in_our_memory() -> dict[str, object]:
             bool((b[:, :-1] == a[:, 1:]).all()) for a, b in itertools.pairwise(pictures)
         ],
         "behind_the_pixels_untouched": bool((flight.memory.slots[:, NBYTES:] == UNTOUCHED).all()),
+        "states_at_opened": flight.states_at_opened,
         "state": flight.head.state.value,
         "statistics": dict(flight.head.statistics()),
         "thread_ended": not flight.thread.is_alive(),

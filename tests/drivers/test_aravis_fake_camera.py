@@ -60,6 +60,7 @@ def _scenario(name: str) -> dict[str, Any]:
 
 def test_frames_land_in_the_memory_we_gave_pixel_by_pixel() -> None:
     outcome = _scenario("frames_land_in_our_memory")
+    assert outcome["states_at_opened"] == ["active"], "an open head can be triggered"
     assert outcome["statuses"] == ["complete"] * 8
     assert outcome["slots"] == [0, 1, 2, 3, 0, 1, 2, 3], "slots are used in turn"
     assert [b - a for a, b in zip(outcome["ids"], outcome["ids"][1:], strict=False)] == [1] * 7

@@ -205,18 +205,20 @@ def test_software_triggers_play_one_file_each_and_say_when_there_are_no_more(
     opened, came = threading.Event(), threading.Semaphore(0)
 
     def watch(record: Record) -> None:
-        opened.set()
         if isinstance(record, Frame):
             came.release()
+        elif not opened.is_set():
+            head.trigger()
+            opened.set()
 
     recorder.stop = watch
     thread = threading.Thread(target=head.run, args=(recorder,))
     thread.start()
     try:
-        assert opened.wait(5)
-        for _ in range(2):
-            head.trigger()
-            assert came.acquire(timeout=5)
+        assert opened.wait(5), "an open head can be triggered"
+        assert came.acquire(timeout=5)
+        head.trigger()
+        assert came.acquire(timeout=5)
         with pytest.raises(DeviceError, match="all 2 files are played; set loop = true"):
             head.trigger()
     finally:

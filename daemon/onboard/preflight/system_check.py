@@ -106,7 +106,7 @@ class SystemCheck:
         )  # fmt: skip
         self._pipeline = PipelineQueue(1)
         self._sequence = ExposureSequence(flight, self._pipeline, self._supervisor.send, _no_event)
-        devices = DeviceStates(flight, self._sequence.log, _no_event)
+        self._devices = devices = DeviceStates(flight, self._sequence.log, _no_event)
         self._preflight = Preflight(configuration, rig, flight, self._line, devices, self._pipeline)
         self._dispatcher = MessageDispatcher()
         for handlers in (self._handlers, devices.handlers, self._sequence.handlers):
@@ -120,7 +120,6 @@ class SystemCheck:
         self._device_faults: dict[str, str] = {}
         self._not_fired = ""
         self._has_fired: bool | None = None
-        self._opened: set[str] = set()
 
     async def run(self) -> list[CheckResult]:
         """Everything that was found, in the order of the devices.
@@ -156,7 +155,7 @@ class SystemCheck:
 
     def _heads_are_open(self) -> bool:
         heads = {spec.name for spec in self._specs if spec.kind == "head"}
-        return heads & self._bound.keys() <= self._opened
+        return heads & self._bound.keys() <= self._devices.delivering
 
     def _dispatch(self, message: object) -> None:
         if (record := self._recorders.get(type(message))) is not None:
@@ -202,9 +201,7 @@ class SystemCheck:
             self._data[f"head {frame.head}"] = frame
 
     def _on_device_event(self, event: DeviceEvent) -> None:
-        if event.name == "opened":
-            self._opened.add(event.device)
-        else:
+        if event.name != "opened":
             self._device_faults[event.device] = event.sentence
 
     def _on_fired(self, fired: Fired) -> None:
@@ -345,6 +342,8 @@ class SystemCheck:
             return CheckResult(
                 "stream", name, CheckOutcome.NOT_TRIED, "nothing is fired without --fire"
             )
+        if head in self._device_faults and head not in self._devices.delivering:
+            return failed("stream", name, self._device_faults[head])
         why = f" ({self._not_fired})" if self._not_fired else ""
         return failed(
             "stream", name, f"Head {head} sent no image{why}. Check its trigger cable and settings"

@@ -364,7 +364,7 @@ class AravisHead(AravisSettings, HeadDevice):
         try:
             with self._control:
                 session.camera.start()
-            self._state = LifeCycle.ACTIVE
+            self._begin_delivery()
             self._deliver(session, sink)
         except (AravisHeadLostError, aravis_error()) as error:
             reason = str(getattr(error, "message", error))

@@ -165,7 +165,7 @@ class FolderHead(HeadDevice):
         return f"The head {self.name} plays {len(self._files)} files of {self.folder}."
 
     def _serve(self, sink: Sink) -> None:
-        self._state = LifeCycle.ACTIVE
+        self._begin_delivery()
         next_ns = self.clock.mono_ns() + round(self.interval_s * 1e9)
         while not self._closing.is_set():
             if self.trigger_source == "line":

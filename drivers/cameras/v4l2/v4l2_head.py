@@ -224,7 +224,7 @@ class V4l2Head(V4l2Settings, HeadDevice):
             session.unqueued_buffers = dict.fromkeys(range(count), 0)
             self._queue_again(session)
             node.stream_on()
-            self._state = LifeCycle.ACTIVE
+            self._begin_delivery()
             self._deliver(session, sink)
         except V4l2HeadLostError as error:
             reason = str(error)

@@ -100,7 +100,7 @@ class HostThermometer(DeviceDriver):
         self.emitter.emit("opened", f"The host's sensors {self.name} are read; nothing to do.")
 
     def _serve(self, sink: Sink) -> None:
-        self._state = LifeCycle.ACTIVE
+        self._begin_delivery()
         next_ns = self.clock.mono_ns()
         while not self._closing.is_set():
             self._read_all(sink)

@@ -251,7 +251,7 @@ class PpsDevice(DeviceDriver):
         self.emitter.emit("opened", f"The pulse per second {self.name} is open.")
 
     def _serve(self, sink: Sink) -> None:
-        self._state = LifeCycle.ACTIVE
+        self._begin_delivery()
         try:
             self._listen(sink)
         except OSError as error:
