@@ -118,7 +118,7 @@ class DeviceDriver(Configured):
         raise NotImplementedError
 
     def _serve(self, sink: Sink) -> None:
-        """Begin delivery, and deliver until `_closing` is set or the device is lost; report a loss."""
+        """Begin delivery; deliver until `_closing` is set or the device is lost; report a loss."""
         raise NotImplementedError
 
     def _release_device(self) -> None:
