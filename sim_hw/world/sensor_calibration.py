@@ -72,6 +72,8 @@ def measure(sensor: Sensor, truth: SensorTruth, seed: int) -> Radiometry:
     bias = truth.bias_dn + noise(read_variance, BIAS_FRAMES)
     charge = truth.dark_e_per_s * np.float32(DARK_EXPOSURE_S)
     dark = truth.bias_dn + charge / np.float32(epd) + noise(charge + read_variance, DARK_FRAMES)
+    # A hot pixel saturates within the exposure: the converter shows no more.
+    dark = np.minimum(dark, np.float32(sensor.full_scale_dn))
     dark_rate = (dark - bias) / np.float32(DARK_EXPOSURE_S)
     light = FLAT_LEVEL * sensor.full_scale_dn * epd
     flat_signal = truth.response * np.float32(light)

@@ -101,6 +101,7 @@ class AravisHead(AravisSettings, HeadDevice):
         self._control = threading.Lock()
         self._session: _Session | None = None
         self._of_stream: Counter[str] = Counter()
+        self._is_held_reported = False
 
     def bind(self, sink: Sink | None = None) -> Mapping[str, str]:
         """Open the head and write its settings. See `drivers.contract.Head`.
@@ -275,15 +276,14 @@ class AravisHead(AravisSettings, HeadDevice):
         """Open the head after another controller has released it. DeviceError if it does not."""
         deadline_ns = self.clock.mono_ns() + round(self.control_wait_limit_s * 1e9)
         held = self._is_controlled_by_other()
-        reported_settings = False
         while not self._closing.is_set():
             if not held:
                 try:
                     return self._open_now()
                 except ControlDeniedError:
                     held = True
-            if not reported_settings:
-                reported_settings = True
+            if not self._is_held_reported:
+                self._is_held_reported = True
                 self.emitter.emit(
                     "held-by-another",
                     f"Another controller has control of the head {self.name} at {self.address}. If "
@@ -346,6 +346,7 @@ class AravisHead(AravisSettings, HeadDevice):
                 )
             else:
                 self.counters["opened"] += 1
+                self._is_held_reported = False
                 return session
         self._release_device()
         if camera is not None:
@@ -371,11 +372,9 @@ class AravisHead(AravisSettings, HeadDevice):
         if reason:
             self._state = LifeCycle.INACTIVE
             session.is_lost = True
-            self.emitter.emit(
-                "lost",
+            self._emit_lost(
                 f"The head {self.name} at {self.address} was lost ({reason}). Check its power and "
-                "cable. Reconnecting automatically.",
-                fault=True,
+                "cable. Reconnecting automatically."
             )
         elif is_ip_address(self.address):
             alive = control_privilege(self.address, timeout_s=PROBE_TIMEOUT_S)

@@ -78,6 +78,7 @@ class V4l2Head(V4l2Settings, HeadDevice):
 
     _session: _Session | None = None
     _adjusted: tuple[float, float] | None = None
+    _is_silent = False
 
     def bind(self, sink: Sink | None = None) -> Mapping[str, str]:
         """Open the head and write its settings. See `drivers.contract.Head`.
@@ -224,7 +225,8 @@ class V4l2Head(V4l2Settings, HeadDevice):
             session.unqueued_buffers = dict.fromkeys(range(count), 0)
             self._queue_again(session)
             node.stream_on()
-            self._begin_delivery()
+            if not self._is_silent:
+                self._begin_delivery()
             self._deliver(session, sink)
         except V4l2HeadLostError as error:
             reason = str(error)
@@ -232,11 +234,9 @@ class V4l2Head(V4l2Settings, HeadDevice):
             reason = _loss(error)
         if reason:
             self._state = LifeCycle.INACTIVE
-            self.emitter.emit(
-                "lost",
+            self._emit_lost(
                 f"The head {self.name} at {self.device} was lost ({reason}). Check its power and "
-                "cable; it is reopened automatically.",
-                fault=True,
+                "cable; it is reopened automatically."
             )
         self._release_device()
 
@@ -251,12 +251,17 @@ class V4l2Head(V4l2Settings, HeadDevice):
                 filled = node.dequeue()
                 if filled is not None:
                     last_frame_ns = now_ns
+                    if self._is_silent:
+                        self._is_silent = False
+                        self._begin_delivery()
                     self._take(session, filled, sink)
                 elif found & (select.POLLERR | select.POLLHUP):
                     raise V4l2HeadLostError("the kernel ended its stream")
             self._queue_again(session)
             if self.silence_s and now_ns - last_frame_ns > self.silence_s * 1e9:
                 self.counters["silences"] += 1
+                # It opens without an error; only a frame shows that it delivers again.
+                self._is_silent = True
                 raise V4l2HeadLostError(f"no frame came for {self.silence_s:g} s")
             if now_ns >= next_check_ns:
                 node.check_alive()

@@ -283,6 +283,20 @@ def test_the_laboratory_finds_the_sensor_within_the_noise_of_its_series(
         assert stored["dark_dn_per_s"].dtype == np.float16
 
 
+@pytest.mark.parametrize("electrons_per_dn", [20.0, 1.0])
+def test_the_dark_signal_of_a_hot_pixel_ends_at_the_converters_range(
+    world: World, electrons_per_dn: float
+) -> None:
+    cone = world.rig.cone_of("SU00")
+    sensor = replace(world.rig.sensor("SU00"), electrons_per_dn=electrons_per_dn)
+    truth = true_sensor(cone, sensor, 3, field_radius_mm=world.field_radius_mm(cone))
+    found = sensor_calibration.measure(sensor, truth, 3)
+    limit = (sensor.full_scale_dn - truth.bias_dn) / sensor_calibration.DARK_EXPOSURE_S
+    assert truth.dark_e_per_s.max() / electrons_per_dn > limit.max()
+    assert np.isfinite(found.dark_dn_per_s).all()
+    assert found.dark_dn_per_s.max() == pytest.approx(limit.max(), rel=0.01)
+
+
 def test_calibrated_frames_give_the_light_back(world: World, scene: Scene) -> None:
     flight = world.flight.beginning_first_line_at(1100.0)
     cone, sensor = world.rig.cone_of("SU00"), world.rig.sensor("SU00")
