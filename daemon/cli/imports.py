@@ -152,8 +152,8 @@ BLOCK_HELP = """Import cameras, orientations and points of another program for `
 
 Programs: colmap (folder of a text model), opensfm (reconstruction.json
 and tracks.csv), metashape (cameras.xml),
-bundler (bundle.out) and bal (problem file). Distortion is converted to the ten parameters by fit
-and refused above 0.02 px. Without --position-sigma the project is a free network.
+bundler (bundle.out) and bal (problem file). Distortion is converted to the ten parameters by fit;
+above 0.02 px the measurements are corrected for it instead. Without --position-sigma the project is a free network.
 
 Examples: `syntopic import block sparse/0 --from colmap --out block`,
 `syntopic import block bundle.out --from bundler --out block --image-sigma 0.3`

@@ -1,12 +1,14 @@
 """An adjustment project of an imported block: cameras, orientations, object and image points.
 
-Distortion of the other program is converted to the ten parameters by fit. Without standard
-deviations of positions the project is a free network.
+Distortion of the other program is converted to the ten parameters by fit. Where it does not fit,
+the measurements are corrected for it, and the camera has none. Without standard deviations of
+positions the project is a free network.
 """
 
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -98,6 +100,7 @@ def import_block(
         )
     pitches = [camera.pitch_mm or NOMINAL_PITCH_MM for camera in block.cameras]
     fits = [_lens_of(c, pitch) for c, pitch in zip(block.cameras, pitches, strict=True)]
+    block, fits = _corrected(block, pitches, fits)
     network = _network(block, pitches, [lens for lens, _ in fits], sigma_px, position_sigma_m)
     file = ProjectFile(
         format=1,
@@ -123,7 +126,10 @@ def import_block(
 
 
 def _lens_of(camera: BlockCamera, pitch_mm: float) -> tuple[Lens, float]:
-    """The lens that corrects what the model distorts, about its principal point."""
+    """The lens that corrects what the model distorts, about its principal point, and its residual.
+
+    The residual is infinite where the model has no inverse in parts of the image.
+    """
     model = camera.model
     lens = Lens(f_mm=model.fy_px * pitch_mm)
     if model.is_pinhole and model.fx_px == model.fy_px:
@@ -135,10 +141,7 @@ def _lens_of(camera: BlockCamera, pitch_mm: float) -> tuple[Lens, float]:
     pixels = np.stack([columns.ravel(), rows.ravel()], axis=1)
     rays = rays_from_measured_px(model, pixels)
     if not np.isfinite(rays).all():
-        raise BlockError(
-            f"camera {camera.name}: its distortion has no inverse over the whole image; crop the "
-            "images, or adjust it in the other program with fewer parameters"
-        )
+        return lens, math.inf
     up = np.array([pitch_mm, -pitch_mm])
     measured = (pixels - [model.cx_px, model.cy_px]) * up
     delta = rays * [lens.f_mm, -lens.f_mm] - measured
@@ -149,13 +152,47 @@ def _lens_of(camera: BlockCamera, pitch_mm: float) -> tuple[Lens, float]:
     solution, *_ = np.linalg.lstsq(design / size, delta.ravel(), rcond=None)
     values = dict(zip(_TERMS, (float(v) for v in solution / size), strict=True))
     lens = _with(lens, values)
-    worst_px = float(np.abs(lens_correction(lens, measured) - delta).max()) / pitch_mm
-    if worst_px > FIT_LIMIT_PX:
-        raise BlockError(
-            f"camera {camera.name}: its distortion fits the ten parameters within {worst_px:.3f} "
-            f"px, {FIT_LIMIT_PX:g} px is the limit; import undistorted images"
+    return lens, float(np.abs(lens_correction(lens, measured) - delta).max()) / pitch_mm
+
+
+def _corrected(
+    block: Block, pitches: list[float], fits: list[tuple[Lens, float]]
+) -> tuple[Block, list[tuple[Lens, float]]]:
+    """The block with measurements corrected for distortions that the ten parameters do not fit.
+
+    Raises:
+        BlockError: a measurement that no ray has in the other program's model.
+    """
+    px = block.points.px.copy()
+    of = np.array([image.camera for image in block.images], dtype=np.int64)[block.points.image]
+    notes = list(block.notes)
+    found = list(fits)
+    for number, (camera, pitch, (_, worst_px)) in enumerate(
+        zip(block.cameras, pitches, fits, strict=True)
+    ):
+        if worst_px <= FIT_LIMIT_PX:
+            continue
+        model, own = camera.model, of == number
+        rays = rays_from_measured_px(model, px[own])
+        if not np.isfinite(rays).all():
+            lost = int(np.isnan(rays).any(axis=1).sum())
+            raise BlockError(
+                f"camera {camera.name}: its distortion has no inverse at {lost} of {len(rays)} "
+                "measurements; adjust it in the other program with fewer parameters"
+            )
+        px[own] = [model.cx_px, model.cy_px] + model.fy_px * rays
+        found[number] = Lens(f_mm=model.fy_px * pitch), 0.0
+        finding = (
+            f"fits the ten parameters within {worst_px:.3f} px only, {FIT_LIMIT_PX:g} px is the "
+            "limit"
+            if math.isfinite(worst_px)
+            else "has no inverse in the corners"
         )
-    return lens, worst_px
+        notes.append(
+            f"camera {camera.name}: its distortion {finding}. The measurements are corrected for "
+            "it, and the camera of the project has none"
+        )
+    return replace(block, points=replace(block.points, px=px), notes=tuple(notes)), found
 
 
 def _with(lens: Lens, values: Mapping[str, float]) -> Lens:

@@ -31,6 +31,10 @@ SIZE = (1600, 1200)
 
 @pytest.fixture(scope="module")
 def scene():
+    return made_scene(K1, K2)
+
+
+def made_scene(k1: float, k2: float):
     """Nine nadir images over uneven ground, and their measurements with 0.3 px of noise.
 
     Projection is written here: vision axes, f, k1, k2 about the middle.
@@ -49,7 +53,7 @@ def scene():
         x, y, z = ((points - centres[k]) @ turns[k]).T
         x, y = x / z, y / z
         r2 = x * x + y * y
-        radial = 1 + K1 * r2 + K2 * r2 * r2
+        radial = 1 + k1 * r2 + k2 * r2 * r2
         u, v = F * x * radial, F * y * radial
         seen += [
             (k, p, float(u[p] + random.normal(0, 0.3)), float(v[p] + random.normal(0, 0.3)))
@@ -58,11 +62,11 @@ def scene():
     return points, centres, turns, seen
 
 
-def colmap(scene, folder: Path) -> Path:
+def colmap(scene, folder: Path, k1: float = K1, k2: float = K2) -> Path:
     points, centres, turns, seen = scene
     flip = np.diag([1.0, -1.0, -1.0])
     middle = ((SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2)
-    model = ForwardDistortion(F, F, *middle, k1=K1, k2=K2)
+    model = ForwardDistortion(F, F, *middle, k1=k1, k2=k2)
     block = Block(
         "scene",
         (BlockCamera("camera1", *SIZE, model),),
@@ -179,6 +183,45 @@ def test_an_imported_block_adjusts_to_the_truth(scene, tmp_path, program, write)
     assert report["sigma0"] == pytest.approx(1.0, abs=0.1), "0.3 px of noise, stated as 0.3 px"
     project = read_project(tmp_path / "project/project.toml")
     assert np.abs(project.network.stations.position_m - np.array(scene[1])).max() < 1e-6
+
+
+def imported_and_adjusted(path: Path, out: Path) -> tuple[dict, dict]:
+    done = RUN.invoke(
+        app,
+        ["import", "block", str(path), "--from", "colmap", "--out", str(out), "--image-sigma",
+         "0.3", "--position-sigma", "0.05", "0.05", "0.05", "--json"],
+    )  # fmt: skip
+    assert done.exit_code == 0, done.output + str(done.exception)
+    adjusted = RUN.invoke(app, ["adjust", str(out), "--json"])
+    assert adjusted.exit_code == 0, adjusted.output + str(adjusted.exception)
+    return json.loads(done.stdout), json.loads(adjusted.stdout)
+
+
+def test_a_distortion_that_does_not_fit_is_taken_out_of_the_measurements(tmp_path) -> None:
+    """As real cameras have it: the ten parameters leave a quarter of a pixel in the corners."""
+    strong = (-0.28, 0.12)
+    path = colmap(made_scene(*strong), tmp_path / "in", *strong)
+    content, report = imported_and_adjusted(path, tmp_path / "project")
+    note = content["notes"][-1]
+    assert "The measurements are corrected for it" in note and "0.02 px is the limit" in note
+    assert content["residuals_px"] == {"camera1": 0.0}
+    assert report["sigma0"] == pytest.approx(1.0, abs=0.1)
+    (camera,) = read_project(tmp_path / "project/project.toml").network.cameras
+    assert not camera.interior.any()
+    # The other sign of k1 in the file is no longer the camera that took the measurements.
+    wrong = colmap(made_scene(*strong), tmp_path / "wrong", 0.28, -0.12)
+    _, report = imported_and_adjusted(wrong, tmp_path / "other")
+    assert report["sigma0"] > 5.0
+
+
+def test_a_measurement_that_no_ray_has_is_refused(tmp_path) -> None:
+    """k1 = -4 folds the image over inside its border: the corners have no ray."""
+    path = colmap(made_scene(-0.28, 0.12), tmp_path / "in", -4.0, 0.0)
+    done = RUN.invoke(
+        app, ["import", "block", str(path), "--from", "colmap", "--out", str(tmp_path / "p")]
+    )
+    assert done.exit_code != 0 and not (tmp_path / "p").exists()
+    assert re.search(r"has no inverse at \d+ of \d+ measurements", str(done.exception))
 
 
 @pytest.mark.parametrize("end", ["", "\n", "\n\n", "\n\n\n"])
