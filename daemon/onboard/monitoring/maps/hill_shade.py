@@ -9,7 +9,6 @@ import math
 from typing import Any, Final
 
 import numpy as np
-import pyproj
 from numpy.typing import NDArray
 
 from daemon.onboard.monitoring.maps.pictures import encode
@@ -22,6 +21,7 @@ from daemon.onboard.monitoring.maps.tiles import (
     mercator_bounds_m,
     tile_bounds,
 )
+from daemon.orientation.geodesy import GEOGRAPHIC, Transformer
 from daemon.planning.relief import TerrainRelief
 
 AZIMUTH_DEG: Final = 315.0
@@ -41,8 +41,8 @@ class HillShadeMap:
         self._model = relief.model
         plan = relief.system.crs
         plan = plan.sub_crs_list[0] if plan.is_compound else plan
-        self._from_mercator = pyproj.Transformer.from_crs("EPSG:3857", plan, always_xy=True)
-        to_geographic = pyproj.Transformer.from_crs(plan, "EPSG:4326", always_xy=True)
+        self._from_mercator = Transformer.from_crs("EPSG:3857", plan, always_xy=True)
+        to_geographic = Transformer.from_crs(plan, GEOGRAPHIC, always_xy=True)
         height, width = self._model.height_m.shape
         x = (self._model.x_m, self._model.x_m + (width - 1) * self._model.step_x_m)
         y = (self._model.y_m, self._model.y_m + (height - 1) * self._model.step_y_m)
