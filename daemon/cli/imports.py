@@ -150,10 +150,11 @@ def dbat(
 
 BLOCK_HELP = """Import cameras, orientations and points of another program for `syntopic adjust`.
 
-Programs: colmap (folder of a text model), opensfm (reconstruction.json
-and tracks.csv), metashape (cameras.xml),
-bundler (bundle.out) and bal (problem file). Distortion is converted to the ten parameters by fit;
-above 0.02 px the measurements are corrected for it instead. Without --position-sigma the project is a free network.
+Programs: colmap (folder of a text model), opensfm (reconstruction.json and tracks.csv), metashape
+(cameras.xml), bundler (bundle.out), bal (problem file), bingo and patb (folder with measurements,
+orientation and cameras.txt). Distortion is converted to the ten parameters by fit; above 0.02 px
+the measurements are corrected for it instead. Without --position-sigma the project is a free
+network.
 
 Examples: `syntopic import block sparse/0 --from colmap --out block`,
 `syntopic import block bundle.out --from bundler --out block --image-sigma 0.3`
@@ -164,7 +165,7 @@ Examples: `syntopic import block sparse/0 --from colmap --out block`,
 def block(
     path: Annotated[Path, typer.Argument(help="File or folder of the program.")],
     program: Annotated[
-        str, typer.Option("--from", help="Program: colmap, opensfm, metashape, bundler or bal.")
+        str, typer.Option("--from", help="Program, such as colmap, metashape or bingo.")
     ],
     out: Annotated[Path, typer.Option(help="Folder for the adjustment project; must be new.")],
     image_sigma: Annotated[

@@ -43,6 +43,8 @@ DEFAULTS: Final[Mapping[str, tuple[Angles, Unit]]] = {
 }
 """Order and unit that each program takes; PATB and Inpho read matrices."""
 MATRIX_PROGRAMS: Final = ("patb", "inpho")
+CAMERAS_FILE: Final = "cameras.txt"
+"""The cameras next to files that do not state them: the programs ask for these values."""
 _GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC)
 
 
@@ -76,7 +78,13 @@ def photogrammetry_texts(
         rows.append((number, image, image.eo))
     if block.georeference is None:
         raise BlockError("the coordinate system of the orientations is not known")
-    texts = {"photos.txt": "".join(f"{n} {image.name}{suffix}\n" for n, image, _ in rows)}
+    texts = {
+        "photos.txt": "".join(
+            f"{n} {image.name}{suffix} {block.cameras[image.camera].name}\n" for n, image, _ in rows
+        ),
+        CAMERAS_FILE: "# name f_mm x0_mm y0_mm pixel_um columns rows\n"
+        + "".join(_camera_row(camera) for camera in block.cameras),
+    }
     if program == "inpho":
         texts[f"{block.name}.prj"] = _inpho(block, suffix)
     elif program == "patb":
@@ -201,6 +209,15 @@ def _camera(camera: BlockCamera) -> list[str]:
         "  $CAMERA_MOUNT_ROTATION : 0.000000",
         "$END",
     ]
+
+
+def _camera_row(camera: BlockCamera) -> str:
+    """A line of `cameras.txt`: the principal point from the middle of the image, y up."""
+    model, pitch = camera.model, _pitch_mm(camera)
+    x0_mm = (model.cx_px - (camera.width_px - 1) / 2.0) * pitch
+    y0_mm = ((camera.height_px - 1) / 2.0 - model.cy_px) * pitch
+    numbers = f"{_focal_mm(camera)!r} {x0_mm!r} {y0_mm!r} {pitch * 1e3!r}"
+    return f"{camera.name} {numbers} {camera.width_px} {camera.height_px}\n"
 
 
 def _pitch_mm(camera: BlockCamera) -> float:

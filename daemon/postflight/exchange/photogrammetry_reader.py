@@ -1,0 +1,482 @@
+"""Blocks of BINGO and PATB: orientations, image measurements and cameras of a folder.
+
+Object points are intersected from the orientations, and whatever contradicts them (exchanged axes,
+another order or unit of angles) is refused: neither file states its conventions itself.
+
+Source: BINGO image coordinates as Pix4D documents its `bingo.txt` (image and camera, then point,
+x, y in mm from the middle of the image); PATB exterior orientation, three records a photo, as PCI
+Geomatics documents it; PATB image coordinates, photo and focal length, then point, x, y, ended by
+-99, as PAT-B's manual has them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon.mission.foreign_files import ForeignFileError, read_regular_file
+from daemon.postflight.exchange.block import (
+    VISION_FROM_CAMERA,
+    Block,
+    BlockCamera,
+    BlockError,
+    BlockImage,
+    BlockPoints,
+)
+from daemon.postflight.exchange.photogrammetry import ANGLES, CAMERAS_FILE, UNITS, Unit
+from processing.geometry.forward_distortion import ForwardDistortion
+from processing.geometry.rotation import rotation_from_angles
+
+Array = NDArray[np.float64]
+
+TEXT_MAX_BYTES: Final = 1_000_000_000
+MISFIT_SHARE: Final = 0.01
+"""Median misfit of the intersected points above which orientations and measurements disagree, as
+a share of the longer side."""
+_FOCAL_WITHIN: Final = 1e-3
+_END: Final = "-99"
+_ORTHOGONAL_TO: Final = 1e-5
+_ORDERS: Final = {"omega-phi-kappa": "XYZ", "phi-omega-kappa": "YXZ"}
+_PIX4D: Final = ("imageName", "X", "Y", "Z", "Omega", "Phi", "Kappa")
+
+
+@dataclass(frozen=True)
+class _Oriented:
+    """Place and rotation, grid from camera, of an image by its name or number."""
+
+    centre_m: Array
+    rotation: Array
+
+
+@dataclass(frozen=True)
+class _Measured:
+    """One image: what names its camera (a name, or a focal length), and its points in mm."""
+
+    camera: str
+    points: Mapping[str, tuple[float, float]]
+
+
+def read_bingo(folder: Path) -> Block:
+    """Read `*bingo*.txt` or `*.dat` with measurements, the orientation, and `cameras.txt`.
+
+    The orientation is `orientation.bingo` with `angles.txt`, as `export block` writes them, or
+    Pix4D's `*calibrated_external_camera_parameters.txt`.
+
+    Raises:
+        BlockError: a file that is missing or not understood, or files that contradict each other.
+    """
+    cameras = _cameras(folder)
+    path = folder / "orientation.bingo"
+    if path.exists():
+        order, unit, system = _stated(folder)
+        oriented = _named(path, order, unit)
+    else:
+        path = _one(folder, ("*calibrated_external_camera_parameters.txt",), "orientation.bingo")
+        oriented = _named(path, "XYZ", "deg", header=_PIX4D)
+        system = "not stated: that of the Pix4D project"
+    measured = _bingo(_one(folder, ("*bingo*.txt", "*.dat"), "<name>_bingo.txt"), cameras)
+    return _block(folder, cameras, oriented, measured, system, {})
+
+
+def read_patb(folder: Path) -> Block:
+    """Read `*.im` with measurements, `*.ori` with the orientation, and `cameras.txt`.
+
+    Raises:
+        BlockError: a file that is missing or not understood, or files that contradict each other.
+    """
+    cameras = _cameras(folder)
+    oriented = _three_records(_one(folder, ("*.ori",), "orientation.ori"))
+    photos = _photos(folder, cameras)
+    measured = _patb(_one(folder, ("*.im",), "<name>.im"), cameras, photos)
+    system = _stated(folder)[2] if (folder / "angles.txt").exists() else "not stated in the files"
+    names = {number: name for number, (name, _) in photos.items()}
+    return _block(folder, cameras, oriented, measured, system, names)
+
+
+def _one(folder: Path, patterns: Sequence[str], example: str) -> Path:
+    found = sorted({path for pattern in patterns for path in folder.glob(pattern)})
+    if len(found) != 1:
+        raise BlockError(
+            f"{folder}: {len(found)} files {' or '.join(patterns)}; one is needed, such as "
+            f"{example}"
+        )
+    return found[0]
+
+
+def _lines(path: Path) -> list[tuple[int, list[str]]]:
+    """Numbers and words of all lines that are not empty."""
+    try:
+        text = read_regular_file(path, TEXT_MAX_BYTES).decode("utf-8-sig", "replace")
+    except ForeignFileError as error:
+        raise BlockError(str(error)) from error
+    rows = ((number, line.split()) for number, line in enumerate(text.splitlines(), 1))
+    return [(number, words) for number, words in rows if words]
+
+
+def _floats(path: Path, number: int, words: Sequence[str]) -> list[float]:
+    try:
+        values = [float(word) for word in words]
+    except ValueError as error:
+        raise BlockError(f"{path}: line {number}: {error}") from error
+    if not all(math.isfinite(value) for value in values):
+        raise BlockError(f"{path}: line {number}: a finite number is needed")
+    return values
+
+
+def _cameras(folder: Path) -> dict[str, BlockCamera]:
+    """`cameras.txt`: name, f, principal point, mm, pixel size, um, columns, rows."""
+    path = folder / CAMERAS_FILE
+    if not path.exists():
+        raise BlockError(
+            f"{folder}: has no {CAMERAS_FILE}, and neither program's files state the camera; write "
+            "one line for each: name, f in mm, x0 and y0 of the principal point in mm, pixel size "
+            "in um, columns, rows"
+        )
+    cameras: dict[str, BlockCamera] = {}
+    for number, words in _lines(path):
+        if words[0].startswith("#"):
+            continue
+        if len(words) != 7:
+            raise BlockError(f"{path}: line {number}: {len(words)} columns; 7 are right")
+        f_mm, x0, y0, pitch_um, width, height = _floats(path, number, words[1:])
+        sides = (round(width), round(height))
+        if not (f_mm > 0.0 and pitch_um > 0.0 and sides == (width, height) and min(sides) > 0):
+            raise BlockError(f"{path}: line {number}: f, pixel size and sides are positive")
+        if words[0] in cameras:
+            raise BlockError(f"{path}: line {number}: camera {words[0]} is there twice")
+        pitch, f_px = pitch_um * 1e-3, f_mm / (pitch_um * 1e-3)
+        centre = ((width - 1) / 2.0 + x0 / pitch, (height - 1) / 2.0 - y0 / pitch)
+        model = ForwardDistortion(f_px, f_px, *centre)
+        cameras[words[0]] = BlockCamera(words[0], *sides, model, pitch)
+    if not cameras:
+        raise BlockError(f"{path}: names no camera")
+    return cameras
+
+
+def _photos(folder: Path, cameras: Mapping[str, BlockCamera]) -> dict[str, tuple[str, str]]:
+    """File and camera of each photo's number, of `photos.txt` where there is one."""
+    path = folder / "photos.txt"
+    photos: dict[str, tuple[str, str]] = {}
+    for number, words in _lines(path) if path.exists() else []:
+        if len(words) != 3:
+            raise BlockError(
+                f"{path}: line {number}: {len(words)} columns; number, file and camera are right"
+            )
+        photos[words[0]] = (words[1], _camera_named(path, number, words[2], cameras))
+    return photos
+
+
+def _stated(folder: Path) -> tuple[str, Unit, str]:
+    """Order of axes, unit, and coordinate system that `angles.txt` states."""
+    path = folder / "angles.txt"
+    if not path.exists():
+        raise BlockError(
+            f"{folder}: has no angles.txt, and orientation.bingo does not state the order and unit "
+            "of its angles; write it as `syntopic export block --to bingo` does"
+        )
+    text = "\n".join(" ".join(words) for _, words in _lines(path))
+    rows = dict(row.split(": ", 1) for row in text.split("\n") if ": " in row)
+    order = next((k for k, stated in ANGLES.items() if rows.get("angles") == stated), None)
+    unit: Unit = "gon" if rows.get("unit") == "gon" else "deg"
+    if rows.get("angles", "").startswith("rotation matrix"):
+        return "matrix", unit, rows.get("coordinate system", "")
+    if order not in _ORDERS or rows.get("unit") not in UNITS:
+        raise BlockError(
+            f"{path}: angles {rows.get('angles', 'not stated')!r}, unit "
+            f"{rows.get('unit', 'not stated')!r}; {' or '.join(_ORDERS)} in deg or gon are read"
+        )
+    return _ORDERS[order], unit, rows.get("coordinate system", "")
+
+
+def _named(
+    path: Path, axes: str, unit: Unit, *, header: Sequence[str] = ()
+) -> dict[str, _Oriented]:
+    """Name, place and three angles in each line, the first one the header where there is one."""
+    rows = _lines(path)
+    if header and (not rows or tuple(rows.pop(0)[1]) != tuple(header)):
+        raise BlockError(f"{path}: does not begin with {' '.join(header)}")
+    if axes not in _ORDERS.values():
+        raise BlockError(f"{path}: angles.txt states a matrix, and this file has angles")
+    found: dict[str, _Oriented] = {}
+    for number, words in rows:
+        if len(words) != 7:
+            raise BlockError(f"{path}: line {number}: {len(words)} columns; 7 are right")
+        values = _floats(path, number, words[1:])
+        angles = np.radians(np.array(values[3:]) / UNITS[unit])
+        rotation = rotation_from_angles(axes, angles.tolist())
+        _add(found, path, number, words[0], np.array(values[:3]), np.asarray(rotation))
+    return found
+
+
+def _three_records(path: Path) -> dict[str, _Oriented]:
+    rows = _lines(path)
+    if len(rows) % 3:
+        raise BlockError(f"{path}: {len(rows)} lines; PATB has three records a photo")
+    found: dict[str, _Oriented] = {}
+    for first, second, third in zip(rows[::3], rows[1::3], rows[2::3], strict=True):
+        number, words = first
+        if (len(words), len(second[1]), len(third[1])) != (4, 5, 4):
+            raise BlockError(
+                f"{path}: line {number}: records of {len(words)}, {len(second[1])} and "
+                f"{len(third[1])} numbers; photo, X, Y, Z, then 5 and 4 of the matrix are right"
+            )
+        turn = np.array(_floats(path, second[0], second[1]) + _floats(path, third[0], third[1]))
+        rotation = turn.reshape(3, 3)
+        off = np.abs(rotation @ rotation.T - np.eye(3)).max()
+        if off > _ORTHOGONAL_TO or np.linalg.det(rotation) < 0.0:
+            raise BlockError(f"{path}: line {number}: photo {words[0]}: no rotation matrix")
+        place = np.array(_floats(path, number, words[1:]))
+        _add(found, path, number, words[0], place, rotation)
+    return found
+
+
+def _add(
+    found: dict[str, _Oriented], path: Path, number: int, name: str, place: Array, turn: Array
+) -> None:
+    if name in found:
+        raise BlockError(f"{path}: line {number}: image {name} is there twice")
+    found[name] = _Oriented(place, turn)
+
+
+def _bingo(path: Path, cameras: Mapping[str, BlockCamera]) -> dict[str, _Measured]:
+    """Image and camera in a line, then its points; -99 or an empty line may end an image."""
+    found: dict[str, dict[str, tuple[float, float]]] = {}
+    camera_of: dict[str, str] = {}
+    current = ""
+    for number, words in _lines(path):
+        if words[0] == _END:
+            continue
+        if len(words) == 2:
+            current, camera = words
+            if current in found:
+                raise BlockError(f"{path}: line {number}: image {current} is there twice")
+            camera_of[current] = _camera_named(path, number, camera, cameras)
+            found[current] = {}
+        elif len(words) == 3 and current:
+            _measure(path, number, words, found[current], 1.0)
+        else:
+            raise BlockError(
+                f"{path}: line {number}: {len(words)} columns; image and camera, or point, x, y in "
+                "mm are read, and further columns are not carried"
+            )
+    return {name: _Measured(camera_of[name], points) for name, points in found.items()}
+
+
+def _camera_named(path: Path, number: int, name: str, cameras: Mapping[str, BlockCamera]) -> str:
+    if name not in cameras:
+        raise BlockError(
+            f"{path}: line {number}: camera {name} is not in {CAMERAS_FILE}, which has "
+            f"{', '.join(cameras)}"
+        )
+    return name
+
+
+def _patb(
+    path: Path, cameras: Mapping[str, BlockCamera], photos: Mapping[str, tuple[str, str]]
+) -> dict[str, _Measured]:
+    """Photo and focal length, then its points, ended by -99; both in mm, or both in um."""
+    found: dict[str, dict[str, tuple[float, float]]] = {}
+    camera_of: dict[str, str] = {}
+    current, mm = "", 1.0
+    for number, words in _lines(path):
+        if words[0] == _END:
+            current = ""
+        elif not current:
+            if len(words) != 2:
+                raise BlockError(
+                    f"{path}: line {number}: {len(words)} columns; photo and focal length are "
+                    "read, and further columns are not carried"
+                )
+            current = words[0]
+            if current in found:
+                raise BlockError(f"{path}: line {number}: photo {current} is there twice")
+            (focal,) = _floats(path, number, words[1:])
+            own = photos[current][1] if current in photos else None
+            known = cameras if own is None else {own: cameras[own]}
+            camera_of[current], mm = _camera_of_focal(path, number, focal, known)
+            found[current] = {}
+        elif len(words) == 3 or (len(words) == 4 and words[3] in ("0", "1")):
+            _measure(path, number, words[:3], found[current], mm)
+        else:
+            raise BlockError(
+                f"{path}: line {number}: {' '.join(words)[:60]!r}; point, x, y are read. A weight "
+                "group other than 0 or 1 is not carried; give the block one accuracy, and "
+                "--image-sigma states it"
+            )
+    if current:
+        raise BlockError(f"{path}: photo {current} does not end with {_END}; copy it again")
+    return {name: _Measured(camera_of[name], points) for name, points in found.items()}
+
+
+def _camera_of_focal(
+    path: Path, number: int, focal: float, cameras: Mapping[str, BlockCamera]
+) -> tuple[str, float]:
+    """The one camera of a focal length in mm or um, and the mm of that unit."""
+    found = [
+        (name, mm)
+        for name, camera in cameras.items()
+        for mm in (1.0, 1e-3)
+        if abs(focal * mm / _focal_mm(camera) - 1.0) < _FOCAL_WITHIN
+    ]
+    if len(found) != 1:
+        listed = ", ".join(f"{name} {_focal_mm(c):.4f}" for name, c in cameras.items())
+        raise BlockError(
+            f"{path}: line {number}: focal length {focal:g} is that of {len(found)} cameras in mm "
+            f"or um; {CAMERAS_FILE} has {listed}"
+        )
+    return found[0]
+
+
+def _focal_mm(camera: BlockCamera) -> float:
+    return camera.model.fx_px * (camera.pitch_mm or 1.0)
+
+
+def _measure(
+    path: Path,
+    number: int,
+    words: Sequence[str],
+    points: dict[str, tuple[float, float]],
+    mm: float,
+) -> None:
+    if words[0] in points:
+        raise BlockError(f"{path}: line {number}: point {words[0]} is twice in this image")
+    x, y = _floats(path, number, words[1:])
+    points[words[0]] = (x * mm, y * mm)
+
+
+def _block(
+    folder: Path,
+    cameras: Mapping[str, BlockCamera],
+    oriented: Mapping[str, _Oriented],
+    measured: Mapping[str, _Measured],
+    system: str,
+    names: Mapping[str, str],
+) -> Block:
+    without = sorted(set(measured) - set(oriented))
+    if without:
+        raise BlockError(
+            f"{folder}: {len(without)} images with measurements have no orientation: "
+            f"{', '.join(without[:5])}"
+        )
+    notes = [f"coordinate system: {system}; the curvature of the earth is not modelled"]
+    unmeasured = sorted(set(oriented) - set(measured))
+    if unmeasured:
+        notes.append(f"{len(unmeasured)} images without measurements: {', '.join(unmeasured[:5])}")
+    index = {name: k for k, name in enumerate(cameras)}
+    images = tuple(
+        BlockImage(
+            names.get(name, name),
+            index[one.camera],
+            k,
+            oriented[name].centre_m,
+            oriented[name].rotation,
+        )
+        for k, (name, one) in enumerate(measured.items())
+    )
+    if not images:
+        raise BlockError(f"{folder}: no image has measurements")
+    points, median_px = _intersected(folder, tuple(cameras.values()), images, measured)
+    notes.append(
+        f"points are intersected from the orientations, which they fit with a median of "
+        f"{median_px:.2f} px"
+    )
+    return Block(
+        folder.resolve().name, tuple(cameras.values()), images, points=points, notes=tuple(notes)
+    )
+
+
+def _intersected(
+    folder: Path,
+    cameras: Sequence[BlockCamera],
+    images: Sequence[BlockImage],
+    measured: Mapping[str, _Measured],
+) -> tuple[BlockPoints, float]:
+    """Points seen in two images or more, from the rays of all, and the median misfit in px.
+
+    Raises:
+        BlockError: rays that do not meet, or meet behind the cameras.
+    """
+    seen: dict[str, list[tuple[int, Array]]] = {}
+    for k, one in enumerate(measured.values()):
+        camera = cameras[images[k].camera]
+        pitch = camera.pitch_mm or 1.0
+        middle = np.array([(camera.width_px - 1) / 2.0, (camera.height_px - 1) / 2.0])
+        for point, (x_mm, y_mm) in one.points.items():
+            px = middle + np.array([x_mm, -y_mm]) / pitch
+            if not (np.abs(px - middle) <= middle + 1.0).all():
+                raise BlockError(
+                    f"{folder}: point {point} of image {images[k].name} lies outside of the image "
+                    f"({x_mm:g}, {y_mm:g} mm); are coordinates in mm, and {CAMERAS_FILE} right?"
+                )
+            seen.setdefault(point, []).append((k, px))
+    names: list[str] = []
+    xyz: list[Array] = []
+    image: list[int] = []
+    of: list[int] = []
+    pixels: list[Array] = []
+    misfits: list[float] = []
+    behind = 0
+    for point, rays in seen.items():
+        if len(rays) < 2:
+            continue
+        place, misfit_px, in_front = _meeting(cameras, images, rays)
+        behind += not in_front
+        misfits += misfit_px
+        for k, px in rays:
+            image.append(k)
+            of.append(len(names))
+            pixels.append(px)
+        names.append(point)
+        xyz.append(place)
+    if not names:
+        raise BlockError(f"{folder}: no point is measured in two images; there is no block")
+    median_px = float(np.median(misfits))
+    limit_px = MISFIT_SHARE * max(max(c.width_px, c.height_px) for c in cameras)
+    if not median_px < limit_px or 2 * behind > len(names):
+        raise BlockError(
+            f"{folder}: the rays miss each other by {median_px:.0f} px (median), and {behind} of "
+            f"{len(names)} points lie behind the cameras. Order or unit of the angles, the "
+            "direction of y (up), or the coordinate system of the orientation is another one"
+        )
+    return BlockPoints(
+        np.array(xyz),
+        tuple(names),
+        np.array(image, dtype=np.int64),
+        np.array(of, dtype=np.int64),
+        np.array(pixels),
+    ), median_px
+
+
+def _meeting(
+    cameras: Sequence[BlockCamera],
+    images: Sequence[BlockImage],
+    rays: Sequence[tuple[int, Array]],
+) -> tuple[Array, list[float], bool]:
+    """Where rays meet best, how far in px each measurement is from it, and whether in front."""
+    normal, right = np.zeros((3, 3)), np.zeros(3)
+    for k, px in rays:
+        model = cameras[images[k].camera].model
+        x, y = (px - [model.cx_px, model.cy_px]) / model.fx_px
+        ray = images[k].rotation @ VISION_FROM_CAMERA @ np.array([x, y, 1.0])
+        ray /= np.linalg.norm(ray)
+        across = np.eye(3) - np.outer(ray, ray)
+        normal += across
+        right += across @ images[k].centre_m
+    try:
+        place = np.linalg.solve(normal, right)
+    except np.linalg.LinAlgError:
+        return images[rays[0][0]].centre_m, [math.inf], False
+    misfits, in_front = [], True
+    for k, px in rays:
+        model = cameras[images[k].camera].model
+        x, y, z = VISION_FROM_CAMERA @ images[k].rotation.T @ (place - images[k].centre_m)
+        in_front = in_front and z > 0.0
+        back = np.array([model.cx_px, model.cy_px]) + model.fx_px * np.array([x, y]) / z
+        misfits.append(float(np.linalg.norm(back - px)))
+    return np.asarray(place), misfits, bool(in_front)

@@ -1,0 +1,247 @@
+"""Blocks of BINGO and PATB, in the forms of published descriptions and of our own exporter."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
+
+from daemon.cli import app
+from daemon.postflight.adjustment.project import read_project
+from daemon.postflight.exchange.block import BlockError
+from daemon.postflight.exchange.photogrammetry_reader import read_bingo, read_patb
+from tests.daemon.postflight.exchange.flown_block import fly
+from tests.daemon.postflight.exchange.test_colmap import SECONDS, export
+from tests.daemon.postflight.exchange.test_import_block import SIZE, F, made_scene
+
+RUN = CliRunner()
+PITCH_MM = 0.004
+FLIP = np.diag([1.0, -1.0, -1.0])
+ANGLES = "phi, omega, kappa of R = Ry(phi) Rx(omega) Rz(kappa), grid from camera"
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return made_scene(0.0, 0.0)
+
+
+def camera_file(folder: Path) -> None:
+    folder.mkdir()
+    row = f"X20 {F * PITCH_MM} 0 0 {PITCH_MM * 1e3} {SIZE[0]} {SIZE[1]}\n"
+    (folder / "cameras.txt").write_text("# name f x0 y0 pixel columns rows\n" + row)
+
+
+def rows_of(seen, k: int, unit: float = 1.0) -> list[str]:
+    """Point, x, y of image k; y up."""
+    return [
+        f"{1000 + p} {u * PITCH_MM * unit:.6f} {-v * PITCH_MM * unit:.6f}"
+        for image, p, u, v in seen
+        if image == k
+    ]
+
+
+def bingo(scene, folder: Path) -> Path:
+    """As our exporter writes the orientation, and as Pix4D documents the measurements."""
+    _, centres, turns, seen = scene
+    camera_file(folder)
+    lines, measured = [], []
+    for k, (centre, turn) in enumerate(zip(centres, turns, strict=True)):
+        angles = Rotation.from_matrix(turn @ FLIP).as_euler("YXZ", degrees=True) / 0.9
+        lines.append(" ".join([f"P{k}", *(f"{v:.7f}" for v in (*centre, *angles))]))
+        measured += [f"P{k} X20", *rows_of(seen, k), ""]
+    (folder / "orientation.bingo").write_text("\n".join(lines) + "\n")
+    (folder / "angles.txt").write_text(
+        f"coordinate system: EPSG:32633, heights ellipsoidal\nangles: {ANGLES}\nunit: gon\n"
+    )
+    (folder / "block_bingo.txt").write_text("\n".join(measured) + "\n")
+    return folder
+
+
+def pix4d(scene, folder: Path) -> Path:
+    """With the external parameters of Pix4D in place of our orientation."""
+    bingo(scene, folder)
+    (folder / "orientation.bingo").unlink()
+    (folder / "angles.txt").unlink()
+    lines = ["imageName X Y Z Omega Phi Kappa"]
+    for k, (centre, turn) in enumerate(zip(scene[1], scene[2], strict=True)):
+        angles = Rotation.from_matrix(turn @ FLIP).as_euler("XYZ", degrees=True)
+        lines.append(" ".join([f"P{k}", *(f"{v:.7f}" for v in (*centre, *angles))]))
+    path = folder / "block_calibrated_external_camera_parameters.txt"
+    path.write_text("\n".join(lines) + "\n")
+    return folder
+
+
+def patb(scene, folder: Path, unit: float = 1e3) -> Path:
+    _, centres, turns, seen = scene
+    camera_file(folder)
+    orientation, measured = "", []
+    for k, (centre, turn) in enumerate(zip(centres, turns, strict=True)):
+        r = (turn @ FLIP).ravel()
+        place = "".join(f"{v:16.5f}" for v in centre)
+        orientation += f"{k + 1:16d}{'':16}{place}\n"
+        orientation += "".join(f"{v:16.12f}" for v in r[:5]) + "\n"
+        orientation += "".join(f"{v:16.12f}" for v in r[5:]) + "\n"
+        measured += [f"{k + 1} {F * PITCH_MM * unit}", *rows_of(seen, k, unit), "-99"]
+    (folder / "block.ori").write_text(orientation)
+    (folder / "block.im").write_text("\n".join(measured) + "\n")
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("program", "write"),
+    [("bingo", bingo), ("bingo", pix4d), ("patb", patb)],
+)
+def test_an_imported_block_adjusts_to_the_truth(scene, tmp_path, program, write) -> None:
+    path, out = write(scene, tmp_path / "in"), tmp_path / "project"
+    done = RUN.invoke(
+        app,
+        ["import", "block", str(path), "--from", program, "--out", str(out), "--image-sigma",
+         "0.3", "--position-sigma", "0.05", "0.05", "0.05", "--json"],
+    )  # fmt: skip
+    assert done.exit_code == 0, done.output + str(done.exception)
+    content = json.loads(done.stdout)
+    assert (content["images"], content["residuals_px"]) == (9, {"X20": 0.0})
+    assert "fit with a median of 0." in content["notes"][-1]
+    adjusted = RUN.invoke(app, ["adjust", str(out), "--json"])
+    assert adjusted.exit_code == 0, adjusted.output + str(adjusted.exception)
+    assert json.loads(adjusted.stdout)["sigma0"] == pytest.approx(1.0, abs=0.1)
+    network = read_project(out / "project.toml").network
+    assert np.abs(network.stations.position_m - np.array(scene[1])).max() < 1e-4
+    found = dict(zip(network.points.names, network.points.xyz_m, strict=True))
+    truth = {str(1000 + p): xyz for p, xyz in enumerate(scene[0])}
+    # 0.3 px at 1500 px from 200 m are 4 cm; of two rays of a short base several times that.
+    off = [np.linalg.norm(xyz - truth[name]) for name, xyz in found.items()]
+    assert len(found) > 90 and np.median(off) < 0.1
+
+
+def test_the_focal_length_states_micrometres_or_millimetres_of_patb(scene, tmp_path) -> None:
+    one = read_patb(patb(scene, tmp_path / "um"))
+    other = read_patb(patb(scene, tmp_path / "mm", unit=1.0))
+    assert np.allclose(one.points.px, other.points.px, atol=1e-2)
+
+
+def turned(path: Path, write) -> None:
+    rows = [line.split() for line in path.read_text().splitlines()]
+    path.write_text("\n".join(" ".join(write(row) if len(row) == 3 else row) for row in rows))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "sentence"),
+    [
+        (lambda row: [row[0], row[1], str(-float(row[2]))], "rays miss each other|lie behind"),
+        (lambda row: [row[0], row[2], row[1]], "rays miss each other|outside of the image"),
+        (lambda row: [row[0], str(-float(row[1])), row[2]], "rays miss each other|lie behind"),
+        (lambda row: [row[0], *(str(float(v) * 250) for v in row[1:])], "outside of the image"),
+        (lambda row: [row[0], *(str(float(v) * 0.25) for v in row[1:])], "rays miss each other"),
+        (lambda row: [*row, "0.004"], "4 columns"),
+        (lambda row: [row[0], row[1], "nan"], "finite number"),
+    ],
+    ids=["y down", "exchanged", "x left", "pixels", "another pixel size", "accuracy", "nan"],
+)
+def test_measurements_of_another_convention_are_refused(scene, tmp_path, wrong, sentence) -> None:
+    folder = bingo(scene, tmp_path / "in")
+    turned(folder / "block_bingo.txt", wrong)
+    with pytest.raises(BlockError, match=sentence):
+        read_bingo(folder)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [
+        ("unit: gon", "unit: deg", "rays miss each other|lie behind"),
+        ("unit: gon", "unit: rad", "unit 'rad'"),
+        (ANGLES, ANGLES.replace("phi, omega", "kappa, omega"), "omega-phi-kappa or"),
+    ],
+)
+def test_angles_of_another_unit_or_order_are_refused(scene, tmp_path, old, new, sentence) -> None:
+    folder = bingo(scene, tmp_path / "in")
+    text = (folder / "angles.txt").read_text()
+    assert old in text
+    (folder / "angles.txt").write_text(text.replace(old, new))
+    with pytest.raises(BlockError, match=sentence):
+        read_bingo(folder)
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "sentence"),
+    [
+        ("block.im", "-99\n2 ", "2 ", "line \\d+: '2 6000.0'"),
+        ("block.im", "1 6000.0", "1 7000.0", "focal length 7000 is that of 0 cameras"),
+        ("block.ori", "\n  ", "\n  9", "no rotation matrix"),
+        ("block.ori", "\n", " 1.0\n", "records of 5, 5 and 4 numbers"),
+        ("cameras.txt", "X20 6.0", "X20 -6.0", "f, pixel size and sides are positive"),
+        ("cameras.txt", "1600 1200", "1600", "6 columns; 7 are right"),
+    ],
+)
+def test_damaged_files_of_patb_are_refused(scene, tmp_path, file, old, new, sentence) -> None:
+    folder = patb(scene, tmp_path / "in")
+    text = (folder / file).read_text()
+    assert old in text
+    (folder / file).write_text(text.replace(old, new, 1))
+    with pytest.raises(BlockError, match=sentence):
+        read_patb(folder)
+
+
+def test_weights_and_images_without_orientation_are_refused_by_name(scene, tmp_path) -> None:
+    folder = patb(scene, tmp_path / "in")
+    text = (folder / "block.im").read_text()
+    lines = text.splitlines()
+    (folder / "block.im").write_text("\n".join([lines[0], lines[1] + " 3", *lines[2:]]))
+    with pytest.raises(BlockError, match="weight group other than 0 or 1 is not carried"):
+        read_patb(folder)
+    (folder / "block.im").write_text(text)
+    rows = (folder / "block.ori").read_text().splitlines()
+    (folder / "block.ori").write_text("\n".join(rows[3:]))
+    with pytest.raises(BlockError, match="1 images with measurements have no orientation: 1"):
+        read_patb(folder)
+    for name in ("block.im", "cameras.txt"):
+        (folder / name).unlink()
+        with pytest.raises(BlockError, match=f"has no {name}|0 files"):
+            read_patb(folder)
+
+
+@pytest.mark.parametrize(("program", "read"), [("bingo", read_bingo), ("patb", read_patb)])
+def test_our_own_export_comes_back(tmp_path, program, read) -> None:
+    """Measurements are computed from the exported files themselves, by the test's own formula."""
+    flown = fly(tmp_path / "mission", "midas-mini", seconds=SECONDS)
+    _, folder = export(flown, "--crs", "EPSG:32633", to=program)
+    cameras = {
+        words[0]: [float(v) for v in words[1:]]
+        for words in map(str.split, (folder / "cameras.txt").read_text().splitlines()[1:])
+    }
+    photos = [line.split() for line in (folder / "photos.txt").read_text().splitlines()]
+    poses = []
+    if program == "bingo":
+        for row in map(str.split, (folder / "orientation.bingo").read_text().splitlines()):
+            values = np.array(row[1:], float)
+            turn = Rotation.from_euler("YXZ", values[3:] * 0.9, degrees=True).as_matrix()
+            poses.append((values[:3], turn))
+    else:
+        numbers = (folder / "orientation.ori").read_text().splitlines()
+        for k in range(0, len(numbers), 3):
+            turn = np.array(" ".join(numbers[k + 1 : k + 3]).split(), float).reshape(3, 3)
+            poses.append((np.array(numbers[k].split()[1:], float), turn))
+    ground = poses[0][0] + np.array([0, 0, -1000.0])
+    spread = np.stack(np.meshgrid(*[np.linspace(-700, 700, 21)] * 2), -1).reshape(-1, 2)
+    points = ground + np.column_stack([spread, np.zeros(len(spread))])
+    measured, seen = [], 0
+    for (number, name, camera), (centre, turn) in zip(photos, poses, strict=True):
+        f, x0, y0, pitch_um, columns, rows = cameras[camera]
+        x, y, z = ((points - centre) @ turn).T
+        x, y = x0 - f * x / z, y0 - f * y / z
+        half = np.array([columns, rows]) / 2 * pitch_um * 1e-3
+        inside = np.flatnonzero((z < 0) & (abs(x) < half[0]) & (abs(y) < half[1]))
+        head = f"{name.removesuffix('.jpg')} {camera}" if program == "bingo" else f"{number} {f}"
+        measured += [head, *(f"{k} {x[k]:.9f} {y[k]:.9f}" for k in inside.tolist()), "-99"]
+        seen += len(inside)
+    name = "x_bingo.txt" if program == "bingo" else "x.im"
+    (folder / name).write_text("\n".join(measured) + "\n")
+    block = read(folder)
+    assert len(block.images) == 20 and seen > 100
+    truth = points[[int(point) for point in block.points.names]]
+    assert len(truth) > 15 and np.abs(block.points.xyz_m - truth).max() < 0.05
+    assert "EPSG:32633" in block.notes[0]
