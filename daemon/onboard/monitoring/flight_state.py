@@ -193,9 +193,12 @@ class FlightState:
             return {**dropped, "sequence": 0, "step": step, "flags": [], "findings": []}
         return found
 
-    def dropped_footprints(self) -> list[Json]:
-        """Number, verdict and footprint of exposures beyond `EXPOSURES_MAX`, oldest first."""
-        return [self._dropped[number] for number in sorted(self._dropped)]
+    def older_footprints(self, newest: int = EXPOSURES_MAX) -> list[Json]:
+        """Number, verdict and footprint of all but the newest exposures, oldest first."""
+        older = sorted(self._exposures)[:-newest]
+        whole = (_reduced(number, self._exposures[number]) for number in older)
+        dropped = (self._dropped[number] for number in sorted(self._dropped))
+        return [*dropped, *(one for one in whole if one is not None)]
 
     def retakes(self) -> list[Json]:
         """Lines that were added to be flown again."""
@@ -419,10 +422,8 @@ class FlightState:
         verdict = dropped.get("verdict")
         if verdict in self._dropped_verdicts:
             self._dropped_verdicts[verdict] += 1
-        if dropped.get("footprint"):
-            corners = [[round(x, FOOTPRINT_DIGITS) for x in one] for one in dropped["footprint"]]
-            shown = "lost" if dropped.get("step") == "lost" else verdict
-            self._dropped[number] = {"number": number, "verdict": shown, "footprint": corners}
+        if (reduced := _reduced(number, dropped)) is not None:
+            self._dropped[number] = reduced
         while len(self._dropped) > FOOTPRINTS_MAX:
             del self._dropped[next(iter(self._dropped))]
 
@@ -433,6 +434,15 @@ class FlightState:
             if verdict in counts:
                 counts[verdict] += 1
         return counts
+
+
+def _reduced(number: int, record: Json) -> Json | None:
+    """Footprint and verdict of an exposure; None for one without a footprint."""
+    if not record.get("footprint"):
+        return None
+    corners = [[round(x, FOOTPRINT_DIGITS) for x in one] for one in record["footprint"]]
+    shown = "lost" if record.get("step") == "lost" else record.get("verdict")
+    return {"number": number, "verdict": shown, "footprint": corners}
 
 
 def _apply_report(record: Json, report: Mapping[str, Any]) -> None:

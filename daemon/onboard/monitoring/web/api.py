@@ -95,6 +95,16 @@ Product = Literal[
     "histogram.json",
     "quality.json",
 ]
+Part = Literal[
+    "exposures",
+    "devices",
+    "settings",
+    "track",
+    "history",
+    "events",
+    "residuals",
+    "thumbnails",
+]
 CommandName = Literal[
     "arm",
     "start",
@@ -320,9 +330,11 @@ def _add_products(app: FastAPI, state: FlightState, access: _AccessControl) -> N
         return _listed(state.exposures(after, limit))
 
     @app.get("/api/v1/footprints", dependencies=[watcher], tags=["exposures"])
-    async def footprints() -> list[dict[str, Any]]:
-        """Number, verdict and footprint of the exposures before those of the state."""
-        return state.dropped_footprints()
+    async def footprints(
+        newest: Annotated[int, Query(ge=1, le=EXPOSURES_MAX)] = EXPOSURES_MAX,
+    ) -> list[dict[str, Any]]:
+        """Number, verdict and footprint of all exposures but so many of the newest."""
+        return state.older_footprints(newest)
 
     @app.get("/api/v1/exposures/{number}", dependencies=[watcher], tags=["exposures"])
     async def exposure(number: Number) -> dict[str, Any]:
@@ -402,16 +414,19 @@ def _add_telemetry(app: FastAPI, state: FlightState, access: _AccessControl) -> 
         socket: WebSocket,
         form: Literal["json", "msgpack"] = "msgpack",
         bytes_per_s: float = math.inf,
+        newest: Annotated[int | None, Query(ge=1, le=EXPOSURES_MAX)] = None,
+        without: Annotated[list[Part] | None, Query()] = None,
     ) -> None:
         """Records as in docs/reference/flight/telemetry.md, until the client disconnects.
 
-        The first record holds the complete state.
+        The first record holds the complete state, unless `newest` limits it.
         """
         if not await admit_watcher(socket, access):
             return
         # JSON clients fetch pictures over HTTP.
-        parts = PARTS if form == "json" else (*PARTS, *PREVIEW_PARTS)
-        subscription = Subscription(max(bytes_per_s, MIN_BYTES_PER_S), parts)
+        offered = PARTS if form == "json" else (*PARTS, *PREVIEW_PARTS)
+        parts = tuple(one for one in offered if one not in (without or ()))
+        subscription = Subscription(max(bytes_per_s, MIN_BYTES_PER_S), parts, newest)
         disconnected = asyncio.ensure_future(_wait_for_disconnect(socket))
         try:
             while not disconnected.done():

@@ -89,6 +89,31 @@ def test_a_page_opens_although_its_address_has_sent_too_many_requests(
         browser.wait_for(f"{CONNECTED} && {READY} && typeof L === 'object'", WITHIN_S)
 
 
+KEPT = """caches.open('syntopic-page').then((cache) => Promise.all(['/', '/page.js', '/strip.js',
+  '/vendor/leaflet.js', '/panels.css', '/messages/en/alarm.json'].map((one) => cache.match(one))))
+  .then((found) => found.every(Boolean))"""
+
+
+def test_a_page_that_was_opened_once_opens_without_the_service(tmp_path: Path) -> None:
+    """Nothing was stored by the worker while that page loaded: it was not there yet."""
+    service = Service(tmp_path)
+    service.emit(flight_events.mission())
+    with Browser(tmp_path / "profile") as browser:
+        browser.open(service.address)
+        browser.wait_for(f"{CONNECTED} && {READY}", WITHIN_S)
+        browser.wait_for(KEPT, WITHIN_S)
+        service.end()
+        browser.evaluate("window.isBefore = true; location.reload()")
+        browser.wait_for(
+            f"window.isBefore === undefined && {READY} && typeof L === 'object'", WITHIN_S
+        )
+        paths = browser.evaluate(
+            "caches.open('syntopic-page').then((cache) => cache.keys())"
+            ".then((all) => all.map((one) => new URL(one.url).pathname))"
+        )
+        assert not [one for one in paths if one.startswith("/api/")]
+
+
 def test_a_thumbnail_that_is_missing_is_not_asked_for_with_each_record(
     service: Service, browser: Browser
 ) -> None:

@@ -8,6 +8,7 @@ import pytest
 
 from daemon.onboard.monitoring import flight_state
 from daemon.onboard.monitoring.flight_state import FlightState
+from daemon.onboard.monitoring.telemetry import PAST_BYTES
 from tests.daemon.onboard.monitoring import flight_events
 from tests.daemon.onboard.monitoring.page_service import WITHIN_S, Service
 from tests.support.browser import Browser, chromium
@@ -110,6 +111,45 @@ def test_an_answer_that_is_not_read_is_released(page: tuple[Service, Browser]) -
     assert len(found) == 2 and all(is_released for _, is_released in found)
 
 
+def test_a_page_opened_late_shows_the_newest_first_and_all_footprints(
+    page: tuple[Service, Browser],
+) -> None:
+    service, browser = page
+    browser.call(
+        "Page.addScriptToEvaluateOnNewDocument",
+        source="""
+        window.records = [];
+        const Plain = window.WebSocket;
+        window.WebSocket = class extends Plain {
+          constructor(...given) {
+            super(...given);
+            if (!String(given[0]).includes('/telemetry')) return;
+            this.addEventListener('message', ({data}) => window.records.push(data));
+          }
+        };""",
+    )
+    browser.open(service.address)
+    # This page asked for many pictures that do not exist: its requests may be refused for a while.
+    browser.wait_for("document.body?.dataset.ready !== undefined", WITHIN_S)
+    shown = "import('/map.js').then((map) => map.footprintCount())"
+    browser.wait_for(f"{shown}.then((count) => count === 340)", WITHIN_S)
+    browser.wait_for(
+        "import('/telemetry.js').then(({ flight }) => flight.exposures.size === 300)", WITHIN_S
+    )
+    first, largest, events = browser.evaluate(
+        "[JSON.parse(records[0]).exposures.map((one) => one.number),"
+        " Math.max(...records.map((one) => one.length)),"
+        " records.some((one) => 'events' in JSON.parse(one))]"
+    )
+    assert first[0] == 340 and first == sorted(first, reverse=True) and len(first) < 300
+    assert largest < 3 * PAST_BYTES
+    assert not events
+    track = browser.evaluate(
+        "import('/telemetry.js').then(({ flight }) => flight.history.map((one) => one.number))"
+    )
+    assert track == sorted(track) and track[-1] == 340
+
+
 @pytest.mark.parametrize(
     ("expression", "expected"),
     [
@@ -138,9 +178,10 @@ def test_exposures_beyond_the_snapshot_keep_footprint_and_verdict(
         for event in flight_events.exposure(number, "refly" if number == 4 else "good"):
             state.apply(event)
     assert [one["number"] for one in state.exposures()] == [6, 7, 8]
-    dropped = state.dropped_footprints()
+    dropped = state.older_footprints()
     assert [one["number"] for one in dropped] == [2, 3, 4, 5]
     assert dropped[2] == {"number": 4, "verdict": "refly", "footprint": [[47.0, 15.0]] * 4}
+    assert [one["number"] for one in state.older_footprints(newest=1)] == [2, 3, 4, 5, 6, 7]
     found = state.exposure(4)
     assert found is not None and (found["step"], found["verdict"]) == ("processed", "refly")
     assert state.exposure(1) is None

@@ -238,8 +238,8 @@ WORKER = """
     }}));
   };
   const handlers = {};
-  const self = {addEventListener: (kind, handler) => { handlers[kind] = handler; }};
-  const location = {origin: 'http://camera'};
+  const self = {location: {host: 'camera'}, addEventListener: (kind, handler) => { handlers[kind] = handler; }};
+  const location = {origin: 'http://camera', host: 'camera'};
   new Function('self', 'caches', 'fetch', 'location', SOURCE)(self, caches, fetch, location);
   const get = async (path, mode, client) => {
     let answer;
@@ -259,6 +259,10 @@ WORKER = """
   link.isUp = true;
   found.stored = await get('/page.js', 'no-cors', 'b');
   found.fresh = await get('/page.js', 'no-cors', 'a');
+  // Without a network and a stored page, one opens that tries again.
+  kept.clear();
+  link.isUp = false;
+  found.waiting = (await get('/pilot', 'navigate', 'c')).includes('http-equiv="refresh"');
   return found;
 })()
 """
@@ -274,4 +278,9 @@ def test_the_files_of_a_page_are_of_one_version_over_a_slow_link(
     browser.open("about:blank")
     browser.wait_for("location.href === 'about:blank'", WITHIN_S)
     found = browser.evaluate(WORKER.replace("SOURCE", json.dumps(source)))
-    assert found == {"slow": "new file!", "stored": "old script", "fresh": "new file!"}
+    assert found == {
+        "slow": "new file!",
+        "stored": "old script",
+        "fresh": "new file!",
+        "waiting": True,
+    }

@@ -17,6 +17,8 @@ export const flight = {
 
 const SILENCE_MS = 5000;
 const EXPOSURES_MAX = 300;
+const RETRY_MS = 5000;
+const WANTED = `form=json&newest=${EXPOSURES_MAX}&without=events`;
 const TRACK_MAX = 2000;
 const HISTORY_MAX = 1000;
 const listeners = new Set();
@@ -56,12 +58,17 @@ function prune() {
   }
 }
 
-// Footprints of exposures that the service no longer sends, after a connection late in a flight.
-async function loadOlder(exposures) {
-  if (!exposures.some((one) => one.number > 1)) return;
+// Footprints of the exposures before those that telemetry sends whole, after a connection late in a flight.
+async function loadOlder() {
+  if ((flight.brief.last_number ?? 0) <= EXPOSURES_MAX) return;
   const mission = flight.brief.mission?.id;
-  const listed = await fetchJson("/api/v1/footprints");
-  if (!listed?.length || flight.brief?.mission?.id !== mission) return;
+  const listed = await fetchJson(`/api/v1/footprints?newest=${EXPOSURES_MAX}`);
+  if (flight.brief?.mission?.id !== mission) return;
+  if (!listed) {
+    // Refused for a moment, or the link was lost: without them the map would have a hole.
+    setTimeout(loadOlder, RETRY_MS);
+    return;
+  }
   for (const { number, verdict, footprint } of listed) {
     if (!flight.exposures.has(number) && !flight.older.index.has(number)) flight.older.add(number, verdict, footprint);
   }
@@ -78,19 +85,24 @@ export async function restore(number) {
   return true;
 }
 
+const bySequence = (a, b) => a.sequence - b.sequence;
+
 function merge(record, isFirstRecord) {
-  const { exposures = [], devices = [], track = [], history = [], settings = [], events: _, ...brief } = record;
+  const { exposures = [], devices = [], track = [], history = [], settings = [], ...brief } = record;
   flight.brief = brief;
   for (const one of exposures) flight.exposures.set(one.number, one);
   for (const one of devices) flight.devices.set(one.name, one);
   flight.settings = settings.at(-1) || flight.settings;
   for (const one of track) flight.track.push(one);
   for (const one of history) flight.history.push(one);
+  // The past comes newest first, in several records.
+  flight.track.sort(bySequence);
+  flight.history.sort(bySequence);
   thin(flight.track, TRACK_MAX);
   thin(flight.history, HISTORY_MAX);
   prune();
   for (const listener of listeners) listener(record, isFirstRecord);
-  if (isFirstRecord) loadOlder(exposures);
+  if (isFirstRecord) loadOlder();
 }
 
 // Receive telemetry and reconnect for ever. `onLinkChange(isLinked)` is called when the connection
@@ -104,7 +116,7 @@ export function connect(onLinkChange, requestToken) {
     const token = sessionStorage.getItem("token");
     // A browser sets no other header of a WebSocket; a token in the address would appear in logs.
     const protocols = token ? ["syntopic.v1", `bearer.${token}`] : ["syntopic.v1"];
-    const socket = new WebSocket(`${scheme}://${location.host}/api/v1/telemetry?form=json`, protocols);
+    const socket = new WebSocket(`${scheme}://${location.host}/api/v1/telemetry?${WANTED}`, protocols);
     let hasEnded = false;
     // Also called if the service is silent: a browser may wait long for the end of a dead connection.
     const end = async () => {
@@ -134,7 +146,7 @@ export function connect(onLinkChange, requestToken) {
       if (hasEnded) return;
       waitMs = 500;
       restartTimeout();
-      // The first record is complete. The previous state may belong to another flight.
+      // What the first record leaves out follows. The previous state may belong to another flight.
       if (isFirstRecord) {
         clear();
         onLinkChange(true);

@@ -15,7 +15,12 @@ const isStored = new Map();
 const isOfPage = (address) => address.origin === location.origin && !address.pathname.startsWith("/api/")
   && !/^\/(metrics|docs|openapi)/.test(address.pathname);
 
-const stored = (request) => caches.match(request, { ignoreSearch: true });
+const stored = (request) => caches.match(request, { ignoreSearch: true, ignoreVary: true });
+
+// What opens without a connection and without a stored page. Unlike the error page of a browser it tries again.
+const waitingPage = () => new Response(
+  `<!doctype html><meta charset="utf-8"><meta http-equiv="refresh" content="3"><title>↻</title><p style="font:2rem sans-serif">↻ ${self.location.host}`,
+  { status: 503, headers: { "Content-Type": "text/html; charset=utf-8" } });
 
 // The answer with its whole body. Silence of `timeoutMs` before the answer, or of STALL_MS within it, is a failure.
 async function fetchWhole(request, timeoutMs) {
@@ -55,7 +60,7 @@ async function answerOpened(request, client) {
     return response;
   } catch {
     isStored.set(client, true);
-    return await stored(request) ?? Response.error();
+    return await stored(request) ?? waitingPage();
   }
 }
 
@@ -74,6 +79,18 @@ async function answerFile(request, client) {
   return await stored(request) ?? Response.error();
 }
 
+// Store the files of a page that was opened before there was a worker; one at a time, since the link may be thin.
+async function keep(addresses) {
+  for (const address of addresses.filter((one) => isOfPage(new URL(one)))) {
+    try {
+      if (!await stored(address)) await fromNetwork(new Request(address), STALL_MS);
+    } catch {
+      // The next page that is opened stores it.
+    }
+  }
+}
+
+self.addEventListener("message", (event) => event.waitUntil(keep(event.data?.keep || [])));
 self.addEventListener("install", () => self.skipWaiting());
 self.addEventListener("activate", (event) => event.waitUntil(self.clients.claim()));
 self.addEventListener("fetch", (event) => {
