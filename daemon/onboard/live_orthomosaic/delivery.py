@@ -15,12 +15,12 @@ from daemon.onboard.live_orthomosaic.map_layout import TileId, tile_file
 from daemon.onboard.live_orthomosaic.pmtiles_file import write_pmtiles
 from daemon.onboard.live_orthomosaic.web_tiles import pixel_m
 from daemon.onboard.monitoring.maps.tiles import EARTH_HALF_M, TILE_PX, Bounds, tile_bounds
-from drivers.base.extras import require
+from daemon.products.cog_file import CogLayout, new_cog
 
 COG_FILE: Final = "orthomosaic.tif"
 PMTILES_FILE: Final = "orthomosaic.pmtiles"
 BLOCK_PX: Final = 256
-_SETTINGS: Final = {"GDAL_CACHEMAX": 64, "GDAL_PAM_ENABLED": "NO"}
+CACHE_MB: Final = 64
 
 
 def write_cog(live: LiveOrthomosaic, path: Path, tags: Mapping[str, str]) -> int:
@@ -38,47 +38,28 @@ def write_cog(live: LiveOrthomosaic, path: Path, tags: Mapping[str, str]) -> int
         MissingExtraError: rasterio is not installed.
         OSError: the disk refused.
     """
-    require("geotiff")
-    import rasterio
-    from rasterio.shutil import copy
-    from rasterio.transform import Affine
-    from rasterio.windows import Window
-
     tiles = live.tiles
     left, top = min(t[1] for t in tiles), min(t[2] for t in tiles)
-    width = (max(t[1] for t in tiles) - left + 1) * TILE_PX
-    height = (max(t[2] for t in tiles) - top + 1) * TILE_PX
     size = pixel_m(live.zoom)
-    corner = (left * TILE_PX * size - EARTH_HALF_M, EARTH_HALF_M - top * TILE_PX * size)
-    with durable.new_file(path) as part:
-        plain = part.with_suffix(".plain.tif")
-        try:
-            with (
-                rasterio.Env(**_SETTINGS),
-                rasterio.open(
-                    plain, "w", driver="GTiff", width=width, height=height, count=1,
-                    dtype="uint16", nodata=0, crs="EPSG:3857", tiled=True,
-                    blockxsize=BLOCK_PX, blockysize=BLOCK_PX, SPARSE_OK=True,
-                    transform=Affine(size, 0.0, corner[0], 0.0, -size, corner[1]),
-                    photometric="MINISBLACK", BIGTIFF="IF_SAFER",
-                ) as raster,
-            ):  # fmt: skip
-                raster.set_band_description(1, "pan")
-                raster.update_tags(**tags)
-                for tile in tiles:
-                    signal = live.files.signal(tile)
-                    if signal is None:
-                        continue
-                    column, row = (tile[1] - left) * TILE_PX, (tile[2] - top) * TILE_PX
-                    raster.write(signal, 1, window=Window(column, row, TILE_PX, TILE_PX))
-            with rasterio.Env(**_SETTINGS):
-                copy(
-                    str(plain), str(part), driver="COG", COMPRESS="DEFLATE", PREDICTOR="2",
-                    LEVEL="1", BLOCKSIZE=str(BLOCK_PX), OVERVIEW_RESAMPLING="AVERAGE",
-                    BIGTIFF="IF_SAFER", SPARSE_OK="TRUE",
-                )  # fmt: skip
-        finally:
-            plain.unlink(missing_ok=True)
+    layout = CogLayout(
+        width_px=(max(t[1] for t in tiles) - left + 1) * TILE_PX,
+        height_px=(max(t[2] for t in tiles) - top + 1) * TILE_PX,
+        crs="EPSG:3857",
+        west_m=left * TILE_PX * size - EARTH_HALF_M,
+        north_m=EARTH_HALF_M - top * TILE_PX * size,
+        pixel_m=size,
+        bands=("pan",),
+        block_px=BLOCK_PX,
+        is_sparse=True,
+        cache_mb=CACHE_MB,
+    )
+    # In the folder of what is computed again after a restart: a killed process leaves nothing.
+    plain = live.files.work / "plain.tif"
+    with durable.new_file(path) as part, new_cog(part, plain, layout, tags) as write:
+        for tile in tiles:
+            signal = live.files.signal(tile)
+            if signal is not None:
+                write(signal[None], (tile[1] - left) * TILE_PX, (tile[2] - top) * TILE_PX)
     return path.stat().st_size
 
 

@@ -129,13 +129,27 @@ class LiveOrthomosaic:
         Returns:
             Tiles that were published, coarse ones first; at most `BYTES_PER_EXPOSURE` together.
         """
-        number = orientation.image.number
-        if number in self._at:
+        if orientation.image.number in self._at:
             return []
+        self.place(orientation, pixels, others)
+        return self._publish(CHANGED, BYTES_PER_EXPOSURE)
+
+    def place(
+        self,
+        orientation: LiveOrientation,
+        pixels: NDArray[np.uint16],
+        others: Iterable[LiveOrientation] = (),
+    ) -> None:
+        """As `add`, without publishing a tile."""
+        if orientation.image.number in self._at:
+            return
         dirty = self._place(orientation, pixels)
         moved = self._follow(others, MOVED_PX)
         self._render(dirty | moved, moved=moved)
-        return self._publish(CHANGED, BYTES_PER_EXPOSURE)
+
+    def knows(self, number: int) -> bool:
+        """Whether an exposure is in the map, or has a reason why it is not."""
+        return number in self._at or number in self.not_placed
 
     def level(self, orientations: Sequence[LiveOrientation], ground: MapGround) -> None:
         """After an adjustment of the block: level the images, follow their orientations, and

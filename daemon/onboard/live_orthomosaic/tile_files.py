@@ -51,6 +51,9 @@ class TileFiles:
     Args:
         folder: of the live orthomosaic; what an earlier process left is removed.
         version: of the last picture published by an earlier process.
+
+    Attributes:
+        work: folder of signals and reduced images.
     """
 
     def __init__(self, folder: Path, version: int = 0) -> None:
@@ -59,9 +62,10 @@ class TileFiles:
         self.states: dict[TileId, TileState] = {}
         self._signals: OrderedDict[TileId, Words] = OrderedDict()
         self._images: OrderedDict[int, Words] = OrderedDict()
-        for name in (TILES_FOLDER, WORK_FOLDER):
-            shutil.rmtree(folder / name, ignore_errors=True)
-        durable.make_directories(folder / WORK_FOLDER)
+        self.work = folder / WORK_FOLDER
+        for path in (folder / TILES_FOLDER, self.work):
+            shutil.rmtree(path, ignore_errors=True)
+        durable.make_directories(self.work)
 
     def signal(self, tile: TileId) -> Words | None:
         """Pixels of a tile, None where there is none."""
@@ -128,9 +132,22 @@ class TileFiles:
         self.states[tile] = TileState(self.version)
         return self.version
 
+    def move_to(self, folder: Path) -> None:
+        """Copy everything to another disk, and go on there.
+
+        Raises:
+            OSError: a disk refused; nothing changed.
+        """
+        for name in (TILES_FOLDER, WORK_FOLDER):
+            shutil.rmtree(folder / name, ignore_errors=True)
+            durable.make_directories(folder / name)
+            if (self.folder / name).exists():
+                shutil.copytree(self.folder / name, folder / name, dirs_exist_ok=True)
+        self.folder, self.work = folder, folder / WORK_FOLDER
+
     def drop_work(self) -> None:
         """Remove signals and reduced images."""
-        shutil.rmtree(self.folder / WORK_FOLDER, ignore_errors=True)
+        shutil.rmtree(self.work, ignore_errors=True)
         self._signals.clear()
         self._images.clear()
 
@@ -143,10 +160,10 @@ class TileFiles:
 
     def _signal_file(self, tile: TileId) -> Path:
         zoom, x, y = tile
-        return self.folder / WORK_FOLDER / f"{zoom}-{x}-{y}.npy"
+        return self.work / f"{zoom}-{x}-{y}.npy"
 
     def _image_file(self, number: int) -> Path:
-        return self.folder / WORK_FOLDER / f"image-{number:06d}.npy"
+        return self.work / f"image-{number:06d}.npy"
 
 
 def encoded(grey: NDArray[np.uint8], alpha: NDArray[np.uint8]) -> bytes:

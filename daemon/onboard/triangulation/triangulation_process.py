@@ -149,6 +149,8 @@ class _Work:
             task = self._tasks.get()
             if isinstance(task, UseMission) and self._done is not None:
                 self._done.mission = Mission(task.mission, task.mission.name)
+                if self._map is not None:
+                    self._map.use_mission()
             elif isinstance(task, TriangulateExposure) and self._done is not None:
                 self._triangulate(self._done, task.number)
             elif isinstance(task, FinishTriangulation):

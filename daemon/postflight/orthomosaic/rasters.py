@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from daemon.mission.store.durable import sync_file
 from daemon.orientation.georeference import Georeference
 from daemon.postflight.orthomosaic.tiles import TilePlan, tile_file
-from drivers.base.extras import require
+from daemon.products.cog_file import CogLayout, new_cog
 from processing.radiometry.tone_curve import (
     VALUE_COUNT,
     ToneCurve,
@@ -32,7 +32,6 @@ IMAGES: Final[Mapping[str, tuple[str, ...]]] = {
     "cir": ("nir", "red", "green"),
 }
 BLOCK_PX: Final = 512
-_SETTINGS: Final = {"GDAL_CACHEMAX": 128, "GDAL_PAM_ENABLED": "NO"}
 
 
 def tone_curves(
@@ -80,13 +79,6 @@ def write_cog(
         MissingExtraError: rasterio is not installed.
         OSError: the disk refused.
     """
-    require("geotiff")
-    import rasterio
-    from rasterio.enums import ColorInterp
-    from rasterio.shutil import copy
-    from rasterio.transform import Affine
-    from rasterio.windows import Window
-
     names = IMAGES[image]
     index = [list(bands).index(name) for name in names]
     tables = None if curves is None else [lookup_table(curves[name], name) for name in names]
@@ -94,35 +86,23 @@ def write_cog(
     half = grid.gsd_m / 2.0
     horizontal = georeference.crs
     horizontal = horizontal.sub_crs_list[0] if horizontal.is_compound else horizontal
-    plain = work / f"{final.stem}.plain.tif"
-    with (
-        rasterio.Env(**_SETTINGS),
-        rasterio.open(
-            plain, "w", driver="GTiff", width=grid.width_px, height=grid.height_px,
-            count=len(names), dtype="uint16" if tables is None else "uint8", nodata=0,
-            crs=horizontal.to_wkt(), tiled=True, blockxsize=BLOCK_PX, blockysize=BLOCK_PX,
-            transform=Affine(
-                grid.gsd_m, 0.0, grid.east_m - half, 0.0, -grid.gsd_m, grid.north_m + half
-            ),
-            photometric="RGB" if len(names) == 3 else "MINISBLACK", BIGTIFF="IF_SAFER",
-        ) as raster,
-    ):  # fmt: skip
-        if image == "rgb":
-            raster.colorinterp = [ColorInterp.red, ColorInterp.green, ColorInterp.blue]
-        for number, name in enumerate(names, 1):
-            raster.set_band_description(number, name)
-        raster.update_tags(**tags)
-        for column, row, width, height in plan.tiles:
+    layout = CogLayout(
+        width_px=grid.width_px,
+        height_px=grid.height_px,
+        crs=horizontal.to_wkt(),
+        west_m=grid.east_m - half,
+        north_m=grid.north_m + half,
+        pixel_m=grid.gsd_m,
+        bands=names,
+        dtype="uint16" if tables is None else "uint8",
+        block_px=BLOCK_PX,
+    )
+    with new_cog(final, work / f"{final.stem}.plain.tif", layout, tags) as write:
+        for column, row, _, _ in plan.tiles:
             tile = np.load(tile_file(tiles, column, row), mmap_mode="r")
             planes = [np.asarray(tile[k]) for k in index]
             if tables is not None:
                 planes = [table[plane] for table, plane in zip(tables, planes, strict=True)]
-            raster.write(np.stack(planes), window=Window(column, row, width, height))
-    with rasterio.Env(**_SETTINGS):
-        copy(
-            str(plain), str(final), driver="COG", COMPRESS="DEFLATE", PREDICTOR="2", LEVEL="1",
-            BLOCKSIZE=str(BLOCK_PX), OVERVIEW_RESAMPLING="AVERAGE", BIGTIFF="IF_SAFER",
-        )  # fmt: skip
-    plain.unlink()
+            write(np.stack(planes), column, row)
     sync_file(final)
     return final.stat().st_size

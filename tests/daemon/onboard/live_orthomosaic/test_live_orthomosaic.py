@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import resource
 import shutil
 from pathlib import Path
 
@@ -57,8 +58,10 @@ def truth(flown) -> MapTruth:
     return MapTruth(flown.world, scene, flown.flight)
 
 
-def _flown_map(mission: Path, ground: MapTruth | None = None) -> tuple[MissionMap, list[dict]]:
-    """Fly the whole block; the events of each exposure."""
+def _flown_map(
+    mission: Path, ground: MapTruth | None = None, count: int = EACH * LINES
+) -> tuple[MissionMap, list[dict]]:
+    """Fly the block, or its first exposures; the events of each."""
     folder = Mission.open(mission)
     done = MissionTriangulation(folder)
     events: list[dict] = []
@@ -66,7 +69,7 @@ def _flown_map(mission: Path, ground: MapTruth | None = None) -> tuple[MissionMa
     if ground is not None:
         growing._ground = lambda: ground
     read = sealed_exposures(folder).results
-    for number in sorted(read):
+    for number in sorted(read)[:count]:
         blocks = done.block_count
         done.add(read[number])
         if done.block_count != blocks:
@@ -214,22 +217,108 @@ def test_versions_grow_over_a_restart(copied) -> None:
     assert tile_file(again.folder, tile).exists()
 
 
-def test_a_failed_disk_ends_the_map_and_leaves_the_triangulation(copied, monkeypatch) -> None:
+def test_a_failed_disk_stops_the_map_until_the_end_of_the_line_and_it_catches_up(
+    copied, monkeypatch
+) -> None:
     sentences: list[str] = []
+    events: list[dict] = []
     folder = Mission.open(copied)
     done = MissionTriangulation(folder)
-    growing = MissionMap(done, lambda _event: None, on_failure=sentences.append)
+    growing = MissionMap(done, events.append, GSD_M, sentences.append)
+    read = sealed_exposures(folder).results
 
     def refuse(*_args: object) -> None:
         raise OSError("disk full")
 
-    monkeypatch.setattr(mission_map.LiveOrthomosaic, "add", refuse)
-    read = sealed_exposures(folder).results
-    for number in (1, 2, 3):
-        assert done.add(read[number]).orientation is not None
+    for number in range(1, EACH * LINES + 1):
+        blocks = done.block_count
+        with monkeypatch.context() as patch:
+            if number in (2, 3):
+                patch.setattr(mission_map.LiveOrthomosaic, "add", refuse)
+            assert done.add(read[number]).orientation is not None
+        if done.block_count != blocks:
+            growing.block_adjusted()
     (sentence,) = sentences
     assert "disk full" in sentence and "syntopic orthomosaic" in sentence
-    assert not growing.deliver()
+    numbers = [event["number"] for event in events if "number" in event]
+    assert numbers == [1, *range(EACH + 2, EACH * LINES + 1)]
+    own = [event for event in events if event.get("number", 0) > EACH]
+    assert [event["images"] for event in own] == [3, 6, 9, 10]
+    assert max(sum(tile[4] for tile in event["tiles"]) for event in own) <= BYTES_PER_EXPOSURE
+    versions = [tile[3] for event in events for tile in event["tiles"]]
+    assert versions == sorted(set(versions))
+    done.land()
+    assert growing.deliver()
+    state = json.loads((growing.folder / "orthomosaic.json").read_text())
+    assert state["is_complete"] and state["images"] == EACH * LINES and not state["not_placed"]
+
+
+def test_images_that_come_too_late_at_landing_are_named(copied, monkeypatch) -> None:
+    folder = Mission.open(copied)
+    done = MissionTriangulation(folder)
+    growing = MissionMap(done, lambda _event: None, GSD_M)
+    read = sealed_exposures(folder).results
+    growing.has_failed = True
+    for number in (1, 2, 3):
+        done.add(read[number])
+    (copied / "L2/000001/pan.tif").write_bytes(b"no image")
+    monkeypatch.setattr(mission_map, "LANDING_S", -1.0)
+    done.land()
+    assert growing.deliver()
+    assert growing.live.not_placed == dict.fromkeys((1, 2, 3), mission_map.BEHIND)
+    monkeypatch.setattr(mission_map, "LANDING_S", 60.0)
+    growing.live.not_placed.clear()
+    assert growing.deliver() and len(growing.live.images) == 2
+    assert "cannot be read again" in growing.live.not_placed[1]
+
+
+def test_a_disk_that_is_full_when_the_cog_is_written_is_stated(copied) -> None:
+    """GDAL reports it with an error of its own, which is no OSError."""
+    growing, _ = _flown_map(copied, count=3)
+    sentences: list[str] = []
+    growing._on_failure = sentences.append
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (150_000, before[1]))
+    try:
+        assert not growing.deliver()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    (sentence,) = sentences
+    assert "the GeoTIFF cannot be written" in sentence
+    assert not list(growing.folder.rglob("*.plain.tif")) + list(growing.folder.glob(".*"))
+    assert not (growing.folder / "orthomosaic.tif").exists()
+
+
+def test_the_map_goes_on_where_the_mission_is(copied, tmp_path) -> None:
+    """Another disk leads; its copy of the mission has no products."""
+    growing, events = _flown_map(copied, count=3)
+    elsewhere = tmp_path / "other"
+    shutil.copytree(copied, elsewhere, ignore=shutil.ignore_patterns("export", "L2"))
+    growing._done.mission = Mission(elsewhere, growing._done.mission.id)
+    growing.use_mission()
+    assert growing.deliver()
+    state = json.loads((elsewhere / "export/live-orthomosaic/orthomosaic.json").read_text())
+    assert state["is_complete"] and state["images"] == 3
+    assert {f"{z}/{x}/{y}.webp" for e in events for z, x, y, *_ in e["tiles"]} == {
+        str(path.relative_to(elsewhere / "export/live-orthomosaic/tiles"))
+        for path in (elsewhere / "export").rglob("*.webp")
+    }
+
+
+def test_the_map_begins_again_where_the_earlier_disk_cannot_be_read(copied, tmp_path) -> None:
+    growing, _ = _flown_map(copied, count=3)
+    sentences: list[str] = []
+    growing._on_failure = sentences.append
+    shutil.rmtree(growing.folder / "work")
+    growing.live.files._signals.clear()
+    (growing.folder / "work").write_bytes(b"")
+    elsewhere = tmp_path / "other"
+    shutil.copytree(copied, elsewhere, ignore=shutil.ignore_patterns("export", "L2"))
+    growing._done.mission = Mission(elsewhere, growing._done.mission.id)
+    growing.use_mission()
+    assert len(sentences) == 1 and growing.live is None
+    assert growing.deliver()
+    assert set(growing.live.not_placed) >= {1, 2, 3}
 
 
 def test_exposures_that_are_not_in_the_map_are_named_with_the_reason(copied) -> None:
