@@ -238,7 +238,8 @@ WORKER = """
     }}));
   };
   const handlers = {};
-  const self = {location: {host: 'camera'}, addEventListener: (kind, handler) => { handlers[kind] = handler; }};
+  const self = {location: {host: 'camera'},
+    addEventListener: (kind, handler) => { handlers[kind] = handler; }};
   const location = {origin: 'http://camera', host: 'camera'};
   new Function('self', 'caches', 'fetch', 'location', SOURCE)(self, caches, fetch, location);
   const get = async (path, mode, client) => {
