@@ -23,7 +23,7 @@ FAILED_STARTS = 4
 
 
 class FakeNode:
-    """A video node whose stream starts, and gives a frame, as a test says."""
+    """A video node whose stream starts, and gives a frame, as a test decides."""
 
     def __init__(self, start: Callable[[], None], has_frame: Callable[[], bool]) -> None:
         self.stream_on = start
@@ -105,7 +105,7 @@ def test_a_silent_v4l2_head_is_reported_once_until_a_frame_comes() -> None:
 
 
 class FakeAravisHead(AravisHead):
-    """A head whose control or start is refused as a test says."""
+    """A head whose control or start is refused as a test decides."""
 
     refusals: list[Exception]
     denials: list[Exception]

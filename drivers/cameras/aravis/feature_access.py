@@ -145,8 +145,19 @@ class Features:
         """
         # Quirk: the standard has microseconds; some heads state seconds or milliseconds.
         # Upstream: manual: GenICam description of Hamamatsu C16240-20UP, ExposureTime.
+        return UNITS_US.get(self.unit(name), 1.0)
+
+    def unit(self, name: str) -> str:
+        """The unit that the head's description states.
+
+        Args:
+            name: GenICam name.
+
+        Returns:
+            Such as `us` or `dB`; empty if it states none.
+        """
         node = None if name in self.endless else self._device.get_feature(name)
-        return UNITS_US.get(str(getattr(node, "get_unit", str)() or "").strip(), 1.0)
+        return str(getattr(node, "get_unit", str)() or "").strip()
 
     def _chain(self, name: str) -> list[Any]:
         """A feature and the nodes that hold its value; empty if there is no such feature."""

@@ -9,6 +9,7 @@ Source: GenICam SFNC 2.7; names before SFNC 2 from the descriptions of the heads
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Mapping
 from typing import Final
 
@@ -28,6 +29,12 @@ EXPOSURE_TOLERANCE: Final = 0.05
 PULSE_WIDTH_MODES: Final = ("Off", "TriggerWidth", "TriggerControlled")
 """Modes of exposure in which no exposure time is used."""
 GAINS_DB: Final = ("Gain", "GainAbs")
+"""Gain, in dB unless the head states another unit."""
+FACTORS: Final = ("x", "times", "factor")
+"""Units of a gain that is a factor."""
+MAKERS_OF_FACTORS: Final = ("JAI",)
+# Quirk: JAI heads state no unit; their gain is a factor, 1 for 0 dB.
+# Upstream: manual: JAI GO-2401M-PGE user manual, "Gain control" (setting value 16.0 is 24 dB).
 OWN_FEATURES: Final[Mapping[str, str]] = {
     **dict.fromkeys(EXPOSURE_TIMES, "exposure_time_us"),
     **dict.fromkeys(GAINS_DB, "gain_db"),
@@ -70,7 +77,7 @@ class HeadConfiguration:
         preset = {
             name: value
             for name, value in preset_features(self._settings.preset).items()
-            if self._features.is_available(name)
+            if self._offers(name, value)
         }
         chosen = {**preset, **self._settings.features}
         for name in chosen:
@@ -142,6 +149,13 @@ class HeadConfiguration:
         return value * self._exposure_unit_us()
 
     # Steps
+
+    def _offers(self, name: str, value: FeatureValue) -> bool:
+        """Whether the head has a feature and, where it is an enumeration, the entry."""
+        features = self._features
+        if features.kind(name) == "enumeration":
+            return value in features.entries(name)
+        return features.is_available(name)
 
     def _stop(self) -> None:
         # A head that still acquires for a killed controller would refuse the other settings.
@@ -269,8 +283,12 @@ class HeadConfiguration:
             hint, held = "choose a gain within the head's bounds", features.number(name)
             if not features.is_writable(name):
                 hint = "its gain cannot be set"
-                hint += "" if held is None else f"; set gain_db = {held:g}"
-            self._writer.set("gain_db", name, self._gain_value(gain_db), hint)
+                if held is not None:
+                    held_db = 20.0 * math.log10(held) if self._has_gain_factor() else held
+                    hint += f"; set gain_db = {held_db:g}"
+            is_factor = self._has_gain_factor()
+            key = f"gain_db = {gain_db:g}, as the factor {name}" if is_factor else "gain_db"
+            self._writer.set(key, name, self._gain_value(gain_db), hint)
             return
         if features.is_available("GainRaw"):
             self.gain_feature = "GainRaw"
@@ -295,8 +313,15 @@ class HeadConfiguration:
     def _gain_value(self, gain_db: float) -> FeatureValue:
         """The gain in dB, raised to the head's lowest if 0 dB is below it."""
         low, high = self._features.bounds(self.gain_feature)
-        value = low if gain_db == 0 and 0 < low <= high else gain_db
+        wanted = 10.0 ** (gain_db / 20.0) if self._has_gain_factor() else gain_db
+        value = low if gain_db == 0 and 0 < low <= high else wanted
         return round(value) if self._features.kind(self.gain_feature) == "integer" else value
+
+    def _has_gain_factor(self) -> bool:
+        """Whether the gain is a factor, not in dB."""
+        unit = self._features.unit(self.gain_feature)
+        maker = self._features.text("DeviceVendorName")
+        return unit.lower() in FACTORS or (not unit and maker.startswith(MAKERS_OF_FACTORS))
 
     def _lowest_gain(self, name: str) -> FeatureValue:
         low, _ = self._features.bounds(name)

@@ -5,7 +5,9 @@ them. Processing inside the head (gamma, sharpening, look-up tables, defect corr
 radiometry; mirroring, binning, decimation, offsets and test patterns change geometry.
 
 Source: GenICam SFNC 2.7 for the standard names; the descriptions of Allied Vision, Basler,
-FLIR and Point Grey heads for the others.
+FLIR and Point Grey heads for the others. Names of JAI: roboception/rc_genicam_camera#4, and the
+GO-X series manual. Names of Hikrobot: its MVS client, "GigE Area Scan Camera User Manual", section
+12.2. `flatfieldCorrectionMode`: Teledyne DALSA Linea manual, "Flat Field Category".
 """
 
 from __future__ import annotations
@@ -20,6 +22,9 @@ NEUTRAL: Final[tuple[tuple[str, FeatureValue], ...]] = (
     ("SequencerMode", "Off"),
     ("SequenceEnable", False),
     ("pgrHDRModeEnabled", False),
+    ("HDREnable", False),
+    ("MultiRoiMode", "Off"),
+    ("ExposureModeOption", "Off"),
     ("ExposureAuto", "Off"),
     ("GainAuto", "Off"),
     ("BlackLevelAuto", "Off"),
@@ -44,22 +49,36 @@ NEUTRAL: Final[tuple[tuple[str, FeatureValue], ...]] = (
     ("SaturationEnabled", False),
     ("NoiseReductionEnable", False),
     ("DenoisingEnable", False),
+    ("DigitalNoiseReductionMode", "Off"),
     ("LUTEnable", False),
+    ("LUTMode", "Off"),
+    ("GradationCompressionMode", "Off"),
+    ("EnhancerEnable", False),
+    ("EdgeEnhancerEnable", False),
+    ("ColorEnhancerEnable", False),
+    ("DigitalShiftEnable", False),
     ("DigitalShift", 0),
     ("ColorTransformationEnable", False),
     ("ColorTransformationMode", "Off"),
+    ("ColorTransformationRGBMode", "Off"),
     ("RgbTransformLightSource", "Off"),
     ("OnBoardColorProcessEnabled", False),
     ("ProcessedRawEnable", False),
     ("FlatFieldCorrection", "Off"),
+    ("flatfieldCorrectionMode", "Off"),
     ("FfcEnable", False),
+    ("NUCEnable", False),
+    ("FPNCEnable", False),
+    ("PRNUCEnable", False),
     ("ShadingEnable", False),
+    ("ShadingMode", "Off"),
     ("LensShadingCorrectionMode", "Off"),
     ("VignettingCorrectionMode", "Off"),
     ("CorrectionMode", "Off"),
     ("DefectCorrectionEnable", False),
     ("DefectCorrectStaticEnable", False),
     ("DefectMaskEnable", False),
+    ("BlemishEnable", False),
     ("PixelDefectControl", "Off"),
     ("BSLPixelDefectCorrectionMode", "Off"),
     ("BslStaticDefectPixelCorrectionMode", "Off"),
@@ -67,6 +86,8 @@ NEUTRAL: Final[tuple[tuple[str, FeatureValue], ...]] = (
     ("TestPattern", "Off"),
     ("TestImageSelector", "Off"),
     ("TestPatternGeneratorSelector", "Off"),
+    ("OverlayMode", "Off"),
+    ("FrameSpecInfo", False),
     ("ImageCompressionMode", "Off"),
     ("AdaptiveCompressionEnable", False),
     ("pgrPixelBigEndian", False),
@@ -74,6 +95,7 @@ NEUTRAL: Final[tuple[tuple[str, FeatureValue], ...]] = (
     ("DeviceStreamChannelEndianness", "Little"),
     ("ReverseX", False),
     ("ReverseY", False),
+    ("ImageScalingMode", "Off"),
     ("BinningHorizontal", 1),
     ("BinningVertical", 1),
     ("DecimationHorizontal", 1),
@@ -89,11 +111,20 @@ PASSES: Final = 2
 WITHOUT_EFFECT_WHILE_LOCKED: Final = frozenset(
     {"OnBoardColorProcessEnabled", "HueEnabled", "SaturationEnabled", "SharpnessEnabled"}
     | {"SaturationEnable", "ColorTransformationEnable", "RgbTransformLightSource"}
+    | {"ColorTransformationRGBMode", "ColorEnhancerEnable"}
 )
 """Processing of colour images."""
-BINNING: Final = ("BinningHorizontal", "BinningVertical")
-BINNING_SELECTOR: Final = "BinningSelector"
-GATED: Final[Mapping[str, tuple[str, ...]]] = {"Gamma": ("GammaEnable", "GammaEnabled")}
+SELECTED: Final[Mapping[str, str]] = {
+    "BinningHorizontal": "BinningSelector",
+    "BinningVertical": "BinningSelector",
+    "FrameSpecInfo": "FrameSpecInfoSelector",
+    "EnhancerEnable": "EnhancerSelector",
+}
+"""Selectors whose entries each have a value of the feature."""
+GATED: Final[Mapping[str, tuple[str, ...]]] = {
+    "Gamma": ("GammaEnable", "GammaEnabled", "LUTMode"),
+    "DigitalShift": ("DigitalShiftEnable",),
+}
 """Features that have no effect while one of these switches exists and is off."""
 
 
@@ -130,12 +161,13 @@ def switch_off(
 
 def _switch_off_one(features: Features, name: str, held: dict[str, FeatureValue]) -> None:
     """Write the neutral value of a feature, of each entry of its selector where it has one."""
-    places = features.entries(BINNING_SELECTOR) if name in BINNING else []
-    before = features.text(BINNING_SELECTOR) if places else ""
+    selector = SELECTED.get(name, "")
+    places = features.entries(selector) if selector else []
+    before = features.text(selector) if places else ""
     # The entry that is selected comes last, so that it stays selected.
     for place in sorted(places, key=lambda entry: entry == before) or [""]:
-        if place and features.is_writable(BINNING_SELECTOR):
-            features.set(BINNING_SELECTOR, place)
+        if place and features.is_writable(selector):
+            features.set(selector, place)
         wanted = _wanted(features, name)
         if wanted is not None:
             held[name] = features.set(name, wanted)
@@ -145,7 +177,7 @@ def _wanted(features: Features, name: str) -> FeatureValue | None:
     """The neutral value of a feature; None if it is absent or has no effect."""
     if not features.is_available(name):
         return None
-    if any(features.text(switch) == "False" for switch in GATED.get(name, ())):
+    if any(features.text(switch) in ("False", "Off") for switch in GATED.get(name, ())):
         return None
     return _neutral(features, name, dict(NEUTRAL)[name])
 

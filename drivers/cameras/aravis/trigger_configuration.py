@@ -19,13 +19,14 @@ BURST_LENGTH: Final = "AcquisitionBurstFrameCount"
 ACQUISITION_TRIGGER: Final = "AcquisitionStart"
 TRIGGER_DELAYS: Final = ("TriggerDelay", "TriggerDelayAbs")
 STROBES: Final = (
-    ("LineSelector", "LineSource", "ExposureActive"),
-    ("SyncOutSelector", "SyncOutSource", "Exposing"),
+    ("LineSelector", "LineSource", ("ExposureActive", "ExposureStartActive")),
+    ("SyncOutSelector", "SyncOutSource", ("Exposing",)),
 )
-"""Selector of an output, its source, and the entry that is active during the exposure."""
+"""Selector of an output, its source, and the entries that are active during the exposure."""
+OUTPUT_MODES: Final = ("Output", "Strobe")
 DEBOUNCERS: Final = (
     *("LineDebouncerTime", "LineDebouncerTimeAbs", "LineDebounceTime"),
-    *("DebounceTime", "InputDebounceTime"),
+    *("DebounceTime", "InputDebounceTime", "mvLineDebounceTimeRisingEdge"),
 )
 
 
@@ -190,7 +191,7 @@ def write_strobe(writer: FeatureWriter, settings: AravisSettings) -> None:
     features = writer.features
     # Quirk: Allied Vision heads before Alvium have outputs of their own names.
     # Upstream: manual: GenICam description of Mako G-125B, SyncOutSelector.
-    selector, source, value = next(
+    selector, source, values = next(
         (names for names in STROBES if features.entries(names[0])), STROBES[0]
     )
     if not features.entries(selector):
@@ -198,6 +199,12 @@ def write_strobe(writer: FeatureWriter, settings: AravisSettings) -> None:
         return
     hint = "the head has " + ", ".join(features.entries(selector))
     writer.set("strobe_line", selector, line, hint)
-    if selector == "LineSelector" and "Output" in features.entries("LineMode"):
-        writer.set("strobe_line", "LineMode", "Output", "choose a line that is an output")
+    mode = features.first_entry("LineMode", OUTPUT_MODES)
+    if selector == "LineSelector" and mode is not None:
+        writer.set("strobe_line", "LineMode", mode, "choose a line that is an output")
+    value = features.first_entry(source, values) or values[0]
     writer.set("strobe_line", source, value, "choose another line")
+    # Quirk: outputs of Hikrobot heads have a switch of their own.
+    # Upstream: manual: Hikrobot GigE Area Scan Camera User Manual, "Strobe output".
+    if features.is_available("StrobeEnable"):
+        writer.set("strobe_line", "StrobeEnable", True, "choose another line")
