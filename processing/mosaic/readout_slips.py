@@ -18,7 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.matching.tie_points import PAN_TO_COLOUR, PAN_TO_PAN, TiePoints
-from processing.mosaic.slip_bins import bin_residuals, order_along, points_of_frame, shifted_runs
+from processing.mosaic.slip_bins import (
+    MEDIAN_EFFICIENCY_FACTOR,
+    bin_residuals,
+    order_along,
+    points_of_frame,
+    shifted_runs,
+)
 from processing.quality.figures.stitching import SlipFigures
 from processing.rig import Rig
 
@@ -49,6 +55,7 @@ class SlipSettings:
 
     bin_points: int = 7
     limit: float = 15.0
+    own_limit: float = 10.0
     min_share: float = 0.6
     min_own_px: float = 0.5
     max_rounds: int = 4
@@ -395,6 +402,7 @@ def _best_band(
                 large
                 and explained > 0.0
                 and np.mean(near) > settings.min_share
+                and _own_score(residuals[band], np.array([dx, dy])) > settings.own_limit
                 and (best is None or explained > best[1])
             ):
                 start = 0 if first == 0 else int(at[band.start])
@@ -429,6 +437,18 @@ def _extend_band(
     while last < len(medians) and nearer[last] and last - first < most:
         last += 1
     return first, last
+
+
+def _own_score(residuals: Array, shift: Array) -> float:
+    """Shift (2,) of a band over the standard deviation that its own points (n, 2) show.
+
+    Under the edge of a cloud points scatter several times more than those of their kind.
+    """
+    main = int(np.argmax(np.abs(shift)))
+    along = residuals[:, main]
+    spread = _MAD_TO_SIGMA * float(np.median(np.abs(along - np.median(along))))
+    sigma = MEDIAN_EFFICIENCY_FACTOR * max(spread, MIN_SIGMA_PX) / math.sqrt(len(along))
+    return float(abs(shift[main])) / sigma
 
 
 def _level_outside(residuals: Array, band: slice) -> Array:

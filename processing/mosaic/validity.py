@@ -118,7 +118,7 @@ class Validity:
     explain it all.
     `probe_bias` is a probe whose error explains the misfit nearly as well as the named sensor, or,
     with no sensor named, clearly better. `insignificant_displacement` is a sensor that would be
-    named if more than P/C points and a few P/P showed it.
+    named if more than P/C points and a few P/P showed it, or its alternatives.
     """
 
     observability: Mapping[str, Observability]
@@ -242,7 +242,11 @@ def _cause(
     is_undisplaced = _Cause(hypotheses, remainder=remainder, degrees_of_freedom=degrees_of_freedom)
     if best.statistic <= limit:
         return is_undisplaced
-    if pan_points(rig, mosaic)[best.sensor] < MIN_PAN_POINTS:
+    near = 2.0 * math.log(settings.odds_limit)
+    likely = [h.sensor for h in hypotheses if best.statistic - h.statistic < near]
+    counts = pan_points(rig, mosaic)
+    if any(counts[sensor] < MIN_PAN_POINTS for sensor in likely):
+        # A place that hardly any points determine explains the misfit as well.
         return replace(is_undisplaced, insignificant_displacement=best)
     displacement = replace(is_undisplaced, displaced=best)
     names = [s.name for s in places.sensors]
@@ -260,7 +264,6 @@ def _cause(
         return displacement
     probe_bias = max((_misread(wide, probe) for probe in read), key=lambda m: m.statistic)
     lead = probe_bias.statistic - _hypotheses(wide)[0].statistic
-    near = 2.0 * math.log(settings.odds_limit)
     if lead < -near:
         return displacement
     with_free_cause = wide.with_free_cause(wide.probe_bias(probe_bias.probe))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -36,10 +37,12 @@ def signal_figures(
         return ()
     shares = {s.name: statistics[s.name].saturated_fraction for s in sensors}
     worst = max(shares, key=lambda name: shares[name])
+    bright = bright_level(sensors, [frames[s.name] for s in sensors])
     return (
         SignalFigures(
             mean_dn=float(np.mean([statistics[s.name].mean_dn for s in sensors])),
-            bright_fraction=bright_level(sensors, [frames[s.name] for s in sensors]),
+            bright_fraction=bright,
+            bright_snr=None if bright is None else min(_snr(s, bright) for s in sensors),
         ),
         SaturationFigures(
             saturated_fraction=float(np.mean(list(shares.values()))),
@@ -47,6 +50,12 @@ def signal_figures(
             saturated_worst_sensor=worst,
         ),
     )
+
+
+def _snr(sensor: Sensor, share: float) -> float:
+    """Signal of a share of full scale over its noise of photons and read-out."""
+    electrons = max(share, 0.0) * sensor.full_scale_dn * sensor.electrons_per_dn
+    return electrons / max(math.hypot(math.sqrt(electrons), sensor.read_noise_e), 1.0)
 
 
 def sharpness_figures(

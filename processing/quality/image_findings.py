@@ -260,6 +260,29 @@ def _blur(
     return findings
 
 
+def _dark(signal: SignalFigures, thresholds: Thresholds) -> list[Finding]:
+    """An image without much light: black, noisy, or of dark ground."""
+    bright, snr = signal.bright_fraction, signal.bright_snr
+    if bright is None or bright >= thresholds.bright_fraction:
+        return []
+    if bright < thresholds.bright_refly_fraction:
+        return [
+            Finding(
+                Flag.UNDEREXPOSED,
+                Verdict.REFLY,
+                "The image is black; check shutter, aperture and lens cover. Fly it again.",
+                bright,
+                thresholds.bright_refly_fraction,
+            )
+        ]
+    sentence, verdict = "The image is dark", Verdict.USABLE
+    if snr is not None:
+        sentence += f": its bright parts have {snr:.0f} times their noise"
+        verdict = Verdict.GOOD if snr >= thresholds.bright_snr else Verdict.USABLE
+    sentence += "; lengthen the exposure or open the aperture."
+    return [Finding(Flag.UNDEREXPOSED, verdict, sentence, bright, thresholds.bright_fraction)]
+
+
 def exposure_findings(figures: QualityFigures, thresholds: Thresholds) -> list[Finding]:
     """Exposure that is too dark, too bright or blurred.
 
@@ -270,21 +293,7 @@ def exposure_findings(figures: QualityFigures, thresholds: Thresholds) -> list[F
     Returns:
         Findings about brightness, exposure times, saturation, smear and sharpness.
     """
-    findings = []
-    bright = figures.of(SignalFigures).bright_fraction
-    if bright is not None and bright < thresholds.bright_fraction:
-        black = bright < thresholds.bright_refly_fraction
-        findings.append(
-            Finding(
-                Flag.UNDEREXPOSED,
-                Verdict.REFLY if black else Verdict.USABLE,
-                "The image is black; check shutter, aperture and lens cover. Fly it again."
-                if black
-                else "The image is dark; lengthen the exposure or open the aperture.",
-                bright,
-                thresholds.bright_refly_fraction if black else thresholds.bright_fraction,
-            )
-        )
+    findings = _dark(figures.of(SignalFigures), thresholds)
     unknown = ", ".join(figures.of(UnknownExposureFigures).exposure_unknown_sensors)
     if unknown:
         findings.append(

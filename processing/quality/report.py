@@ -109,6 +109,9 @@ class Thresholds:
     bright_fraction: float = 0.06
     """The 95th percentile of the signal as a share of full scale; below, the image is dark."""
     bright_refly_fraction: float = 0.01
+    bright_snr: float = 40.0
+    """Of a dark image: below it noise shows, above it only the ground is dark and the verdict stays
+    good. ISO 12232 takes 40 for an excellent image."""
     unread_fraction: float = 0.01
     saturated_fraction: float = 0.005
     saturated_refly_fraction: float = 0.05

@@ -15,7 +15,7 @@ from benchmarks.silent_errors.__main__ import failures
 from benchmarks.silent_errors.cases import Case, _result, draw, run
 from benchmarks.silent_errors.clean import clean_row, clean_rows
 from benchmarks.silent_errors.faults import FAULTS
-from benchmarks.silent_errors.limits import DMC, LIMITS, L, X, table
+from benchmarks.silent_errors.limits import DMC, LIMITS, MIDAS, L, X, table
 from benchmarks.silent_errors.truth import Found, _least_share, head_limit
 from processing.quality.figures import QualityFigures
 from processing.quality.report import NO_FLAGS, QualityReport, Verdict
@@ -63,6 +63,25 @@ def test_a_tenth_of_a_colour_pixel_under_a_cloud_is_no_slip() -> None:
         row = clean_row(number, seed=4)
         assert (row["rig"], row["scene"]) == (DMC, "cloud")
         assert not row["alarm"], row
+
+
+@pytest.mark.trust
+@pytest.mark.soak
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize(
+    ("number", "rig"),
+    [
+        pytest.param(186, L, id="rows of plants that colour heads show and PAN does not"),
+        pytest.param(358, X, id="a few tie points at the edge of a cloud"),
+        pytest.param(396, DMC, id="points of green that scatter under a cloud"),
+        pytest.param(970, MIDAS, id="dark fields without noise"),
+    ],
+)
+def test_a_healthy_exposure_that_once_raised_a_false_alarm_raises_none(
+    number: int, rig: str
+) -> None:
+    row = clean_row(number, seed=33)
+    assert row["rig"] == rig and not row["alarm"], row
 
 
 @pytest.mark.trust

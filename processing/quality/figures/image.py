@@ -68,6 +68,10 @@ class SignalFigures(FigureGroup):
         float | None,
         "95th percentile of PAN signal as a share of full scale",
     ] = None
+    bright_snr: Annotated[
+        float | None,
+        "its signal over its noise of photons and read-out, of the noisiest sensor",
+    ] = None
 
 
 @dataclass(frozen=True)

@@ -128,6 +128,19 @@ def test_a_shift_within_fifteen_standard_deviations_is_noise(sigma: float, expec
     assert len(found) == expected
 
 
+@pytest.mark.parametrize(("times", "expected"), [(1.0, 1), (3.0, 1), (4.0, 0)])
+def test_a_band_whose_points_scatter_more_than_it_is_shifted_is_no_slip(
+    times: float, expected: int
+) -> None:
+    tie_points, residuals = points(500)
+    own = np.where((tie_points.sensor_a == 0)[:, None], tie_points.raw_a, tie_points.raw_b)
+    residuals[own[:, 1] >= 440] *= times
+    residuals = shifted(tie_points, residuals, 1, 440, HEIGHT - 1, (0.35, 0.0))
+    assert len(find_slips(MINI, tie_points, residuals)) == expected
+    by_kind_alone = SlipSettings(own_limit=0.0)
+    assert len(find_slips(MINI, tie_points, residuals, settings=by_kind_alone)) == 1
+
+
 def test_fewer_points_than_six_bins_are_not_searched() -> None:
     settings = SlipSettings()
     for count, expected in ((41, 0), (42, 1)):

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from processing.geometry.placement import nominal_placements, vip_mm_from_raw
-from processing.matching.tie_points import TiePoints
+from processing.matching.tie_points import PAN_TO_PAN, TiePoints
 from processing.mosaic.free_mosaic import Mosaic, free_mosaic
 from processing.mosaic.validity import evaluate_master, robust_datum
 from processing.rig import Rig, find_rig
@@ -161,6 +161,27 @@ def test_a_small_displacement_that_two_sensors_explain_alike_is_reported_as_ambi
     assert len(ambiguous) == 2 and set(repaired.datum_sensors) == set(MASTER) - ambiguous
     _, _, clear, temperatures = exposure(14, {"SU00": (3.0, 0.0)})
     assert evaluate_master(MINI, clear, temperatures).alternatives == ()
+
+
+@pytest.mark.parametrize(("left", "named"), [(20, False), (60, True)])
+def test_where_a_few_points_of_another_sensor_explain_it_nobody_is_named(
+    left: int, named: bool
+) -> None:
+    truth, points, _, temperatures = exposure(17, {"SU00": (0.2, 0.0)}, sigma_pp_px=0.05)
+    ambiguous = evaluate_master(MINI, free_mosaic(MINI, truth.start, points), temperatures)
+    assert ambiguous.displaced is not None and ambiguous.displaced.sensor == "SU00"
+    other = ambiguous.alternatives[0]
+    number = points.names.index(other)
+    of_other = (points.sensor_a == number) | (points.sensor_b == number)
+    rows = np.flatnonzero(of_other & (points.kind == PAN_TO_PAN))
+    keep = np.ones(len(points), np.bool_)
+    keep[rows] = False
+    keep[rows[:: max(1, len(rows) // left)][:left]] = True
+    fewer = free_mosaic(MINI, truth.start, points.only(keep))
+    validity = evaluate_master(MINI, fewer, temperatures)
+    found = validity.displaced if named else validity.insignificant_displacement
+    assert found is not None and found.sensor in ("SU00", other)
+    assert (validity.displaced is not None) is named
 
 
 def test_two_displaced_sensors_are_not_passed_off_as_one() -> None:

@@ -82,6 +82,21 @@ def test_each_figure_beyond_its_threshold_raises_its_flag(
     assert len(finding.sentence) > 20 and finding.sentence.endswith(".")
 
 
+@pytest.mark.parametrize(
+    ("snr", "verdict"),
+    [(39.9, Verdict.USABLE), (40.0, Verdict.GOOD), (None, Verdict.USABLE)],
+)
+def test_a_dark_image_is_judged_by_its_noise(snr: float | None, verdict: Verdict) -> None:
+    report = evaluated(GOOD | {"bright_fraction": 0.05, "bright_snr": snr})
+    assert report.flags == Flag.UNDEREXPOSED and report.verdict is verdict
+    assert ("40 times their noise" in report.findings[0].sentence) is (snr is not None)
+
+
+def test_a_black_image_is_flown_again_whatever_its_noise() -> None:
+    report = evaluated(GOOD | {"bright_fraction": 0.009, "bright_snr": 50.0})
+    assert report.verdict is Verdict.REFLY
+
+
 def test_an_exposure_without_tie_points_is_flown_again() -> None:
     report = evaluated(GOOD | {"tie_points_pp": 3, "tie_points_min_overlap": 0})
     assert report.verdict is Verdict.REFLY
