@@ -39,8 +39,7 @@ Examples: `syntopic catalog build season missions/`, `syntopic catalog build sea
 QUERY_HELP = """List exposures by polygon, time and quality.
 
 Conditions hold together. With --commands the selection is printed as commands of `syntopic
-process`, one a mission in a folder; a mission in an object store is named on the standard error,
-and the status is 1.
+process`, one a mission, in folders and in object stores.
 
 Examples: `syntopic catalog query season --bbox 16 47 17 48 --since 2026-11-01 --verdict refly`,
 `syntopic catalog query season --polygon block.geojson --gsd-max 0.1 --commands`
@@ -105,7 +104,6 @@ def query(
     from daemon.postflight.mission_catalog.catalog_queries import (
         CatalogQuery,
         parse_time,
-        places_not_processed,
         process_arguments,
         select,
     )
@@ -127,16 +125,11 @@ def query(
         content = {
             "exposures": selected,
             "commands": process_arguments(selected),
-            "not_processed": places_not_processed(selected),
         }
         typer.echo(json.dumps(content))
     elif commands:
         for line in process_arguments(selected):
             typer.echo(shlex.join(line))
-        left_out = places_not_processed(selected)
-        for sentence in left_out:
-            typer.echo(sentence, err=True)
-        raise typer.Exit(status_of(is_good=not left_out))
     else:
         table = light_table("Exposures", ("mission", "utc", "verdict"), ("exposure", "GSD m"))
         for one in selected:

@@ -27,17 +27,21 @@ from daemon.cli.batch_options import (
 from daemon.cli.exit_status import exit_if_failed
 from daemon.cli.level2_tables import print_reports
 from daemon.cli.options import AsJson
+from daemon.cli.transfer import folder_of
 from daemon.configuration.model import ConfigurationError, PlanSection, ProcessingSection
 from daemon.configuration.problems import nested_value
 from daemon.mission.layout import Mission
 from daemon.orientation.exterior_orientation import mount_of
+from daemon.planning.overlaps import overlaps_of
 from daemon.terminal.console import Console
+from drivers.base.extras import require
 from processing.image.kernels import DEFAULT_INTERPOLATION, INTERPOLATIONS
 from processing.rig.problem_sentences import findings_of, sentences
 
 if TYPE_CHECKING:
     from daemon.postflight.batch.capacity import ProcessAllocation
     from daemon.postflight.batch.executor import BatchExecutor
+    from daemon.postflight.batch.level2_sources import AnyLevel2Work, Level2Source
     from daemon.postflight.batch.level2_work import Level2Survey, Level2Work
 
 HELP = """Process the exposures of a mission folder again, Level-0 to Level-2.
@@ -54,14 +58,18 @@ Every frame is compared with the hash in its record, and record, file and rig wi
 (docs/reference/formats.md). An exposure that cannot be processed is listed at the end with its
 cause; the others are done. No other command writes into the mission at the same time.
 
+A mission that `syntopic transfer` copied to an object store is processed there: frames are read
+into memory, and products are written below its folder `processed`.
+
 Examples: `syntopic process MISSION`, `syntopic process MISSION --only 3 --method fixed`,
 `syntopic process MISSION --dry-run`, `syntopic process MISSION --processes 8 --json`,
-`syntopic process MISSION --scheduler tcp://127.0.0.1:8786`
+`syntopic process MISSION --scheduler tcp://127.0.0.1:8786`,
+`syntopic process s3://survey/2026/20261121T101500Z-ultracam-x-mini`
 """
 
 
 def process(
-    mission: Annotated[Path, typer.Argument(help="Mission folder.")],
+    mission: Annotated[str, typer.Argument(help="Mission folder, or its address in a store.")],
     only: Annotated[
         list[int] | None, typer.Option(help="Number of an exposure; repeatable.")
     ] = None,
@@ -94,11 +102,10 @@ def process(
     dry_run: DryRun = False,
     as_json: AsJson = False,
 ) -> None:
-    from daemon.mission.store.level2 import recover_level2
-    from daemon.planning.overlaps import overlaps_of
-    from daemon.postflight.batch.level2_work import Level2Work, survey
+    from daemon.mission.transfer.object_store import is_store_url
+    from daemon.postflight.batch.level2_sources import level2_source
+    from daemon.postflight.batch.level2_work import Level2Work
     from daemon.postflight.batch.software_identity import software_identity
-    from processing.rig import load_rig
 
     if method not in ("free", "fixed") or interpolation not in INTERPOLATIONS:
         raise ConfigurationError(
@@ -107,43 +114,48 @@ def process(
     cluster = None
     if scheduler is not None:
         cluster = cluster_executor(scheduler, tls_ca, tls_certificate, tls_key, processes)
-    folder = Mission.open(mission)
-    rig = load_rig(rig_file or folder.rig_path)
-    plan, radiometry = as_flown(folder, radiometry, elevation)
-    processing = ProcessingSection.model_validate(
-        {
-            "method": method,
-            "interpolation": interpolation,
-            "baselines": baselines,
-            "thresholds": flown_thresholds(folder),
-        }
-    )
-    work = Level2Work(
-        mission=folder.path.absolute(),
-        rig_file=rig_file and rig_file.absolute(),
-        processing=processing,
-        plan=plan,
-        radiometry=radiometry and radiometry.absolute(),
-        identity=software_identity(),
-        recomputes=again,
-    )
-    with nullcontext() if dry_run else folder.held(is_shared=True):
-        if not dry_run:
-            recover_level2(folder)
-        found = survey(work, folder, only or folder.numbers(), overlaps_of(folder, rig))
-        placed = process_plan(work.memory_nbytes, len(found.pending), processes, threads)
-        if dry_run:
-            _print_dry_run(folder, found, None if cluster else placed, as_json=as_json)
-            return
-        executor = executor_for(placed, processes)
-        if cluster is not None:
-            executor, placed = cluster, replace(placed, threads=threads or 1, reason="its workers")
-        _run(folder, work.with_threads(placed.threads), found, executor, placed, as_json=as_json)
+    if is_store_url(mission):
+        require("stores")
+    with level2_source(mission if is_store_url(mission) else str(folder_of(mission))) as source:
+        folder = source.mission
+        plan, radiometry = as_flown(folder, radiometry, elevation)
+        processing = ProcessingSection.model_validate(
+            {
+                "method": method,
+                "interpolation": interpolation,
+                "baselines": baselines,
+                "thresholds": flown_thresholds(folder),
+            }
+        )
+        work = Level2Work(
+            mission=folder.path.absolute(),
+            rig_file=rig_file and rig_file.absolute(),
+            processing=processing,
+            plan=plan,
+            radiometry=radiometry and radiometry.absolute(),
+            identity=software_identity(),
+            recomputes=again,
+        )
+        with nullcontext() if dry_run else source.writing():
+            numbers = only or folder.numbers()
+            found = source.survey(source.placed(work), numbers, overlaps_of(folder, work.rig))
+            placed = process_plan(work.memory_nbytes, len(found.pending), processes, threads)
+            if dry_run:
+                _print_dry_run(source, found, None if cluster else placed, as_json=as_json)
+                return
+            executor = executor_for(placed, processes)
+            if cluster is not None:
+                executor = cluster
+                placed = replace(placed, threads=threads or 1, reason="its workers")
+            if not (found.pending or found.complete):
+                _refuse_unsuitable(folder, work)
+            placed_work = source.placed(work.with_threads(placed.threads))
+            _run(source, placed_work, found, executor, placed, as_json=as_json)
 
 
 def _run(
-    folder: Mission,
-    work: Level2Work,
+    source: Level2Source,
+    work: AnyLevel2Work,
     found: Level2Survey,
     executor: BatchExecutor,
     placed: ProcessAllocation,
@@ -152,7 +164,6 @@ def _run(
 ) -> None:
     """Compute what is pending and print the reports of all exposures."""
     from daemon.postflight.batch.batch_run import BatchOutcome, run_batch
-    from daemon.postflight.batch.level2_work import replaced_meanwhile, report_of
     from processing.radiometry.calibration import CalibrationError
 
     outcome, console = BatchOutcome(), Console(stderr=True)
@@ -168,16 +179,12 @@ def _run(
                 outcome = run_batch(executor, work, found.pending, show)
             except (ValueError, CalibrationError) as error:
                 raise ConfigurationError([str(error)]) from error
-    elif not complete:
-        _refuse_unsuitable(folder, work)
-    reports = dict(outcome.results)
-    for number, key in found.complete.items():
-        reports[number] = report_of(folder, number, key)
-    failures = [*outcome.failures, *replaced_meanwhile(folder, found, outcome)]
+    reports = {**outcome.results, **source.reports(found.complete)}
+    failures = [*outcome.failures, *source.replaced(found, outcome)]
     ordered = [reports[number] for number in sorted(reports)]
     if as_json:
         content = {
-            "mission": str(folder.path),
+            "mission": source.place,
             "exposures": ordered,
             "failures": [failure.as_json() for failure in failures],
             "complete_before": complete,
@@ -190,8 +197,8 @@ def _run(
     else:
         output = Console()
         if ordered:
-            print_reports(output, f"Level-2 of {folder.id}", ordered)
-        output.print(f"Products are in {folder.level2_root}")
+            print_reports(output, f"Level-2 of {source.mission.id}", ordered)
+        output.print(f"Products are in {source.products}")
     if outcome.is_interrupted:
         raise KeyboardInterrupt
     exit_if_failed(failures)
@@ -208,7 +215,7 @@ def _refuse_unsuitable(folder: Mission, work: Level2Work) -> None:
 
 
 def _print_dry_run(
-    folder: Mission, found: Level2Survey, placed: ProcessAllocation | None, *, as_json: bool
+    source: Level2Source, found: Level2Survey, placed: ProcessAllocation | None, *, as_json: bool
 ) -> None:
     """Print what would be computed; `placed` is None on a cluster, which is not asked."""
     count = len(found.pending)
@@ -217,7 +224,7 @@ def _print_dry_run(
         expected_s = round(found.expected_s * count / max(1, placed.processes), 1)
     if as_json:
         content = {
-            "mission": str(folder.path),
+            "mission": source.place,
             "complete": sorted(found.complete),
             "pending": [task.number for task in found.pending],
             "read_nbytes": found.pending_nbytes,

@@ -12,7 +12,7 @@ import math
 import struct
 import sys
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from io import BytesIO
@@ -79,14 +79,26 @@ class DecodedFrame:
     description: Mapping[str, Any]
 
 
-def read_frame(path: Path, *, width_px: int, height_px: int) -> DecodedFrame:
+def read_frame(
+    path: Path,
+    *,
+    width_px: int,
+    height_px: int,
+    read: Callable[[Path], bytes] = Path.read_bytes,
+) -> DecodedFrame:
     """Read a frame's file once: what is hashed is what is decoded.
+
+    Args:
+        path: of the file.
+        width_px: of the sensor.
+        height_px: of the sensor.
+        read: content of the file.
 
     Raises:
         RasterError: as `read_tiff`.
     """
     try:
-        data = path.read_bytes()
+        data = read(path)
     except OSError as error:
         raise RasterError(f"{path}: cannot be read ({error.strerror})") from error
     with _first_page(path, BytesIO(data)) as page:

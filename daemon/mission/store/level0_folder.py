@@ -78,7 +78,11 @@ def unsealed_exposure(capture: CaptureRecord) -> Exposure:
 
 
 def load_level0(
-    folder: Path, rig: Rig, *, calibration_sha256: str = ""
+    folder: Path,
+    rig: Rig,
+    *,
+    calibration_sha256: str = "",
+    read: Callable[[Path], bytes] = Path.read_bytes,
 ) -> tuple[dict[str, NDArray[np.uint16]], Exposure]:
     """Read the frames of an exposure, flown or laid out by hand, for a rig.
 
@@ -92,6 +96,7 @@ def load_level0(
         folder: such as `L0/000001`.
         rig: names the sensors and their sizes.
         calibration_sha256: hash of the rig file; refuse an exposure whose record names another.
+        read: content of a frame's file; frames may be elsewhere than their names.
 
     Returns:
         Pixels by sensor, shape (height, width), and the exposure.
@@ -133,7 +138,9 @@ def load_level0(
             missing.setdefault(record.sensor, f"{path.name} is not in its folder")
             continue
         try:
-            frame = read_frame(path, width_px=sensor.width_px, height_px=sensor.height_px)
+            frame = read_frame(
+                path, width_px=sensor.width_px, height_px=sensor.height_px, read=read
+            )
         except RasterError as error:
             problems.append(f"{folder.name}: {error}")
             continue

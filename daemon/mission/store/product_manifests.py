@@ -88,13 +88,26 @@ def read_manifest(mission: Mission, number: int, key: str) -> ProductManifest | 
     """
     path = manifest_folder(mission, number) / f"{key}.json"
     try:
-        content = parse_record(path.read_bytes(), path.name)
+        return parse_manifest(path.read_bytes(), key)
+    except OSError:
+        return None
+
+
+def parse_manifest(data: bytes, key: str) -> ProductManifest | None:
+    """The manifest in the content of a file; None where it is damaged or of another key.
+
+    Args:
+        data: content of the file.
+        key: SHA-256 of what the products are computed from.
+    """
+    try:
+        content = parse_record(data, f"{key}.json")
         files = {
             str(name): ProductFile(int(file["nbytes"]), str(file["sha256"]))
             for name, file in content["files"].items()
         }
         found = ProductManifest(str(content["key"]), files, str(content["compared_sha256"]))
-    except (OSError, RecordError, KeyError, TypeError, ValueError, AttributeError):
+    except (RecordError, KeyError, TypeError, ValueError, AttributeError):
         return None
     return found if found.key == key else None
 
@@ -187,12 +200,25 @@ def publish(
         OSError: the disk refused; an earlier product set is still there.
     """
     with closing(StagedFolder(mission.level2(number))) as staged, ThreadPoolExecutor(1) as hashing:
-        hashes = {name: hashing.submit(_sha256, parts) for name, parts in contents.items()}
+        hashes = {name: hashing.submit(parts_sha256, parts) for name, parts in contents.items()}
         sizes = level2.write_files(staged.part, contents)
         files = {name: ProductFile(sizes[name], hashes[name].result()) for name in sorted(sizes)}
         _revoke(mission, number)
         staged.publish()
     report = parse_record(b"".join(contents[REPORT_FILE]), REPORT_FILE)
+    return manifest_of(key, files, report)
+
+
+def manifest_of(
+    key: str, files: Mapping[str, ProductFile], report: Mapping[str, Any]
+) -> ProductManifest:
+    """The manifest of written products.
+
+    Args:
+        key: SHA-256 of what the products are computed from.
+        files: by name, with quality.json.
+        report: content of quality.json.
+    """
     return ProductManifest(key, files, _compared_sha256(files, report))
 
 
@@ -270,7 +296,8 @@ def _revoke(mission: Mission, number: int) -> None:
         durable.sync_directory(folder)
 
 
-def _sha256(parts: Parts) -> str:
+def parts_sha256(parts: Parts) -> str:
+    """SHA-256 of a file that is given in parts."""
     digest = hashlib.sha256()
     for part in parts:
         digest.update(part)

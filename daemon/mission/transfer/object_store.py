@@ -40,6 +40,10 @@ class ObjectStoreError(DaemonError):
     """A store refused or cannot be reached; the message has the cause and what to do."""
 
 
+class ObjectStoreUnavailableError(ObjectStoreError, ConnectionError):
+    """A store that failed in every attempt; the same call may succeed later."""
+
+
 @dataclass(frozen=True)
 class StoredObject:
     """An object: its name below the folder, its size, and its entity tag where there is one."""
@@ -106,8 +110,11 @@ class ObjectStore:
         """A folder in this one."""
         return ObjectStore(f"{self.url}/{name}")
 
-    def list_objects(self) -> list[StoredObject]:
+    def list_objects(self, folder: str = "") -> list[StoredObject]:
         """Every object, sorted by name.
+
+        Args:
+            folder: only those below it; names are those below this store's folder all the same.
 
         Raises:
             ObjectStoreError: the store refused.
@@ -117,7 +124,7 @@ class ObjectStore:
         def listed() -> list[StoredObject]:
             return [
                 StoredObject(str(one["path"]), int(one["size"]), one.get("e_tag"))
-                for chunk in obstore.list(self._store)
+                for chunk in obstore.list(self._store, prefix=folder or None)
                 for one in chunk
             ]
 
@@ -144,6 +151,23 @@ class ObjectStore:
         """The content of an object that fits into memory; None where there is none."""
         found = self.find(name)
         return None if found is None else b"".join(self.blocks(found))
+
+    def read(self, name: str, nbytes: int) -> bytes:
+        """The content of an object whose size is known.
+
+        Args:
+            name: of the object.
+            nbytes: its size.
+
+        Raises:
+            ObjectStoreError: the object is gone, has another size, or the store refused.
+        """
+        entry = self.find(name)
+        if entry is None or entry.nbytes != nbytes:
+            found = "is missing" if entry is None else f"has {entry.nbytes} bytes"
+            raise ObjectStoreError(f"{self.url}/{name} {found}; {nbytes} bytes were transferred")
+        blocks = list(self.blocks(entry))
+        return blocks[0] if len(blocks) == 1 else b"".join(blocks)
 
     def blocks(self, entry: StoredObject) -> Iterator[bytes]:
         """The content of an object, in parts of at most `PART_BYTES`.
@@ -213,6 +237,38 @@ class ObjectStore:
                     raise self._refused(name, error) from error
                 time.sleep(_FIRST_PAUSE_S * 2**attempt)
 
+    def create_small(self, name: str, data: bytes) -> bool:
+        """Write a small object unless it is there: of several writers one succeeds.
+
+        An object with the same content after a lost answer may be of this call or of another one.
+
+        Args:
+            name: of the object.
+            data: its content.
+
+        Returns:
+            Whether this call wrote it, by the answer of the store; False where it was there.
+
+        Raises:
+            ObjectStoreError: the store refused, or the object is there with another content.
+        """
+        import obstore
+
+        def create() -> bool:
+            try:
+                obstore.put(self._store, name, data, mode="create", use_multipart=False)
+            except (FileExistsError, obstore.exceptions.AlreadyExistsError):
+                return False
+            return True
+
+        is_created = self._repeated(create, name)
+        if not is_created and self.read_small(name) != data:
+            raise ObjectStoreError(
+                f"{self.url}/{name} is there with another content; it is left as it is. Remove it "
+                "with a program of the store and run the same command again"
+            )
+        return is_created
+
     def replace_small(self, name: str, data: bytes) -> None:
         """Write a small object and read it back."""
         self.put(name, lambda: iter([data]), len(data), hashlib.sha256(data).hexdigest())
@@ -245,7 +301,8 @@ class ObjectStore:
         raise AssertionError  # the last attempt returns or raises
 
     def _refused(self, name: str, error: Exception) -> ObjectStoreError:
-        return ObjectStoreError(
+        kind = ObjectStoreError if _is_final(error) else ObjectStoreUnavailableError
+        return kind(
             f"{self.url}/{name}: {_first_line(error)}. Check the network, the credentials and the "
             "bucket, and run the command again: it continues"
         )

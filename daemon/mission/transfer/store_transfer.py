@@ -18,6 +18,7 @@ from pathlib import Path
 from daemon.mission.layout import Mission
 from daemon.mission.store.file_tree import FileEntry, FileTree
 from daemon.mission.transfer.object_store import PART_BYTES, ObjectStore, StoredObject
+from daemon.mission.transfer.store_products import is_processed
 from daemon.mission.transfer.store_verification import check_store_copy, read_store_manifest
 from daemon.mission.transfer.transfer import (
     Progress,
@@ -276,7 +277,7 @@ class _StoreCopying:
         for name in present:
             if name in ours and (has_manifest or name in self._noted):
                 continue
-            if name in EXCLUDED_FILES:
+            if name in EXCLUDED_FILES or is_processed(name):
                 continue
             if name not in self._noted:
                 raise TransferError(

@@ -12,6 +12,12 @@ from concurrent.futures import ThreadPoolExecutor
 from daemon.mission.canonical_json import RECORD_MAX_BYTES, RecordError, parse_record
 from daemon.mission.layout import Mission, is_exposure_name
 from daemon.mission.transfer.object_store import ObjectStore, ObjectStoreError, StoredObject
+from daemon.mission.transfer.store_products import (
+    PROCESSED,
+    is_processed,
+    list_products,
+    product_differences,
+)
 from daemon.mission.transfer.transfer_manifest import (
     EXCLUDED_FILES,
     MANIFEST_FILE,
@@ -99,7 +105,7 @@ def verify_in_store(
     problems += [
         f"{name}: was not written by a transfer; move it away"
         for name in found
-        if name not in manifest.files and name not in EXCLUDED_FILES
+        if name not in manifest.files and name not in EXCLUDED_FILES and not is_processed(name)
     ]
     about = manifest.files.get("mission.json")
     if manifest.genesis_sha256 != (about.sha256 if about else ""):
@@ -114,13 +120,17 @@ def verify_in_store(
             counted, wrong = _frames(target, manifest, entry)
             frames += counted
             problems += wrong
-    covered = CoveredFiles("objects of the mission", len(manifest.files), MANIFEST_FILE)
+    covered = [CoveredFiles("objects of the mission", len(manifest.files), MANIFEST_FILE)]
+    products = list_products(target)
+    if count := sum(1 for _ in products.committed()):
+        problems += product_differences(target, products, lambda _count: None)
+        covered.append(CoveredFiles("product sets", count, f"{PROCESSED}/manifests"))
     return VerifyReport(
         exposures,
         frames,
         manifest.nbytes,
         tuple(problems),
-        covered=(covered,),
+        covered=tuple(covered),
         remarks=("The chain of records is not followed in a store; a copy on a disk shows more.",),
     )
 

@@ -167,7 +167,7 @@ def _note(content: dict[str, Any]) -> TransferManifest:
 
 
 def _file_name(name: str) -> str:
-    if any(component in ("", ".", "..") for component in name.split("/")):
+    if "\0" in name or any(part in ("", ".", "..") for part in name.split("/")):
         raise ValueError(name)
     return name
 

@@ -6,7 +6,7 @@ import os
 import socket
 import threading
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -32,7 +32,11 @@ from daemon.postflight.batch.product_key import (
 )
 from daemon.postflight.batch.software_identity import software_identity
 from daemon.products.band_images import radiance_folder
-from daemon.products.exposure_products import FlightGeometry, make_products
+from daemon.products.exposure_products import (
+    ExposureProducts,
+    FlightGeometry,
+    make_products,
+)
 from daemon.products.processor import Processor, processor_for
 from processing.rig import Rig, load_rig
 
@@ -147,6 +151,11 @@ class Level2Action:
             "" if work.rig_file else sha256_hex(mission.rig_path.read_bytes())
         )
 
+    @property
+    def recomputes(self) -> bool:
+        """Whether complete products are computed again."""
+        return self._work.recomputes
+
     def clone(self) -> Level2Action:
         """Another action with separate buffers and shared calibrations."""
         return Level2Action(
@@ -171,11 +180,39 @@ class Level2Action:
             return self._compute(number, payload)
 
     def _compute(self, number: int, payload: Level2Payload) -> dict[str, Any]:
-        started, folder = time.monotonic(), self._mission.level0(number)
+        started = time.monotonic()
+        key, products = self.make(number, payload)
+        manifest = product_manifests.publish(self._mission, number, key, products.contents)
+        duration_s = round(time.monotonic() - started, 3)
+        product_manifests.commit(self._mission, number, manifest, self.provenance(key, duration_s))
+        return {**products.report, "duration_s": duration_s}
+
+    def make(
+        self,
+        number: int,
+        payload: Level2Payload,
+        *,
+        read: Callable[[Path], bytes] = Path.read_bytes,
+        hash_of: Callable[[Path], str] = store.hash_file,
+    ) -> tuple[str, ExposureProducts]:
+        """Compute the products of one exposure and their key.
+
+        Args:
+            number: of the exposure.
+            payload: its key as surveyed, and its overlaps.
+            read: content of a frame's file.
+            hash_of: SHA-256 of a file whose hash is not in a record.
+
+        Raises:
+            InputsChangedError: the inputs are not those the key was computed from.
+            Exception: the exposure cannot be processed.
+        """
+        folder = self._mission.level0(number)
         frames, exposure = store.load_level0(
-            folder, self._processor.rig, calibration_sha256=self._calibration_sha256
+            folder, self._processor.rig, calibration_sha256=self._calibration_sha256, read=read
         )
-        key = product_key(self._common, input_identity(folder), asdict(payload.overlap_shares))
+        inputs = input_identity(folder, hash_of)
+        key = product_key(self._common, inputs, asdict(payload.overlap_shares))
         if payload.key and key != payload.key:
             raise InputsChangedError(
                 f"{folder} was changed after the run began; run the same command again"
@@ -187,12 +224,15 @@ class Level2Action:
             frames,
             overlap_shares=payload.overlap_shares,
         )
-        manifest = product_manifests.publish(self._mission, number, key, products.contents)
-        duration_s = round(time.monotonic() - started, 3)
-        product_manifests.commit(self._mission, number, manifest, self._provenance(key, duration_s))
-        return {**products.report, "duration_s": duration_s}
+        return key, products
 
-    def _provenance(self, key: str, duration_s: float) -> dict[str, Any]:
+    def provenance(self, key: str, duration_s: float) -> dict[str, Any]:
+        """Who computed products of this key, with what, and how long it took.
+
+        Args:
+            key: of the products.
+            duration_s: of the computation.
+        """
         return {
             "key": key,
             "host": socket.gethostname(),

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from daemon.mission.store.level0_folder import CAPTURE_FILE, EXPOSURE_FILE, hash
 RECORDS = (EXPOSURE_FILE, CAPTURE_FILE)
 
 
-def input_identity(folder: Path) -> dict[str, Any]:
+def input_identity(folder: Path, hash_of: Callable[[Path], str] = hash_file) -> dict[str, Any]:
     """Hashes of the records of an exposure, and of each file the size or the hash.
 
     A file whose hash is in the record is compared with it when it is read; its size stands for it
@@ -26,6 +26,7 @@ def input_identity(folder: Path) -> dict[str, Any]:
 
     Args:
         folder: such as `L0/000001`.
+        hash_of: SHA-256 of a file whose hash is not in a record.
 
     Raises:
         OSError: a file cannot be read.
@@ -38,11 +39,11 @@ def input_identity(folder: Path) -> dict[str, Any]:
         if path.exists():
             data = path.read_bytes()
             found[name] = sha256_hex(data)
-            hashed |= _hashed_files(data)
+            hashed |= hashed_files(data)
     with os.scandir(folder) as entries:
         files = {e.name: e.stat().st_size for e in entries if e.is_file() and e.name not in RECORDS}
     for name, nbytes in sorted(files.items()):
-        found[name] = nbytes if name in hashed else hash_file(folder / name)
+        found[name] = nbytes if name in hashed else hash_of(folder / name)
     return found
 
 
@@ -78,7 +79,15 @@ def frame_nbytes(inputs: Mapping[str, Any], folder: Path) -> int:
     )
 
 
-def _hashed_files(record: bytes) -> set[str]:
+def hashed_files(record: bytes) -> set[str]:
+    """Names of the files whose hash a record has.
+
+    Args:
+        record: content of `exposure.json` or `capture.json`.
+
+    Raises:
+        ValueError: no JSON.
+    """
     content = json.loads(record)
     frames = content.get("frames", []) if isinstance(content, dict) else []
     if not isinstance(frames, list):

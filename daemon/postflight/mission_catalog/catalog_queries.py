@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -12,7 +11,6 @@ from typing import Any
 
 from daemon import DaemonError
 from daemon.mission.foreign_files import ForeignFileError, read_regular_file
-from daemon.mission.transfer.object_store import is_store_url
 from daemon.postflight.mission_catalog.catalog_files import TABLE
 
 _POLYGON_MAX_BYTES = 50_000_000
@@ -82,24 +80,11 @@ def select(folder: Path, query: CatalogQuery) -> list[dict[str, Any]]:
 
 
 def process_arguments(selected: Sequence[dict[str, Any]]) -> list[list[str]]:
-    """The arguments of `syntopic process` for each mission of a selection in a folder."""
+    """The arguments of `syntopic process` for each mission of a selection."""
     by_place: dict[str, list[str]] = {}
     for one in selected:
-        if is_store_url(one["place"]):
-            continue
         by_place.setdefault(one["place"], []).extend(("--only", str(one["exposure"])))
     return [["syntopic", "process", place, *only] for place, only in by_place.items()]
-
-
-def places_not_processed(selected: Sequence[dict[str, Any]]) -> list[str]:
-    """A sentence for each mission of a selection that `syntopic process` does not take."""
-    counts = Counter(one["place"] for one in selected if is_store_url(one["place"]))
-    return [
-        f"{place}: {count} exposures are in an object store, and syntopic process reads a mission "
-        "in a folder. Copy the mission there with a program of the store, run syntopic verify on "
-        "it, and query a catalog of that folder"
-        for place, count in counts.items()
-    ]
 
 
 def parse_time(text: str) -> datetime:

@@ -12,9 +12,15 @@ from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 
 from daemon import DaemonError
-from daemon.mission.layout import Mission, is_exposure_name
+from daemon.mission.layout import Mission, exposure_name, is_exposure_name
 from daemon.mission.store.durable import make_directories
+from daemon.mission.store.product_manifests import REPORT_FILE
 from daemon.mission.transfer.object_store import ObjectStore, StoredObject, is_store_url
+from daemon.mission.transfer.store_products import (
+    list_products,
+    product_folder,
+    stored_provenance,
+)
 
 RECORD_MAX_BYTES = 20_000_000
 _ROOT_FILES = ("mission.json", "rig.toml", "service.toml")
@@ -70,10 +76,28 @@ def _fetched(store: ObjectStore, scratch: Path) -> list[tuple[Mission, str]]:
             make_directories((folder / below).parent)
             (folder / below).write_bytes(b"".join(store.blocks(entry)))
         address = f"{store.url}/{root}" if root else store.url
+        _fetch_processed(ObjectStore(address), folder)
         found.append((Mission.open(folder), address))
     if not found:
         raise SourceError(f"{store.url}: no mission there; a mission has records in L0")
     return found
+
+
+def _fetch_processed(store: ObjectStore, folder: Path) -> None:
+    """Quality reports of products that were computed in the store; of several keys the last one."""
+    products = list_products(store)
+    newest: dict[int, tuple[float, str]] = {}
+    for number, key in products.committed():
+        finished_s = stored_provenance(store, number, key).get("finished_unix_s", 0)
+        newest[number] = max(newest.get(number, (-1.0, "")), (float(finished_s), key))
+    for number, (_, key) in newest.items():
+        report = f"{product_folder(number, key)}/{REPORT_FILE}"
+        entry = store.find(report)
+        if entry is None or entry.nbytes > RECORD_MAX_BYTES:
+            raise SourceError(f"{store.url}/{report}: is missing or too large for a report")
+        make_directories(folder / "L2" / exposure_name(number))
+        target = folder / "L2" / exposure_name(number) / REPORT_FILE
+        target.write_bytes(b"".join(store.blocks(entry)))
 
 
 def _is_record(path: PurePosixPath) -> bool:
