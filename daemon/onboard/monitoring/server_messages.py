@@ -32,7 +32,7 @@ NUMBERS: Final = frozenset(
         *("expected", "exposures", "factor", "first", "gap", "gb", "height", "height_limit"),
         *("k", "last", "level", "limit", "lines", "m", "ms", "n", "noise", "number", "planned"),
         *("ppm", "present", "px", "ratio", "received", "right", "row", "s", "share", "step"),
-        *("top", "triggers", "undecided", "used", "valid", "value"),
+        *("db", "top", "triggers", "undecided", "us", "used", "valid", "value"),
     )
 )
 """Parameters that are numbers. A text where one is expected belongs to another message."""
@@ -190,11 +190,22 @@ def _parameter(value: str, depth: int) -> Any:
     if depth > DEPTH_MAX:
         return value
     parts = [_match(one, depth) or one for one in _SEPARATORS.split(value)]
+    message = _match(value, depth)
     if len(parts) > 1 and all(isinstance(one, dict) for one in parts):
-        return parts
-    if (message := _match(value, depth)) is not None:
+        # A sentence may have a separator of its own.
+        is_one = message is not None and _text_length(message) < _text_length(parts)
+        return message if is_one else parts
+    if message is not None:
         return message
     return parts if any(isinstance(one, dict) for one in parts) else value
+
+
+def _text_length(value: Any) -> int:
+    """Characters of a message, or of a list, that no text of the catalog stands for."""
+    if isinstance(value, str):
+        return len(value)
+    parts = value["parameters"].values() if isinstance(value, dict) else value
+    return sum(_text_length(one) for one in parts)
 
 
 @lru_cache(maxsize=1)
@@ -204,9 +215,16 @@ def _catalog() -> Mapping[str, str]:
 
 @lru_cache(maxsize=1)
 def _templates() -> Sequence[_Template]:
-    """The most specific first."""
+    """The most specific first; of frames, those that split at a colon, which joins the least."""
     found = []
     for code, text in _catalog().items():
         parts = re.split(r"\{(\w+)\}", text)
         found.append(_Template(code.removeprefix(PREFIX), tuple(parts[::2]), tuple(parts[1::2])))
-    return sorted(found, key=lambda one: (one.is_frame, -one.literal_length))
+    return sorted(
+        found,
+        key=lambda one: (
+            one.is_frame,
+            one.is_frame and ": " not in one.literals,
+            -one.literal_length,
+        ),
+    )

@@ -193,3 +193,87 @@ def test_a_long_sentence_of_a_device_costs_no_time() -> None:
     """Matching is linear: what a device sends cannot hold up the page."""
     for text in ("; ".join(["a (b"] * 400), "the " * 500, ": " * 900, "(" * 1900, "7 m of " * 250):
         assert message_of(text) is None or english(message_of(text) or {}) == text
+
+
+COMPOSED = {
+    *("use_end_program", "use_stop_modem", "instrument_silent", "head_open_holding"),
+    *("node_forbidden", "node_not_opened", "not_opened", "serial_lost", "serial_silent"),
+}
+"""Sentences that a driver composes, or that are shorter than what `sentences_of` looks at."""
+
+
+def codes_of(value: Any) -> Iterator[str]:
+    """The codes of a message and of its parameters."""
+    if isinstance(value, dict):
+        yield value["code"]
+        for one in value["parameters"].values():
+            yield from codes_of(one)
+    elif isinstance(value, list):
+        for one in value:
+            yield from codes_of(one)
+
+
+def test_every_text_of_a_device_is_one_that_a_driver_writes() -> None:
+    """A sentence that a driver changes would otherwise be English on every page."""
+    found: set[str] = set()
+    for source in sorted((ROOT / "drivers").rglob("*.py")):
+        for variants in sentences_of(source):
+            for one in variants:
+                found |= set(codes_of(message_of(one) or {"code": "", "parameters": {}}))
+    catalog = json.loads(CATALOG.read_text("utf-8"))
+    device = {one.removeprefix("server.") for one in catalog if one.startswith("server.device.")}
+    assert device - found - {f"device.{one}" for one in COMPOSED} == set()
+
+
+@pytest.mark.parametrize(
+    ("sentence", "codes"),
+    [
+        (
+            "SU11 at 10.0.0.5: another program controls the head; end that program. Retrying "
+            "automatically.",
+            ["device.not_opened", "device.named_error_at", "device.controlled"],
+        ),
+        (
+            "gnss: port /dev/ttyUSB0 cannot be opened: it is in use by gpsd (812); run: systemctl "
+            "stop gpsd.socket gpsd, or use driver gpsd",
+            [
+                *("device.named_error", "device.port_not_opened", "device.port_in_use"),
+                "device.use_stop_gpsd",
+            ],
+        ),
+        (
+            "SU07 at 10.0.0.7: 4000 us, 6 dB, 0 TDI shifts are refused (GainRaw: out of range); "
+            "choose settings within the head's bounds",
+            ["device.named_error_at", "device.settings_refused"],
+        ),
+        (
+            "SU02 at /dev/video2: /dev/video2 may not be opened; add this user to the group video",
+            ["device.node_forbidden"],
+        ),
+        (
+            "SU02 at /dev/video2: /dev/video2 cannot be opened (Input/output error); check cable "
+            "and power. Retrying automatically.",
+            ["device.not_opened", "device.node_not_opened"],
+        ),
+        (
+            "thermo: nothing came at /dev/ttyS0 in 3 s; check power, cable, baudrate (9600)",
+            ["device.named_error", "device.instrument_silent"],
+        ),
+        (
+            "SU07: serial number is 231 where 232 is configured; another head is connected here, "
+            "or serial is wrong",
+            ["device.named_error", "device.serial_other"],
+        ),
+    ],
+)
+def test_a_refusal_of_a_driver_has_codes_for_all_of_its_parts(
+    sentence: str, codes: list[str]
+) -> None:
+    message = message_of(sentence)
+    assert message is not None
+    assert list(codes_of(message)) == codes
+    assert english(message) == sentence
+    for language in ("de", "fr", "es", "zh"):
+        catalog = json.loads((CATALOG.parents[1] / language / "server.json").read_text("utf-8"))
+        translated = english(message, catalog)
+        assert "end that program" not in translated and "; run: " not in translated
