@@ -15,7 +15,7 @@ from daemon.terminal.console import Console
 app = typer.Typer(
     help="""Import exposures of other cameras as a mission folder for `syntopic process`.
 
-Example: `syntopic import rededge 0000SET --out field-7`
+Example: `syntopic import multispectral 0000SET --out field-7`
 """,
     no_args_is_help=True,
     rich_markup_mode="markdown",
@@ -28,45 +28,59 @@ def imports() -> None:
 
 
 @app.command()
-def rededge(
+def multispectral(
     folder: Annotated[
         Path, typer.Argument(help="Folder with IMG_0000_1.tif ..., searched recursively.")
     ],
     out: Annotated[Path, typer.Option(help="New mission folder.")],
     as_json: AsJson = False,
 ) -> None:
-    """Import MicaSense RedEdge images; lens and radiance calibration come from their tags.
+    """Import images of multispectral cameras by the calibration in their tags.
 
-    Example: `syntopic import rededge 000/ --out missions/field-7`
+    Reads MicaSense RedEdge, Altum and Dual, Parrot Sequoia, DJI Phantom 4 and Mavic 3
+    Multispectral, Sentera 6X, and others with the same tags. Each serial number becomes a mission:
+    with several, OUT has a folder for each.
+
+    Example: `syntopic import multispectral 000/ --out missions/field-7`
     """
-    from daemon.postflight.importers.rededge import import_rededge
+    from daemon.postflight.importers.multispectral import import_multispectral
 
     with Progress(console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("importing", total=None)
-        imported = import_rededge(
+        imported = import_multispectral(
             folder,
             out,
             progress=lambda done, total: progress.update(task, completed=done, total=total),
         )
     if as_json:
-        content = {
-            "mission": str(imported.mission.path),
-            "exposures": imported.exposures,
-            "frames": imported.frames,
-            "lens_fit_px": dict(imported.lens_fit_px),
-            "missing": list(imported.missing),
-        }
-        typer.echo(json.dumps(content))
+        cameras = [
+            {
+                "mission": str(one.mission.path),
+                "camera": one.camera,
+                "serial": one.serial,
+                "exposures": one.exposures,
+                "frames": one.frames,
+                "lens_fit_px": dict(one.lens_fit_px),
+                "missing": list(one.missing),
+                "notes": list(one.notes),
+            }
+            for one in imported
+        ]
+        typer.echo(json.dumps({"cameras": cameras}))
         return
     console = Console()
-    worst = max(imported.lens_fit_px.values(), default=0.0)
-    console.print(
-        f"{imported.exposures} exposures, {imported.frames} frames in {out}; lens "
-        f"distortion carried over within {worst:.3f} px"
-    )
-    for sentence in imported.missing:
-        console.print(sentence, markup=False, style="yellow")
-    console.print(f"Next: syntopic process {out}")
+    for one in imported:
+        worst = max(one.lens_fit_px.values(), default=0.0)
+        console.print(
+            f"{one.camera} {one.serial}: {one.exposures} exposures, {one.frames} frames in "
+            f"{one.mission.path}; lens distortion carried over within {worst:.3f} px",
+            soft_wrap=True,
+            markup=False,
+        )
+        for sentence in (*one.missing, *one.notes):
+            console.print(sentence, markup=False, style="yellow", soft_wrap=True)
+    for one in imported:
+        console.print(f"Next: syntopic process {one.mission.path}", soft_wrap=True)
 
 
 @app.command()

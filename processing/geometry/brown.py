@@ -10,8 +10,9 @@ eq. 5.1.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -99,15 +100,60 @@ def lens_from_brown(
         >>> lens.f_mm, worst_px < 0.01
         (5.0, True)
     """
-    f_mm = brown.f_px * pitch_mm
-    centre = brown.principal_point_px
+
+    def measured_px(ideal: Array) -> Array:
+        measured = measured_from_ideal_brown(brown, ideal) * brown.f_px
+        return np.asarray(measured + np.array(brown.principal_point_px))
+
+    return lens_from_distortion(
+        measured_px, brown.f_px, brown.principal_point_px, (width_px, height_px), pitch_mm,
+        f_number=f_number, serial=serial,
+    )  # fmt: skip
+
+
+def lens_from_distortion(
+    measured_px: Callable[[Array], Array],
+    f_px: float,
+    centre_px: tuple[float, float],
+    size_px: tuple[int, int],
+    pitch_mm: float,
+    *,
+    f_number: float,
+    serial: str,
+    is_affine: bool = False,
+    reach: float = 1.15,
+) -> tuple[Lens, float]:
+    """The lens of eq. 5.1 that undoes a distortion best.
+
+    Args:
+        measured_px: pixels (column, row), shape (n, 2), of ideal points in units of the focal
+            length, shape (n, 2), x right, y down.
+        f_px: focal length.
+        centre_px: principal point, column and row.
+        size_px: columns and rows of the frame.
+        pitch_mm: pixel pitch; with `f_px` it gives the principal distance.
+        f_number: copied into the lens.
+        serial: copied into the lens.
+        is_affine: whether affinity, shear and a change of the focal length are fitted, too.
+        reach: of the ideal points, in half frames; what falls outside of the frame is left out.
+
+    Returns:
+        The lens about the principal point, and the largest error of the fit over the frame, px.
+
+    Raises:
+        ValueError: a distortion that cannot be undone within a pixel.
+
+    Source: docs/explanation/mathematics/lens.md#from-browns-model; Heier et al. (2002), eq. 5.1.
+    """
+    f_mm = f_px * pitch_mm
+    centre, (width_px, height_px) = centre_px, size_px
     half = _GRID_OVERSIZE * max(
         centre[0], centre[1], width_px - 1 - centre[0], height_px - 1 - centre[1], 1.0
     )
-    axis = np.linspace(-1.15 * half, 1.15 * half, _GRID) / brown.f_px
+    axis = np.linspace(-reach * half, reach * half, _GRID) / f_px
     ideal = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
-    measured = measured_from_ideal_brown(brown, ideal)
-    at = measured * brown.f_px + np.array(centre)
+    at = measured_px(ideal)
+    measured = (at - np.array(centre)) / f_px
     inside = (
         (at[:, 0] >= -0.02 * width_px)
         & (at[:, 0] <= 1.02 * width_px)
@@ -116,24 +162,20 @@ def lens_from_brown(
     )
     up = np.array([f_mm, -f_mm])
     m, delta = measured[inside] * up, (ideal - measured)[inside] * up
-    lens = Lens(
-        f_mm=f_mm, f_ppm_per_k=0.0, f_number=f_number, serial=serial, dx0_mm=0.0, dy0_mm=0.0,
-        df_mm=0.0, k1=0.0, k2=0.0, k3=0.0, p1=0.0, p2=0.0, b1=0.0, b2=0.0,
-    )  # fmt: skip
-    units = (
-        replace(lens, k1=1.0),
-        replace(lens, k2=1.0),
-        replace(lens, k3=1.0),
-        replace(lens, p1=1.0),
-        replace(lens, p2=1.0),
-    )
-    columns = [lens_correction(unit, m).ravel() for unit in units]
+    lens = Lens(f_mm=f_mm, f_number=f_number, serial=serial)
+    terms = ("k1", "k2", "k3", "p1", "p2", *(("b1", "b2", "df_mm") if is_affine else ()))
+    columns = [lens_correction(_with(lens, {term: 1.0}), m).ravel() for term in terms]
     design = np.stack(columns, axis=1)
     size = np.linalg.norm(design, axis=0)
     solution, *_ = np.linalg.lstsq(design / size, delta.ravel(), rcond=None)
-    k1, k2, k3, p1, p2 = (float(value) for value in solution / size)
-    lens = replace(lens, k1=k1, k2=k2, k3=k3, p1=p1, p2=p2)
+    values = (float(value) for value in solution / size)
+    lens = _with(lens, dict(zip(terms, values, strict=True)))
     worst_px = float(np.abs(lens_correction(lens, m) - delta).max()) / pitch_mm
     if not math.isfinite(worst_px) or worst_px > 1.0:
         raise ValueError(f"the distortion cannot be undone within a pixel ({worst_px:.2g} px left)")
     return lens, worst_px
+
+
+def _with(lens: Lens, values: Mapping[str, float]) -> Lens:
+    changed: dict[str, Any] = dict(values)
+    return replace(lens, **changed)

@@ -203,7 +203,7 @@ class BandPipeline(
         cells = grid_of(self._image.width_px, self._image.height_px)
         return Judgement(
             "bands",
-            _figures(found, stages.corrected.saturated, masks),
+            _figures(found, stages.corrected.saturated, masks, len(self._band_of)),
             area_of_rasters(masks, self._band_of.values(), cells, saturated_bit=SATURATED),
             nominal_bands=tuple(f.band for f in found if not f.registered),
         )
@@ -278,8 +278,12 @@ def _figures(
     found: Collection[RegisteredBand],
     saturated: Mapping[str, Array],
     masks: Mapping[str, Array],
+    band_count: int,
 ) -> Iterator[FigureGroup]:
-    """Registration by band, saturation by sensor name, and valid pixels of the masks by band."""
+    """Registration by band, saturation by sensor name, and valid pixels of the masks by band.
+
+    What is valid is at most the share of the bands that are there: one of five is no image.
+    """
     yield BandFitFigures(
         points_by_band={band.band: band.points for band in found},
         rms_px_by_band={band.band: band.rms_px for band in found},
@@ -293,7 +297,7 @@ def _figures(
         # Each band is a measurement of its own: the worst decides.
         yield SaturationFigures(shares[worst], shares[worst], worst)
         everywhere = np.logical_and.reduce([mask & VALID != 0 for mask in masks.values()])
-        yield ValidFigures(float(np.mean(everywhere)))
+        yield ValidFigures(min(float(np.mean(everywhere)), len(masks) / band_count))
 
 
 def _for_matching(frame: Array, unusable: Array) -> Array:

@@ -33,7 +33,7 @@ IMAGE_MAX_PIXELS: Final = 500_000_000
 
 Timing = Literal["syntopic", "synchronous"]
 Role = Literal["pan", "colour"]
-BANDS: Final = ("pan", "red", "green", "blue", "nir", "red_edge")
+BANDS: Final = ("pan", "red", "green", "blue", "nir", "red_edge", "red_edge_2")
 ColourFilterArray = Literal["none", "RGGB", "BGGR", "GRBG", "GBRG"]
 
 SidePx = Annotated[int, Strict(), Field(ge=1, le=SIDE_MAX_PX)]

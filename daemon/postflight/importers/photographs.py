@@ -19,7 +19,7 @@ from daemon.mission.store import durable
 from daemon.postflight.calibration.rig_writer import rig_toml
 from daemon.postflight.importers import exif_tags
 from daemon.postflight.importers.exif_tags import ImageTags, TagsError, read_tags
-from daemon.postflight.importers.rededge import ImagesError
+from daemon.postflight.importers.multispectral_tags import ImagesError
 from processing.rig import Cone, Lens, Rig, Sensor, load_rig
 
 CONE: Final = "C"

@@ -14,6 +14,7 @@ from daemon.mission.foreign_xml import XmlError, parse_xml
 
 XMP_MAX_BYTES = 1_000_000
 XMP_MAX_ELEMENTS = 10_000
+_NUMBERS_MAX = 10
 _RDF = "{http://www.w3.org/1999/02/22-rdf-syntax-ns#}"
 
 
@@ -44,12 +45,17 @@ class Xmp:
     def number(self, key: str) -> float:
         return self._number(key, self.text(key))
 
-    def numbers(self, key: str, count: int) -> tuple[float, ...]:
-        """A sequence of so many numbers, or one text that holds them between commas."""
+    def numbers(self, key: str, count: int | None = None) -> tuple[float, ...]:
+        """A sequence of so many numbers, or one text that holds them between commas.
+
+        Without a count, two to `_NUMBERS_MAX` are read.
+        """
         values = self._values.get(key, ())
         if len(values) == 1:
             values = values[0].split(",")
-        if len(values) != count:
+        if count is None and not 2 <= len(values) <= _NUMBERS_MAX:
+            raise XmpError(f"{self._file}: XMP {key} has {len(values)} values; a few are needed")
+        if count is not None and len(values) != count:
             raise XmpError(f"{self._file}: XMP {key} has {len(values)} values; {count} are needed")
         return tuple(self._number(key, value) for value in values)
 

@@ -17,12 +17,8 @@ from daemon.cli import app
 from daemon.configuration.model import PlanSection
 from daemon.mission.layout import Mission
 from daemon.mission.store.store import load_level0
-from daemon.postflight.importers.rededge import (
-    ImagesError,
-    gps_ns_from_utc,
-    import_rededge,
-    read_image,
-)
+from daemon.postflight.importers.multispectral import gps_ns_from_utc, import_multispectral
+from daemon.postflight.importers.multispectral_tags import ImagesError, read_image
 from daemon.products.band_images import radiance_of
 from daemon.products.exposure_conditions import conditions_of
 from processing.geometry.placement import vip_mm_from_raw, vip_px_from_mm
@@ -44,7 +40,9 @@ PUBLISHED = {
 def processed(tmp_path_factory):
     """The recorded camera, imported and processed: mission, rig, reports by exposure."""
     path = tmp_path_factory.mktemp("rededge") / "field"
-    output = _run_json(["import", "rededge", str(RECORDED), "--out", str(path), "--json"])
+    (output,) = _run_json(["import", "multispectral", str(RECORDED), "--out", str(path), "--json"])[
+        "cameras"
+    ]
     assert output["exposures"] == 2 and output["frames"] == 10 and output["missing"] == []
     assert max(output["lens_fit_px"].values()) < 0.03
     mission = Mission.open(path)
@@ -184,11 +182,11 @@ def test_images_of_two_cameras_and_doubled_images_are_refused_and_leave_nothing(
     shutil.copy(source, folder / "IMG_0000_1.tif")
     shutil.copy(source, folder / "IMG_0007_1.tif")
     with pytest.raises(ImagesError, match=r"IMG_0007_1.tif: its capture has another image"):
-        import_rededge(folder, tmp_path / "out")
+        import_multispectral(folder, tmp_path / "out")
     changed = source.read_bytes().replace(b"0.00014648541280593884", b"0.00014648541280593984")
     (folder / "IMG_0007_1.tif").write_bytes(changed.replace(b"5v25BtsZg3BQ", b"5v25BtsZg3BX"))
     with pytest.raises(ImagesError, match=r"another camera or calibration than IMG_0000_1\.tif"):
-        import_rededge(folder, tmp_path / "out")
+        import_multispectral(folder, tmp_path / "out")
     assert [entry.name for entry in tmp_path.iterdir()] == ["set"]
 
 
@@ -200,7 +198,7 @@ def test_a_damaged_image_is_reported_by_name(tmp_path):
     (folder / "short.tif").write_bytes(file_bytes[:300_000])
     (folder / "torn.tif").write_bytes(file_bytes[: len(file_bytes) - 5000])
     with pytest.raises(ImagesError) as refused:
-        import_rededge(folder, tmp_path / "out")
+        import_multispectral(folder, tmp_path / "out")
     assert len(refused.value.problems) == 2
     assert refused.value.problems[0].startswith("short.tif: ")
 
@@ -229,18 +227,18 @@ def test_damaged_tags_end_in_a_sentence_or_in_an_image_and_never_otherwise(tmp_p
 
 def test_images_without_what_the_calibration_needs_are_refused(tmp_path):
     write_tiff(tmp_path / "a.tif", packet())
-    with pytest.raises(ImagesError, match=r"a\.tif: has no EXIF"):
-        import_rededge(tmp_path, tmp_path / "out")
+    with pytest.raises(ImagesError, match=r"a\.tif: .*has no EXIF"):
+        import_multispectral(tmp_path, tmp_path / "out")
     (tmp_path / "a.tif").write_bytes(b"II*\0")
-    with pytest.raises(ImagesError, match=r"a\.tif: not a usable RedEdge image"):
-        import_rededge(tmp_path, tmp_path / "out")
+    with pytest.raises(ImagesError, match=r"a\.tif: not a usable image"):
+        import_multispectral(tmp_path, tmp_path / "out")
 
 
 def test_an_empty_folder_and_a_mission_that_is_there_are_refused(tmp_path):
     with pytest.raises(ImagesError, match="holds 0 TIFF images"):
-        import_rededge(tmp_path, tmp_path / "out")
+        import_multispectral(tmp_path, tmp_path / "out")
     with pytest.raises(ImagesError, match="is there already"):
-        import_rededge(tmp_path, tmp_path)
+        import_multispectral(tmp_path, tmp_path)
 
 
 def test_gps_time_counts_the_leap_seconds_of_its_day():

@@ -146,7 +146,7 @@ def folder_frame() -> Target:
 
 
 def rededge_image() -> Target:
-    from daemon.postflight.importers.rededge import ImagesError, read_image
+    from daemon.postflight.importers.multispectral_tags import ImagesError, read_image
     from tests.daemon.rededge_data import packet, write_tiff
 
     path = scratch_folder() / "seed.tif"

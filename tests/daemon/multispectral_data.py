@@ -1,0 +1,93 @@
+"""Images of multispectral cameras, written here after the tags that their makers publish."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+
+KINDS = {"byte": 1, "ascii": 2, "short": 3, "long": 4, "rational": 5}
+
+
+def entry(code: int, kind: str, value) -> tuple[int, int, int, bytes]:
+    if kind == "ascii":
+        raw = value.encode() + b"\0"
+        return code, 2, len(raw), raw
+    if kind == "byte":
+        return code, 1, len(value), bytes(value)
+    if kind == "rational":
+        return code, 5, 1, struct.pack("<II", round(value * 1_000_000), 1_000_000)
+    values = value if isinstance(value, tuple) else (value,)
+    letter = {"short": "H", "long": "I"}[kind]
+    return code, KINDS[kind], len(values), struct.pack(f"<{len(values)}{letter}", *values)
+
+
+def directory(entries, at: int) -> bytes:
+    """An image file directory that lies at `at`, its long values behind it (TIFF 6.0)."""
+    entries = sorted(entries)
+    head, tail = struct.pack("<H", len(entries)), b""
+    behind = at + 2 + 12 * len(entries) + 4
+    for code, kind, count, raw in entries:
+        head += struct.pack("<HHI", code, kind, count)
+        if len(raw) <= 4:
+            head += raw.ljust(4, b"\0")
+        else:
+            head += struct.pack("<I", behind + len(tail))
+            tail += raw + b"\0" * (len(raw) % 2)
+    return head + struct.pack("<I", 0) + tail
+
+
+def xmp(values: dict[str, str], *, as_attributes: bool = False) -> bytes:
+    """A packet; DJI writes attributes, the others elements."""
+    attributes = "".join(f' c:{k}="{v}"' for k, v in values.items()) if as_attributes else ""
+    elements = "" if as_attributes else "".join(f"<c:{k}>{v}</c:{k}>" for k, v in values.items())
+    return (
+        '<x:xmpmeta xmlns:x="adobe:ns:meta/"><r:RDF '
+        'xmlns:r="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
+        f'<r:Description xmlns:c="http://pix4d.com/camera/1.0"{attributes}>{elements}'
+        "</r:Description></r:RDF></x:xmpmeta>"
+    ).encode()
+
+
+def write_image(
+    path: Path,
+    pixels: np.ndarray,
+    packet: bytes,
+    *,
+    make: str,
+    model: str,
+    serial: str | None = None,
+    black: int | None = None,
+    taken: str = "2024:05:06 07:08:09",
+    subsec: str | None = "25",
+    focal_mm: float | None = 5.5,
+    per_mm: float | None = None,
+    iso: int = 100,
+    time_s: float | None = 0.002,
+) -> None:
+    height, width = pixels.shape
+    exif = [entry(36867, "ascii", taken)] if taken else []
+    for code, kind, value in (
+        (33434, "rational", time_s), (33437, "rational", 2.2), (34855, "short", iso),
+        (37386, "rational", focal_mm), (41486, "rational", per_mm),
+        (41488, "short", 4 if per_mm else None), (37520, "ascii", subsec),
+        (42033, "ascii", serial),
+    ):  # fmt: skip
+        if value is not None:
+            exif.append(entry(code, kind, value))
+    image = [
+        entry(256, "long", width), entry(257, "long", height), entry(258, "short", 16),
+        entry(259, "short", 1), entry(262, "short", 1), entry(271, "ascii", make),
+        entry(272, "ascii", model), entry(277, "short", 1), entry(278, "long", height),
+        entry(279, "long", pixels.nbytes), entry(700, "byte", packet),
+    ]  # fmt: skip
+    if black is not None:
+        image.append(entry(50714, "short", black))
+    start = 8 + pixels.nbytes
+    exif_at = start + len(directory([*image, entry(273, "long", 8), entry(34665, "long", 0)], 0))
+    exif_at += exif_at % 2
+    first = directory([*image, entry(273, "long", 8), entry(34665, "long", exif_at)], start)
+    body = struct.pack("<2sHI", b"II", 42, start) + pixels.astype("<u2").tobytes() + first
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(body.ljust(exif_at, b"\0") + directory(exif, exif_at))

@@ -1,0 +1,316 @@
+"""Folders of multispectral cameras, in the tags their makers publish, become missions."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import tifffile
+from typer.testing import CliRunner
+
+from daemon.cli import app
+from daemon.configuration.model import PlanSection
+from daemon.mission.layout import Mission
+from daemon.mission.store.store import load_level0
+from daemon.postflight.importers.multispectral import import_multispectral
+from daemon.postflight.importers.multispectral_tags import ImagesError
+from daemon.products.band_images import radiance_of
+from daemon.products.exposure_conditions import conditions_of
+from processing.geometry.placement import vip_mm_from_raw
+from processing.image.band_registration import band_placements
+from processing.pipelines.bands import BandPipeline, BandProduct
+from processing.quality.report import Flag, Verdict
+from processing.rig import load_rig
+from tests.daemon.multispectral_data import write_image, xmp
+
+RUN = CliRunner()
+SIZE = (320, 240)
+DEWARP = "2022-04-05;1913.333,1913.333,10.5,-7.25,-0.35,0.15,0.0003,-0.0002,-0.05"
+
+
+@pytest.fixture(scope="module")
+def scene() -> np.ndarray:
+    """Fields of several sizes, with detail for the registration; words of 16 bits."""
+    random = np.random.default_rng(3)
+    grey = sum(
+        cv2.resize(random.normal(0, 1.0, (h, h * 4 // 3)).astype(np.float32), SIZE) * 500
+        for h in (6, 12, 30, 60, 120)
+    )
+    return np.clip(12000 + grey, 4200, 60000).astype(np.uint16)
+
+
+def sequoia(folder: Path, scene, band: str, name: str, capture: str = "C1", **changes) -> None:
+    """Parrot Sequoia: a fisheye in Pix4D's namespace, 10 bits at the top of a word."""
+    wavelength = {"Green": 550, "Red": 660, "Red edge": 735, "NIR": 790}[band]
+    values = {
+        "BandName": band, "CentralWavelength": str(wavelength), "WavelengthFWHM": "40",
+        "ModelType": "fisheye", "PrincipalPoint": "0.61,0.44", "CaptureUUID": capture,
+        "FisheyePolynomial": "0,1,-0.025178575,0.167834214",
+        "FisheyeAffineMatrix": "463.0,0,0,463.0",
+        "SensorModel": "1000.0,60.0,0.1", **changes.pop("tags", {}),
+    }  # fmt: skip
+    values = {key: value for key, value in values.items() if value}
+    more = {"serial": "PS1", "per_mm": 1 / 0.00375, **changes}
+    write_image(folder / name, scene & 0xFFC0, xmp(values), make="Parrot", model="Sequoia", **more)
+
+
+def dji(folder: Path, scene, band: str, name: str, model: str = "M3M", **changes) -> None:
+    """DJI: Brown's model about the optical centre plus an offset, in attributes."""
+    values = {
+        "BandName": band, "CentralWavelength": "560(+/-16)nm", "DewarpData": DEWARP,
+        "CalibratedOpticalCenterX": "160.0", "CalibratedOpticalCenterY": "120.0",
+        "CaptureUUID": "U1", "DroneSerialNumber": "D1", **changes.pop("tags", {}),
+    }  # fmt: skip
+    values = {key: value for key, value in values.items() if value}
+    more = {"black": 4096, "focal_mm": 5.74, **changes}
+    packet = xmp(values, as_attributes=True)
+    write_image(folder / name, scene, packet, make="DJI", model=model, **more)
+
+
+def micasense(folder: Path, scene, band: str, name: str, model: str, serial: str, **changes):
+    values = {
+        "BandName": band, "CentralWavelength": "560", "WavelengthFWHM": "27",
+        "ModelType": "perspective", "PrincipalPoint": "0.6,0.45",
+        "PerspectiveFocalLength": "5.5", "PerspectiveFocalLengthUnits": "mm",
+        "PerspectiveDistortion": "-0.1,0.1,0,0.0002,0.0003", "CaptureId": "cap1",
+        "RadiometricCalibration": "1e-4,1e-7,1e-6", "VignettingCenter": "160,120",
+        "VignettingPolynomial": "0,0,0,0,0,0", **changes.pop("tags", {}),
+    }  # fmt: skip
+    more = {"black": 4800, "per_mm": 1 / 0.00345, **changes}
+    write_image(
+        folder / name, scene & 0xFFF0, xmp(values), make="MicaSense", model=model,
+        serial=serial, **more,
+    )  # fmt: skip
+
+
+def imported(folder: Path, out: Path) -> list[dict]:
+    done = RUN.invoke(app, ["import", "multispectral", str(folder), "--out", str(out), "--json"])
+    assert done.exit_code == 0, done.output + str(done.exception)
+    return json.loads(done.stdout)["cameras"]
+
+
+def refused(folder: Path, out: Path) -> str:
+    with pytest.raises(ImagesError) as error:
+        import_multispectral(folder, out)
+    assert not out.exists()
+    return str(error.value)
+
+
+def ideal(rig, sensor: str, pixels: np.ndarray) -> np.ndarray:
+    """Ideal points of raw pixels, x right, y down, in units of the focal length."""
+    placement = band_placements(rig, {})[sensor]
+    return vip_mm_from_raw(placement, pixels) / rig.cone("G").lens.f_mm * [1, -1]
+
+
+def processed(path: Path, number: int) -> BandProduct:
+    mission = Mission.open(path)
+    rig = load_rig(mission.rig_path)
+    frames, exposure = load_level0(mission.level0(number), rig)
+    conditions = conditions_of(exposure, rig, PlanSection.model_validate({}), Flag(0))
+    radiance = radiance_of(rig, mission.path / "radiometry")
+    return BandPipeline(rig, radiance).process(frames, conditions)
+
+
+PIXELS = np.stack(np.meshgrid(np.linspace(0, 319, 9), np.linspace(0, 239, 7)), -1).reshape(-1, 2)
+
+
+def test_a_sequoia_with_its_fisheye_becomes_a_mission_that_is_processed(scene, tmp_path) -> None:
+    for band, code in (("Green", "GRE"), ("Red", "RED"), ("Red edge", "REG"), ("NIR", "NIR")):
+        sequoia(tmp_path / "in", scene, band, f"IMG_0000_{code}.TIF")
+        sequoia(tmp_path / "in", scene, band, f"IMG_0001_{code}.TIF", capture="C2")
+    (camera,) = imported(tmp_path / "in", tmp_path / "out")
+    assert (camera["camera"], camera["serial"]) == ("Parrot Sequoia", "PS1")
+    assert (camera["exposures"], camera["frames"], camera["missing"]) == (2, 8, [])
+    assert "radiometric tags are not read" in camera["notes"][0]
+    assert "no BlackLevel is stated" in camera["notes"][1]
+    assert max(camera["lens_fit_px"].values()) < 0.1
+    rig = load_rig(tmp_path / "out/rig.toml")
+    assert {c.bands[0]: c.wavelengths_nm for c in rig.cones} == {
+        "green": (550.0,), "red": (660.0,), "red_edge": (735.0,), "nir": (790.0,)
+    }  # fmt: skip
+    assert all((s.bits, s.justified) == (10, "left") for s in rig.sensors)
+    # Pix4D's formula, solved here for the angle of each pixel by bisection.
+    away = PIXELS - np.array([0.61, 0.44]) / 0.00375
+    rho = np.hypot(*away.T) / 463.0
+    low, high = np.zeros(len(rho)), np.ones(len(rho))
+    for _ in range(60):
+        middle = (low + high) / 2
+        value = middle - 0.025178575 * middle**2 + 0.167834214 * middle**3
+        low, high = np.where(value < rho, middle, low), np.where(value < rho, high, middle)
+    r = np.tan(low * np.pi / 2)
+    expected = away / np.hypot(*away.T)[:, None] * r[:, None]
+    assert np.abs(ideal(rig, "N", PIXELS) - expected).max() * 295 < 0.1
+    product = processed(tmp_path / "out", 1)
+    assert {b.band for b in product.registrations if b.registered} == {"red", "red_edge", "nir"}
+    assert set(product.units.values()) == {"DN"}
+
+
+@pytest.mark.parametrize(
+    ("model", "bands"),
+    [("FC6360", ("Blue", "Green", "Red", "RedEdge", "NIR")), ("M3M", ("Green", "Red", "NIR"))],
+)
+def test_images_of_dji_are_placed_as_opencv_does(scene, tmp_path, model, bands) -> None:
+    for number, band in enumerate(bands):
+        dji(tmp_path / "in", scene, band, f"DJI_00{number}.TIF", model)
+    (camera,) = imported(tmp_path / "in", tmp_path / "out")
+    assert (camera["camera"], camera["serial"], camera["exposures"]) == (f"DJI {model}", "D1", 1)
+    missing = ["exposure 1 has no frame of E"] if model == "M3M" else []
+    assert camera["missing"] == missing, "a Mavic 3 M has a red edge band, this folder has none"
+    rig = load_rig(tmp_path / "out/rig.toml")
+    sensor = rig.sensor("N")
+    assert (sensor.black_dn, sensor.bits, sensor.pitch_um) == (4096.0, 16, pytest.approx(3.0))
+    matrix = np.array([[1913.333, 0, 170.5], [0, 1913.333, 112.75], [0, 0, 1.0]])
+    terms = np.array([-0.35, 0.15, 0.0003, -0.0002, -0.05])
+    criteria = (cv2.TERM_CRITERIA_COUNT, 100, 0.0)
+    expected = cv2.undistortPoints(PIXELS[:, None], matrix, terms, criteria=criteria)[:, 0]
+    assert np.abs(ideal(rig, "N", PIXELS) - expected).max() * 1913 < 0.05
+    exposure = Mission.open(tmp_path / "out").level0(1) / "exposure.json"
+    state = json.loads(exposure.read_text())["state"]
+    assert state == ("degraded" if missing else "complete")
+
+
+def test_two_cameras_in_one_folder_are_two_missions(scene, tmp_path) -> None:
+    """A Dual: both cameras write the same capture into one folder."""
+    red = ("Blue", "Green", "Red", "NIR", "Red edge")
+    blue = ("Blue-444", "Green-531", "Red-650", "Red edge-705", "Red edge-740")
+    for number, band in enumerate(red, 1):
+        name = f"IMG_0000_{number}.tif"
+        micasense(tmp_path / "in", scene, band, name, "RedEdge-M", "RX02-1")
+    for number, band in enumerate(blue, 6):
+        name = f"IMG_0000_{number}.tif"
+        micasense(tmp_path / "in", scene, band, name, "RedEdge-M", "RX02-2")
+    cameras = imported(tmp_path / "in", tmp_path / "out")
+    assert [(c["serial"], c["exposures"], c["frames"]) for c in cameras] == [
+        ("RX02-1", 1, 5), ("RX02-2", 1, 5)
+    ]  # fmt: skip
+    bands = [
+        [c.bands[0] for c in load_rig(Path(camera["mission"]) / "rig.toml").cones]
+        for camera in cameras
+    ]
+    assert sorted(bands[0]) == ["blue", "green", "nir", "red", "red_edge"]
+    assert bands[1] == ["blue", "green", "red", "red_edge", "red_edge_2"]
+
+
+def test_bands_of_another_size_are_left_out_by_name(scene, tmp_path) -> None:
+    for number, band in enumerate(("Blue", "Green", "Red", "NIR", "Red edge", "LWIR"), 1):
+        name = f"IMG_0000_{number}.tif"
+        pixels = scene if band != "LWIR" else scene[:120, :160]
+        micasense(tmp_path / "in", pixels, band, name, "Altum", "AL05-1")
+    micasense(tmp_path / "in", scene, "Panchro", "IMG_0000_7.tif", "Altum", "AL05-1")
+    (camera,) = imported(tmp_path / "in", tmp_path / "out")
+    assert camera["frames"] == 5 and camera["notes"] == [
+        "band LWIR is not processed: 1 images are left out",
+        "band Panchro is not processed: 1 images are left out",
+    ]
+
+
+def test_a_group_with_one_of_five_bands_is_degraded_and_not_usable(scene, tmp_path) -> None:
+    for number, band in enumerate(("Blue", "Green", "Red", "NIR", "Red edge"), 1):
+        micasense(tmp_path / "in", scene, band, f"IMG_0000_{number}.tif", "RedEdge-M", "R1")
+    other = {"tags": {"CaptureId": "cap2"}}
+    micasense(tmp_path / "in", scene, "Green", "IMG_0001_2.tif", "RedEdge-M", "R1", **other)
+    (camera,) = imported(tmp_path / "in", tmp_path / "out")
+    assert camera["missing"] == [f"exposure 2 has no frame of {s}" for s in ("B", "R", "N", "E")]
+    exposure = json.loads((tmp_path / "out/L0/000002/exposure.json").read_text())
+    assert exposure["state"] == "degraded"
+    report = processed(tmp_path / "out", 2).report
+    assert report.verdict is Verdict.REFLY and Flag.FRAME_MISSING in report.flags
+    assert any("Only 20% of the image holds data" in one.sentence for one in report.findings)
+    assert processed(tmp_path / "out", 1).report.verdict is Verdict.GOOD
+
+
+def test_a_group_without_one_of_five_bands_stays_usable(scene, tmp_path) -> None:
+    for number, band in enumerate(("Blue", "Green", "Red", "Red edge"), 1):
+        micasense(tmp_path / "in", scene, band, f"IMG_0000_{number}.tif", "RedEdge-M", "R1")
+    imported(tmp_path / "in", tmp_path / "out")
+    assert processed(tmp_path / "out", 1).report.verdict is Verdict.USABLE
+
+
+def test_captures_without_a_name_are_grouped_by_time(scene, tmp_path) -> None:
+    """Two of one second apart, whose files are not in the order of time."""
+    nameless = {"CaptureUUID": ""}
+    for second, first in ((9, 10), (11, 0)):
+        for number, band in enumerate(("Green", "Red", "RedEdge", "NIR")):
+            dji(
+                tmp_path / "in", scene, band, f"DJI_{first + number:04d}.TIF", tags=nameless,
+                taken=f"2024:05:06 07:08:{second:02d}", subsec=str(10 + number),
+            )  # fmt: skip
+    (camera,) = imported(tmp_path / "in", tmp_path / "out")
+    assert (camera["exposures"], camera["frames"], camera["missing"]) == (2, 8, [])
+    dji(tmp_path / "in", scene, "NIR", "DJI_0099.TIF", tags=nameless, taken="")
+    sentence = refused(tmp_path / "in", tmp_path / "other")
+    assert "DJI_0099.TIF: neither CaptureId, CaptureUUID nor DateTimeOriginal" in sentence
+
+
+def test_an_unknown_camera_is_refused_with_what_is_missing(scene, tmp_path) -> None:
+    write_image(
+        tmp_path / "in/a.tif", scene, xmp({"CentralWavelength": "550"}), make="Acme", model="Six",
+        time_s=None, focal_mm=None,
+    )  # fmt: skip
+    assert refused(tmp_path / "in", tmp_path / "out") == (
+        "a.tif: Acme Six: has no BandName in XMP, no lens: ModelType with its parameters, or "
+        "DewarpData in XMP, no ExposureTime in EXIF, no FocalPlaneXResolution in EXIF"
+    )
+    sequoia(tmp_path / "two", scene, "Red", "b.tif", tags={"FisheyeAffineMatrix": ""})
+    sentence = refused(tmp_path / "two", tmp_path / "out")
+    assert sentence == "b.tif: Parrot Sequoia: has no FisheyeAffineMatrix in XMP"
+    micasense(tmp_path / "three", scene, "Mauve", "c.tif", "RedEdge-M", "R1")
+    assert "band 'mauve'; known are blue" in refused(tmp_path / "three", tmp_path / "out")
+
+
+def test_a_camera_that_is_not_known_by_name_is_taken_and_this_is_stated(scene, tmp_path) -> None:
+    """Pix4D's tags: a focal length without a unit is in millimetres."""
+    values = {
+        "ModelType": "perspective", "PrincipalPoint": "0.48,0.36", "PerspectiveFocalLength": "4.5",
+        "PerspectiveDistortion": "-0.1,0.1,0,0.0002,0.0003", "CaptureUUID": "U1",
+    }  # fmt: skip
+    for band in ("Green", "NIR"):
+        packet = xmp(values | {"BandName": band})
+        write_image(
+            tmp_path / f"in/{band}.tif", scene, packet, make="Acme", model="Two", per_mm=1 / 0.003
+        )
+    (camera,) = imported(tmp_path / "in", tmp_path / "out")
+    assert camera["notes"][-1].startswith("Acme Two is not a known camera: bands that are not")
+    rig = load_rig(tmp_path / "out/rig.toml")
+    assert rig.cone("G").lens.f_mm == pytest.approx(4.5)
+    assert [c.bands[0] for c in rig.cones] == ["green", "nir"]
+
+
+@pytest.mark.parametrize(
+    ("tags", "sentence"),
+    [
+        ({"FisheyePolynomial": "0,-1,0,0"}, "begins with 0 and a positive number"),
+        ({"FisheyePolynomial": "0,1,0,-9"}, "folds the frame over"),
+        ({"FisheyePolynomial": "0,1,nan"}, "finite number"),
+        ({"FisheyePolynomial": ",".join(["0"] * 50)}, "50 values"),
+        ({"FisheyeAffineMatrix": "1,2,3"}, "3 values; 4 are needed"),
+        ({"ModelType": "cylindrical"}, "ModelType is 'cylindrical'"),
+    ],
+)
+def test_a_fisheye_that_cannot_be_one_is_refused(scene, tmp_path, tags, sentence) -> None:
+    sequoia(tmp_path / "in", scene, "Green", "a.tif", tags=tags)
+    assert sentence in refused(tmp_path / "in", tmp_path / "out")
+
+
+@pytest.mark.parametrize("dewarp", ["2022;1,2,3", "2022;0,0,0,0,0,0,0,0,0", "x;a,b,c,d,e,f,g,h,i"])
+def test_a_damaged_dewarp_is_refused(scene, tmp_path, dewarp) -> None:
+    dji(tmp_path / "in", scene, "Green", "a.tif", tags={"DewarpData": dewarp})
+    assert "a.tif: not a usable image" in refused(tmp_path / "in", tmp_path / "out")
+
+
+def test_two_calibrations_of_one_serial_number_are_refused(scene, tmp_path) -> None:
+    dji(tmp_path / "in", scene, "Green", "a.tif")
+    other = {"DewarpData": DEWARP.replace("10.5", "11.5"), "CaptureUUID": "U2"}
+    dji(tmp_path / "in", scene, "Green", "b.tif", tags=other)
+    sentence = refused(tmp_path / "in", tmp_path / "out")
+    assert "b.tif: another camera or calibration than a.tif" in sentence
+
+
+def test_the_words_are_those_of_the_file(scene, tmp_path) -> None:
+    dji(tmp_path / "in", scene, "Green", "a.tif")
+    dji(tmp_path / "in", scene, "NIR", "b.tif")
+    imported(tmp_path / "in", tmp_path / "out")
+    assert np.array_equal(tifffile.imread(tmp_path / "out/L0/000001/N.tif"), scene)
