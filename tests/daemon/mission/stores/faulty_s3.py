@@ -96,7 +96,7 @@ class FaultyApplication:
         if fault == "lost answer":
             list(self._application(environ, lambda *_arguments: None))
             return _refuse(start_response, "500")
-        answer = self._application(environ, start_response)
+        answer: Iterable[bytes] = self._application(environ, start_response)
         if fault == "truncated":
             content = b"".join(answer)
             return [content[: len(content) // 2]]
@@ -105,8 +105,8 @@ class FaultyApplication:
 
 def _body(environ: dict[str, Any]) -> bytes:
     if environ.get("CONTENT_LENGTH"):
-        return environ["wsgi.input"].read(int(environ["CONTENT_LENGTH"]))
-    return environ["wsgi.input"].read() if environ.get("wsgi.input_terminated") else b""
+        return bytes(environ["wsgi.input"].read(int(environ["CONTENT_LENGTH"])))
+    return bytes(environ["wsgi.input"].read()) if environ.get("wsgi.input_terminated") else b""
 
 
 def _refuse(start_response: Any, status: str) -> list[bytes]:
