@@ -224,7 +224,8 @@ class DeviceEvent:
     """A change of state or a fault of a device.
 
     `name` is a stable kebab-case word ("opened", "lost", "timeout", "checksum", "held-by-another").
-    `sentence` is for the operator and ends with the remedy.
+    `sentence` is for the operator and ends with the remedy. `settings` of "opened" are what the
+    driver wrote or switched off, with the value that the device holds; a truth value is 0 or 1.
     """
 
     device: str
@@ -232,6 +233,7 @@ class DeviceEvent:
     is_fault: bool
     sentence: str
     mono_ns: int
+    settings: Mapping[str, float | int | str] = field(default_factory=dict)
 
 
 Record = (

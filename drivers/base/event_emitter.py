@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Final
 
 from drivers.contract import DeviceEvent, Sink
@@ -20,17 +21,26 @@ class EventEmitter:
         self._emitted_ns: dict[str, int] = {}
         self.sink: Sink | None = None
 
-    def emit(self, event: str, sentence: str, *, fault: bool = False) -> None:
+    def emit(
+        self,
+        event: str,
+        sentence: str,
+        *,
+        fault: bool = False,
+        settings: Mapping[str, float | int | str] | None = None,
+    ) -> None:
         """Report a change of state; without effect while there is no sink.
 
         Args:
             event: name of the event, a stable kebab-case word.
             sentence: what happened and the remedy, for the operator.
             fault: whether it is a fault.
+            settings: what the device holds, by name; for an opening.
         """
         if self.sink is not None:
             now_ns = self._clock.mono_ns()
-            self.sink(DeviceEvent(self._device, event, fault, sentence, now_ns))
+            held = {} if settings is None else dict(settings)
+            self.sink(DeviceEvent(self._device, event, fault, sentence, now_ns, held))
 
     def emit_throttled(self, event: str, sentence: str) -> None:
         """Report a fault that may occur with every message, at most once in ten seconds.

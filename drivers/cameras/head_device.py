@@ -83,8 +83,12 @@ class HeadDevice(DeviceDriver):
     def _opened_sentence(self) -> str:
         return f"The head {self.name} is open; nothing to do."
 
+    def _held_settings(self) -> Mapping[str, float | int | str]:
+        """What the driver wrote or switched off, with the value that the head holds."""
+        return {}
+
     def _emit_opened(self) -> None:
-        self.emitter.emit("opened", self._opened_sentence())
+        self.emitter.emit("opened", self._opened_sentence(), settings=self._held_settings())
 
     # Used by drivers
 

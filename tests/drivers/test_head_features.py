@@ -13,6 +13,7 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
+from daemon.mission.log.log_records import message_of, record_of
 from drivers.cameras.aravis.aravis_head import AravisHead
 from drivers.cameras.aravis.formats import usual_format
 from drivers.cameras.aravis.presets import preset_features, preset_names
@@ -247,9 +248,13 @@ def test_what_was_written_and_switched_off_is_in_the_record_of_the_mission() -> 
         with running(driver) as records:
             pass
         (opened,) = (r for r in records if isinstance(r, DeviceEvent) and r.name == "opened")
-        for held in ("ExposureAuto = Off", "ReverseX = False", "BlackLevel = 17", "OffsetX = 0"):
-            assert held in found
-            assert held in opened.sentence
+        assert opened.sentence.endswith("; nothing to do.")
+        for name, held in (("ExposureAuto", "Off"), ("ReverseX", 0), ("BlackLevel", 17)):
+            assert f"{name} = {held}" in found
+            assert opened.settings[name] == held
+        assert opened.settings["ExposureTime"] == pytest.approx(1000.0, rel=0.05)
+        logged = record_of(message_of(opened))
+        assert logged == opened
 
 
 THERMOMETER = """

@@ -172,7 +172,7 @@ def test_a_hikrobot_head_is_armed_with_its_strobe_and_sends_the_pattern() -> Non
         for held in (
             "LineMode = Strobe",
             "LineSource = ExposureStartActive",
-            "StrobeEnable = True",
+            "StrobeEnable = 1",
         ):
             assert held in found
         assert emulated.registers.symbolic_or("LineSelector", "") == "Line1"

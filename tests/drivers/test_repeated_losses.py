@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import select
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -116,7 +116,7 @@ class FakeAravisHead(AravisHead):
         self._session = cast(Any, SimpleNamespace(is_lost=False, camera=self))
         return self._session
 
-    holds = "nothing"
+    held: Mapping[str, float | int | str] = {"ExposureAuto": "Off"}
 
     def start(self) -> None:
         if self.refusals:

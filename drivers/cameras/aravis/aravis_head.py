@@ -134,7 +134,7 @@ class AravisHead(AravisSettings, HeadDevice):
             if session.camera.link_mbps is None
             else f"{session.camera.link_mbps:g} Mbit/s",
             "chunks": ", ".join(session.camera.chunks) or f"no: {session.camera.chunks_missing}",
-            "features": session.camera.holds,
+            "features": ", ".join(f"{k} = {v}" for k, v in session.camera.held.items()),
             "clock": "no" if session.latch is None else f"+-{session.latch.sigma_ns / 1e3:.0f} us",
             "temperature": ""
             if session.temperature_c is None
@@ -264,10 +264,12 @@ class AravisHead(AravisSettings, HeadDevice):
             self._open()
 
     def _opened_sentence(self) -> str:
-        """Names what the driver wrote, so that the log of a mission holds it at every opening."""
-        sentence = f"The head {self.name} is open at {self.address}; nothing to do."
+        return f"The head {self.name} is open at {self.address}; nothing to do."
+
+    def _held_settings(self) -> Mapping[str, float | int | str]:
+        """So that the log of a mission holds them at every opening."""
         session = self._session
-        return sentence if session is None else f"{sentence} It holds {session.camera.holds}."
+        return {} if session is None else session.camera.held
 
     def _event_for(self, error: DeviceError) -> str:
         return "held-by-another" if isinstance(error, ControlDeniedError) else "lost"

@@ -162,10 +162,15 @@ class AravisCamera:
         return bool(camera.is_gv_device() and not camera.get_device().is_controller())
 
     @property
-    def holds(self) -> str:
-        """Every feature the driver wrote or switched off, with the value the head holds."""
-        held = {**self._configuration.written, **self._pacing}
-        return ", ".join(f"{name} = {value}" for name, value in held.items())
+    def held(self) -> Mapping[str, float | int | str]:
+        """Every feature the driver wrote or switched off, with the value the head holds.
+
+        Those of a frame as well: format, size, exposure time, gain and packet size. A truth value
+        is 0 or 1.
+        """
+        written = {**self._configuration.written, **self._pacing}
+        numbers = {k: int(v) if isinstance(v, bool) else v for k, v in written.items()}
+        return {**numbers, **self.frame_settings}
 
     def start(self) -> None:
         """Start acquisition; raises the error of Aravis."""

@@ -210,6 +210,10 @@ class V4l2Head(V4l2Settings, HeadDevice):
     def _opened_sentence(self) -> str:
         return f"The head {self.name} is open at {self.device}; nothing to do."
 
+    def _held_settings(self) -> Mapping[str, float | int | str]:
+        session = self._session
+        return {} if session is None else session.settings
+
     def _serve(self, sink: Sink) -> None:
         session = self._session
         if session is None:
