@@ -168,6 +168,9 @@ def test_degraded_with_many_faults(cockpit: Cockpit) -> None:
         )
         cockpit.emit(flight_events.device_event(f"SU{number % 13:02d}", name, sentence, fault=True))
     cockpit.emit({"event": "disk", "sentence": "The disk is low: room for 40 exposures, 1 min."})
+    area = {"columns": 40, "rows": 26, "gaps": {"pan": [[30, 0, 40, 26]]}}
+    report = {"verdict": "good", "flags": [], "findings": [], "figures": {}, "valid_area": area}
+    cockpit.emit({"event": "judged", "number": 9, "report": report})
     cockpit.status("flying", triggers=9, left=40)
     cockpit.until("document.querySelectorAll('#faults > li').length > 20")
     for lamp, state in (
@@ -178,6 +181,21 @@ def test_degraded_with_many_faults(cockpit: Cockpit) -> None:
     ):
         cockpit.until(f"document.querySelector('#lamp-{lamp}').classList.contains('{state}')")
     assert cockpit.browser.evaluate("document.body.dataset.sounding") == "warning"
+    # The right quarter of exposure 9 has no data, and that is hatched where it is.
+    cockpit.until("document.querySelectorAll('#map path.no-data').length === 1")
+    hatched, image = cockpit.browser.evaluate(
+        "[document.querySelector('#map path.no-data'),"
+        " [...document.querySelectorAll('#map .placed')]"
+        ".sort((a, b) => a.getBoundingClientRect().top - b.getBoundingClientRect().top)[0]]"
+        ".map((one) => one.getBoundingClientRect()).map((one) => [one.left, one.top, one.right,"
+        " one.bottom])"
+    )
+    width = image[2] - image[0]
+    assert hatched[0] == pytest.approx(image[0] + 0.75 * width, abs=3.0)
+    assert hatched[1:] == pytest.approx(image[1:], abs=3.0)
+    assert "no-data-hatch" in cockpit.browser.evaluate(
+        "getComputedStyle(document.querySelector('#map path.no-data')).fill"
+    )
     # 38 m to the right of a line with a limit of 25 m.
     check(cockpit, "degraded", east_deg=0.0005)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 
 import pytest
@@ -166,6 +167,21 @@ def test_numbers_of_older_exposures_are_packed(
     page: tuple[Service, Browser], expression: str, expected: object
 ) -> None:
     assert page[1].evaluate(OLDER.format(expression)) == expected
+
+
+def test_parts_without_data_lie_where_the_pixels_would(page: tuple[Service, Browser]) -> None:
+    """Row 0 is the top of the image; corners are lower left, lower right and so on."""
+    footprint = [[10.0, 0.0], [10.0, 8.0], [14.0, 8.0], [14.0, 0.0]]  # latitude, longitude
+    area = {"columns": 8, "rows": 4, "gaps": {"pan": [[6, 0, 8, 1]], "red": [[0, 3, 1, 4]]}}
+    rings = page[1].evaluate(
+        "import('/map_no_data.js').then(({noDataRings}) => ["
+        f"noDataRings({json.dumps(footprint)}, {json.dumps(area)}),"
+        f"noDataRings({json.dumps(footprint)}, {{share: 0.9, rings: []}}),"
+        f"noDataRings(null, {json.dumps(area)}), noDataRings({json.dumps(footprint)}, undefined)])"
+    )
+    top_right = [[14, 6], [14, 8], [13, 8], [13, 6]]
+    lower_left = [[11, 0], [11, 1], [10, 1], [10, 0]]
+    assert rings == [[top_right, lower_left], [], [], []]
 
 
 def test_exposures_beyond_the_snapshot_keep_footprint_and_verdict(

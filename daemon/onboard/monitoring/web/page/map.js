@@ -5,6 +5,7 @@ import { onGuidance } from "./guidance.js";
 import { startLayers } from "./map_layers.js";
 import { OlderLayer } from "./map_older.js";
 import { isMeasuring, startMeasuring } from "./map_measure.js";
+import { startNoData } from "./map_no_data.js";
 
 const COLOURS = { good: "--good", usable: "--caution", refly: "--warning", lost: "--warning" };
 const DASHES = { good: null, usable: "6 3", refly: "2 4", lost: "1 7" };
@@ -193,6 +194,7 @@ function frame() {
 export function start(root, feed) {
   startLayers(map, feed);
   startMeasuring(map);
+  startNoData(map, feed);
   onGuidance((frame) => {
     if (frame.latitude_deg == null) return;
     marker.setLatLng([frame.latitude_deg, frame.longitude_deg]).addTo(map);
