@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -11,10 +10,21 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.progress import Progress
 
+from daemon.cli.batch_options import (
+    Processes,
+    Scheduler,
+    Threads,
+    TlsCa,
+    TlsCertificate,
+    TlsKey,
+    cluster_executor,
+    executor_for,
+    process_plan,
+    shown_progress,
+)
 from daemon.cli.exit_status import exit_if_failed
 from daemon.cli.options import AsJson
 from daemon.configuration.model import ConfigurationError
-from daemon.mission.exposure_batch import for_each_exposure
 from daemon.mission.layout import Mission
 from daemon.mission.store.publication import sweep
 from daemon.terminal.console import Console, light_table
@@ -30,6 +40,8 @@ computed again from all of them in each run. Earlier images of an exposure are r
 An exposure that cannot be pansharpened is listed at the end with its cause and excluded from the
 tone curve. The others are processed.
 
+Exposures are computed by as many processes as cores and memory allow, or by a cluster.
+
 Examples: `syntopic pansharpen MISSION`, `syntopic pansharpen MISSION --only 3 --image cir --bits 8`
 """
 
@@ -43,44 +55,52 @@ def pansharpen(
     bits: Annotated[
         list[int] | None, typer.Option(help="Bits per sample: 16 or 8; repeatable.")
     ] = None,
-    threads: Annotated[int, typer.Option(help="Number of threads.", min=1)] = 2,
+    threads: Threads = None,
+    processes: Processes = None,
+    scheduler: Scheduler = None,
+    tls_ca: TlsCa = None,
+    tls_certificate: TlsCertificate = None,
+    tls_key: TlsKey = None,
     as_json: AsJson = False,
 ) -> None:
-    import cv2
-
+    from daemon.postflight.batch.batch_run import run_batch
+    from daemon.postflight.batch.executor import BatchTask
+    from daemon.postflight.batch.pansharpen_work import PansharpenWork
     from daemon.products import level3
     from processing.rig import load_rig
 
     images, depths = image or list(level3.IMAGES), bits or list(level3.DEPTHS)
     if set(images) - set(level3.IMAGES) or set(depths) - set(level3.DEPTHS):
         raise ConfigurationError(["--image is rgb or cir, --bits is 16 or 8"])
-    cv2.setNumThreads(threads)
+    cluster = None
+    if scheduler is not None:
+        cluster = cluster_executor(scheduler, tls_ca, tls_certificate, tls_key, processes)
     folder = Mission.open(mission)
     rig = load_rig(folder.rig_path)
-    with folder.held(), Progress(console=Console(stderr=True), transient=True) as progress:
+    with folder.held():
         sweep(level3.level3_root(folder))
-        task = progress.add_task("histograms", total=None)
-        tones, unreadable = level3.mission_tones(
-            folder, rig, lambda _, done, total: progress.update(task, completed=done, total=total)
-        )
-
-        def develop_one(number: int) -> tuple[level3.PansharpenedExposure, float]:
-            started = time.monotonic()
-            done = level3.pansharpen(
-                folder, rig, number, tones, images=images, depths=depths, threads=threads
+        with Progress(console=Console(stderr=True), transient=True) as progress:
+            task = progress.add_task("histograms", total=None)
+            tones, unreadable = level3.mission_tones(
+                folder,
+                rig,
+                lambda _, done, total: progress.update(task, completed=done, total=total),
             )
-            return done, time.monotonic() - started
-
         unreadable_numbers = {failure.exposure for failure in unreadable}
-        numbers = [
-            number for number in only or sorted(tones.scales) if number not in unreadable_numbers
-        ]
-        progress.update(task, description="developing", total=len(numbers), completed=0)
-        walked = for_each_exposure(
-            numbers, develop_one, lambda count: progress.update(task, completed=count)
-        )
-    rows = list(walked.results.values())
-    failures = (*unreadable, *walked.failures)
+        requested = dict.fromkeys(only or sorted(tones.scales))
+        numbers = [number for number in requested if number not in unreadable_numbers]
+        work = PansharpenWork(folder.path.absolute(), tones, tuple(images), tuple(depths))
+        placed = process_plan(work.memory_nbytes, len(numbers), processes, threads)
+        executor, own_threads = executor_for(placed, processes), placed.threads
+        if cluster is not None:
+            executor, own_threads = cluster, threads or 1
+        with shown_progress("pansharpening", len(numbers), 0) as show:
+            outcome = run_batch(
+                executor, work.with_threads(own_threads), [BatchTask(n) for n in numbers], show
+            )
+    walked = outcome.results
+    rows = [walked[number] for number in sorted(walked)]
+    failures = (*unreadable, *outcome.failures)
     if as_json:
         content = {
             "mission": str(folder.path),
@@ -100,6 +120,8 @@ def pansharpen(
         typer.echo(json.dumps(content))
     else:
         _print_table(rows, level3.level3_root(folder))
+    if outcome.is_interrupted:
+        raise KeyboardInterrupt
     exit_if_failed(failures)
 
 

@@ -11,14 +11,22 @@ from rich.progress import Progress
 from rich.table import Table
 from rich.text import Text
 
+from daemon.cli.batch_options import (
+    Scheduler,
+    TlsCa,
+    TlsCertificate,
+    TlsKey,
+    cluster_executor,
+)
 from daemon.cli.exit_status import status_of
 from daemon.cli.options import AsJson
 from daemon.cli.transfer import folder_of
+from daemon.configuration.model import ConfigurationError
 from daemon.terminal.console import Console
 from drivers.base.extras import require
 
 if TYPE_CHECKING:
-    from daemon.mission.verification.verification import VerifyReport
+    from daemon.mission.verification.verification import CheckAll, VerifyReport
 
 HELP = """Check a mission folder against its hashes and list files without a hash.
 
@@ -26,21 +34,36 @@ Files without a hash do not change the exit status. A mission may be verified wh
 
 A mission that `syntopic transfer` copied to an object store is read there, each object once.
 
+With --processes or --scheduler, exposures of a mission folder are compared by processes of this
+machine or by a cluster.
+
 Examples: `syntopic verify flights/demo/missions/20261121T101500Z-ultracam-x-mini`,
 `syntopic verify s3://survey/2026/20261121T101500Z-ultracam-x-mini`
 """
+HashProcesses = Annotated[
+    int | None,
+    typer.Option(help="Number of processes (default: threads of this process).", min=1, max=1024),
+]
 SHOWN = 5
 """So many names of files that are not covered are printed for each reason; --json has all."""
 
 
 def verify(
     mission: Annotated[str, typer.Argument(help="Mission folder, or its address in a store.")],
+    processes: HashProcesses = None,
+    scheduler: Scheduler = None,
+    tls_ca: TlsCa = None,
+    tls_certificate: TlsCertificate = None,
+    tls_key: TlsKey = None,
     as_json: AsJson = False,
 ) -> None:
     from daemon.mission.layout import Mission
     from daemon.mission.store import store
     from daemon.mission.transfer.object_store import ObjectStore, is_store_url
     from daemon.mission.transfer.store_verification import verify_in_store
+    from daemon.mission.verification.verification import check_in_threads
+    from daemon.postflight.batch.local_processes import LocalProcessExecutor
+    from daemon.postflight.batch.verification_work import verified_by
 
     with Progress(console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("verifying", total=None)
@@ -50,10 +73,21 @@ def verify(
 
         if is_store_url(mission):
             require("stores")
+            if processes is not None or scheduler is not None:
+                raise ConfigurationError(
+                    ["--processes and --scheduler are for mission folders; leave them out"]
+                )
             report = verify_in_store(ObjectStore(mission), show)
         else:
             folder = Mission.open(folder_of(mission), checks_subfolders=False)
-            report = store.verify(folder, show)
+            check_all: CheckAll = check_in_threads
+            if scheduler is not None:
+                check_all = verified_by(
+                    cluster_executor(scheduler, tls_ca, tls_certificate, tls_key, processes)
+                )
+            elif processes is not None:
+                check_all = verified_by(LocalProcessExecutor(processes))
+            report = store.verify(folder, show, check_all)
     if as_json:
         typer.echo(json.dumps(asdict(report)))
     else:

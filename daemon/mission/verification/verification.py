@@ -12,7 +12,7 @@ from __future__ import annotations
 import os
 import sqlite3
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -38,6 +38,7 @@ from daemon.mission.verification.verified_exposure import (
 )
 
 Progress = Callable[[int, int], None]
+CheckAll = Callable[[Sequence[ExpectedExposure], Callable[[int], None]], list[FoundExposure]]
 
 STATES = {
     "flown": "being flown, or its service was killed and it was not continued yet",
@@ -76,7 +77,25 @@ class VerifyReport:
         return not self.problems
 
 
-def verify(mission: Mission, progress: Progress = lambda done, total: None) -> VerifyReport:
+def check_in_threads(
+    expected: Sequence[ExpectedExposure], step: Callable[[int], None]
+) -> list[FoundExposure]:
+    """Compare exposures in this process.
+
+    Args:
+        expected: of each exposure.
+        step: called with the number of bytes read.
+    """
+    # Hashing lets go of the interpreter, so that threads are enough to use every core.
+    with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
+        return list(pool.map(lambda one: check_exposure(one, step), expected))
+
+
+def verify(
+    mission: Mission,
+    progress: Progress = lambda done, total: None,
+    check_all: CheckAll = check_in_threads,
+) -> VerifyReport:
     """Check everything in a mission folder.
 
     A mission laid out by hand has no index and no chain; there only hashes that are given count.
@@ -84,13 +103,14 @@ def verify(mission: Mission, progress: Progress = lambda done, total: None) -> V
     Args:
         mission: it may be flown at the same time.
         progress: called with bytes done and bytes in total.
+        check_all: compares exposures, in this process or elsewhere.
     """
-    return _Verification(mission, progress).run()
+    return _Verification(mission, progress, check_all).run()
 
 
 class _Verification:
-    def __init__(self, mission: Mission, progress: Progress) -> None:
-        self.mission = mission
+    def __init__(self, mission: Mission, progress: Progress, check_all: CheckAll) -> None:
+        self.mission, self._check_all = mission, check_all
         self.problems: list[str] = []
         self.remarks: list[str] = []
         self.not_covered: dict[str, str] = {}
@@ -246,9 +266,7 @@ class _Verification:
             )
             for number in numbers
         ]
-        # Hashing lets go of the interpreter, so that threads are enough to use every core.
-        with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
-            found = list(pool.map(lambda one: check_exposure(one, self.step), expected))
+        found = self._check_all(expected, self.step)
         for one in found:
             self.problems += one.problems
             for (what, by), names in one.covered.items():

@@ -119,7 +119,9 @@ def test_options_are_applied_and_an_earlier_result_is_replaced(mission):
 
 
 def test_the_command_pansharpens_the_entire_mission_and_refuses_unknown_options(mission):
-    done = CliRunner().invoke(app, ["pansharpen", str(mission.path), "--bits", "8", "--json"])
+    done = CliRunner().invoke(
+        app, ["pansharpen", str(mission.path), "--bits", "8", "--json", "--processes", "0"]
+    )
     assert done.exit_code == 0, done.output
     output = json.loads(done.stdout)
     assert [row["exposure"] for row in output["exposures"]] == [1, 2, 3]
@@ -127,6 +129,17 @@ def test_the_command_pansharpens_the_entire_mission_and_refuses_unknown_options(
     with pytest.raises(ConfigurationError, match="--image is rgb or cir"):
         CliRunner().invoke(app, ["pansharpen", str(mission.path), "--image", "x"],
                            catch_exceptions=False)  # fmt: skip
+
+
+@pytest.mark.trust
+def test_processes_write_the_same_bytes(mission):
+    command = ["pansharpen", str(mission.path), "--bits", "8", "--json"]
+    hashes = []
+    for count in ("0", "2"):
+        done = CliRunner().invoke(app, [*command, "--processes", count])
+        assert done.exit_code == 0, done.output
+        hashes.append([path.read_bytes() for path in sorted(mission.path.rglob("L3/*/*.tif"))])
+    assert hashes[0] == hashes[1] and len(hashes[0]) == 6
 
 
 def test_a_missing_band_is_reported_and_leaves_out_its_images(mission):
@@ -169,7 +182,9 @@ def test_missing_or_damaged_level_2_is_reported_with_its_cure(mission):
 )
 def test_the_command_goes_on_after_an_exposure_it_cannot_develop(mission, damage, cause):
     damage(mission)
-    done = CliRunner().invoke(app, ["pansharpen", str(mission.path), "--bits", "8", "--json"])
+    done = CliRunner().invoke(
+        app, ["pansharpen", str(mission.path), "--bits", "8", "--json", "--processes", "0"]
+    )
     assert done.exit_code == 1
     output = json.loads(done.stdout)
     assert [row["exposure"] for row in output["exposures"]] == [2, 3]

@@ -51,7 +51,7 @@ def stitched(tmp_path_factory) -> FlownBlock:
     assert rgb in text
     text = text.replace(rgb, rgb + "\nwavelengths_nm = [640.0, 550.0, 470.0]")
     (folder / "rig.toml").write_text(text)
-    done = RUN.invoke(app, ["pansharpen", str(folder)])
+    done = RUN.invoke(app, ["pansharpen", str(folder), "--processes", "0"])
     assert done.exit_code == 0, done.output
     return flown
 
