@@ -24,6 +24,7 @@ from daemon.products.product_files import FramesRead, ProductFiles
 from daemon.products.stitched_image import build_stitched
 from processing.pipelines.bands import BAND_THRESHOLDS, BandPipeline, BandPipelineSettings
 from processing.pipelines.exposure_pipeline import ExposurePipeline
+from processing.pipelines.kernel_compilation import compile_missing
 from processing.pipelines.perspective import HeadPipeline, HeadSettings, has_head_images
 from processing.pipelines.stitched import Conditions, Pipeline, PipelineSettings
 from processing.quality.report import Thresholds
@@ -50,6 +51,8 @@ class Processor:
         return self.pipeline.rig
 
     def warm_up(self) -> None:
+        """Load every kernel; another process compiles those that are not in the cache."""
+        compile_missing()
         self.pipeline.warm_up()
 
     def clone(self) -> Processor:

@@ -14,9 +14,10 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
+from processing.image.compiled_kernel import compiled_kernel
 from processing.image.lattice import OUTSIDE
 from processing.image.resampling import WEIGHT_STEP_PX
 
@@ -299,7 +300,7 @@ def _log_gains(names: Sequence[str], pairs: Sequence[PairBalance]) -> Array:
     return np.asarray(solution)
 
 
-@njit(cache=True, parallel=True, nogil=True)
+@compiled_kernel(parallel=True)
 def _node_means(frames, valid, lattices, cell, out):
     count, rows, columns = out.shape
     nodes = cell // WEIGHT_STEP_PX
@@ -344,7 +345,7 @@ def _node_means(frames, valid, lattices, cell, out):
                     out[s, i, j] = _block_mean(frames[s], valid[s], places[s, j])
 
 
-@njit(cache=True, nogil=True)
+@compiled_kernel()
 def _block_mean(frame, valid, corner):
     """Mean of a block within the usable area; `UNUSABLE` where a pixel is saturated or a hole."""
     column, row = corner[0], corner[1]
@@ -371,7 +372,7 @@ def _block_mean(frame, valid, corner):
     return UNUSABLE if unusable or pixels == 0 else total / pixels
 
 
-@njit(cache=True, nogil=True)
+@compiled_kernel()
 def _whole_block_mean(frame, row, column):
     """As `_block_mean` where all pixels of the block are usable: counts known to the compiler."""
     total = np.int32(0)

@@ -16,9 +16,9 @@ from __future__ import annotations
 from typing import Any, Final
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from processing.image.compiled_kernel import compiled_kernel
 from processing.image.taps import (
     LINE_LENGTH,
     MISSING,
@@ -49,13 +49,13 @@ MAX_CELL_PX: Final = 64
 """Side of the largest cell: its taps fit into a scratch row."""
 
 
-@njit(cache=True, nogil=True)
+@compiled_kernel()
 def _columns(samples):
     """Raw columns that so many samples take, in whole vectors."""
     return (samples + _EXTRA + _VECTOR_WIDTH - 1) // _VECTOR_WIDTH * _VECTOR_WIDTH
 
 
-@njit(cache=True, nogil=True)
+@compiled_kernel()
 def _run_length(phase, step, slack, most):
     """How many pixels a run goes on, from a phase in 0..1 until it leaves by more than `slack`."""
     if step > 0.0:
@@ -67,7 +67,7 @@ def _run_length(phase, step, slack, most):
     return most if margin_px >= most else max(min(most, np.int64(margin_px) + 1), 1)
 
 
-@njit(cache=True, fastmath=True, nogil=True)
+@compiled_kernel(fastmath=True)
 def _fetch_points(frame, table, reach, c0, dc, r0, dr, values, flags, y, first, last):
     """Pixel by pixel: whatever is far from the identity."""
     for k in range(first, last):
@@ -91,7 +91,7 @@ def _fetch_points(frame, table, reach, c0, dc, r0, dr, values, flags, y, first, 
         flags[y, k] = np.uint8(full & np.uint16(1)) | np.uint8(np.uint8(least == 0) << np.uint8(1))
 
 
-@njit(cache=True, nogil=True)
+@compiled_kernel()
 def _base(one, other, slack):
     """Whole pixel that the taps of a run from one place to another lie around, and if all do."""
     least = min(one, other)
@@ -103,7 +103,7 @@ def _base(one, other, slack):
     return np.int64(np.floor(least)), False
 
 
-@njit(cache=True, fastmath=True, nogil=True)
+@compiled_kernel(fastmath=True)
 def _fetch_row(
     flat, width, rows, table, reach, slack, c0, dc, r0, dr, values, flags, y, span, line, spare
 ):
@@ -166,7 +166,7 @@ def _fetch_row(
         done += count
 
 
-@njit(cache=True, nogil=True)
+@compiled_kernel()
 def _corners(lattice, band, column, cell):
     """Raw (column, row) at the left end of a cell's first and last row, and their change per pixel.
 
@@ -188,7 +188,7 @@ def _corners(lattice, band, column, cell):
     )
 
 
-@njit(cache=True, nogil=True)
+@compiled_kernel()
 def _row_of(corners, f):
     """Column, row and their change per pixel of the cell's row at a share `f` of its height."""
     return (
@@ -199,7 +199,7 @@ def _row_of(corners, f):
     )
 
 
-@njit(cache=True, nogil=True)
+@compiled_kernel()
 def _bounds(corners, cell):
     """Least and most raw column, least and most raw row of a cell."""
     c1 = corners[0] + corners[2] * cell
@@ -214,13 +214,13 @@ def _bounds(corners, cell):
     )
 
 
-@njit(cache=True, nogil=True)
+@compiled_kernel()
 def _is_near_identity(corners):
     across = max(abs(corners[2] - 1.0), abs(corners[6] - 1.0))
     return max(across, max(abs(corners[3]), abs(corners[7]))) < _IDENTITY_TOLERANCE
 
 
-@njit(cache=True, nogil=True)
+@compiled_kernel()
 def straight_taps(frame, valid, lattice, band, column, cell, reach, unclean):
     """Whether a cell's taps are one rectangle of raw pixels, and none of them marred.
 
@@ -276,7 +276,7 @@ def straight_taps(frame, valid, lattice, band, column, cell, reach, unclean):
     return left, top
 
 
-@njit(cache=True, fastmath=True, nogil=True)
+@compiled_kernel(fastmath=True)
 def fetch_straight(
     frame,
     lattice,
@@ -356,14 +356,14 @@ def fetch_straight(
         values_strip(lines, phases[1], steps[1], table, gain, offset, out, y0, x0, rows, n)
 
 
-@njit(cache=True, nogil=True)
+@compiled_kernel()
 def _inside(valid, c0, dc, r0, dr, k):
     c = c0 + dc * k
     r = r0 + dr * k
     return valid[0] <= c <= valid[1] and valid[2] <= r <= valid[3]
 
 
-@njit(cache=True, fastmath=True, nogil=True)
+@compiled_kernel(fastmath=True)
 def fetch_cell(
     frame, valid, lattice, band, column, cell, rows, n, table, reach, line, spare, values, flags
 ):

@@ -10,8 +10,10 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
+
+from processing.image.compiled_kernel import compiled_kernel
 
 Array = NDArray[Any]
 
@@ -87,7 +89,7 @@ def means_of_sums(by_row: Array, by_column: Array, first_row: int) -> LineMeans:
     return means
 
 
-@njit(cache=True, nogil=True)
+@compiled_kernel()
 def _divide_sums(by_row, by_column, share, means_by_row, means_by_column):
     rows, bundles = by_row.shape
     for first in range(0, rows, _TILE_ROWS):
@@ -101,7 +103,7 @@ def _divide_sums(by_row, by_column, share, means_by_row, means_by_column):
             means[c] = np.float32(sums[c]) * share
 
 
-@njit(cache=True, parallel=True, nogil=True)
+@compiled_kernel(parallel=True)
 def _sum_lines(frame, by_row, by_column):
     height = len(frame)
     blocks = len(by_column)
@@ -113,7 +115,7 @@ def _sum_lines(frame, by_row, by_column):
             add_line(frame[r], r - first, by_row[r], by_column[block])
 
 
-@njit(cache=True, nogil=True)
+@compiled_kernel()
 def add_line(line, row_of_block, of_row, by_column):
     """Sum the bundles of one line, and add it to those of the columns.
 
@@ -137,7 +139,7 @@ def add_line(line, row_of_block, of_row, by_column):
             by_column[c] += line[c]
 
 
-@njit(cache=True, nogil=True)
+@compiled_kernel()
 def add_pixels(frame, places, first_row, sign, by_row, by_column):
     """Add some pixels to the sums of bundles, or subtract them.
 

@@ -9,8 +9,10 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
+
+from processing.image.compiled_kernel import compiled_kernel
 
 Array = NDArray[Any]
 
@@ -99,7 +101,7 @@ _TINT: Final = (np.linspace(0.0, 2.0, 1025) ** 0.8).astype(np.float32)
 """What a band's share of the mean makes of its brightness, at 1 / 512."""
 
 
-@njit(cache=True, parallel=True, nogil=True)
+@compiled_kernel(parallel=True)
 def _paint(
     grey, low, span, red, green, blue, rows, columns, whites, coloured, light, tint, picture
 ):
@@ -126,13 +128,13 @@ def _paint(
             picture[i, j, 2] = _tinted(bright, b / mean, tint)
 
 
-@njit(cache=True, nogil=True)
+@compiled_kernel()
 def _tinted(bright, share, tint):
     within = min(max(share, np.float32(0.25)), np.float32(2.0))
     return np.uint8(min(bright * tint[np.int64(within * np.float32(512.0))], np.float32(255.0)))
 
 
-@njit(cache=True, parallel=True, nogil=True)
+@compiled_kernel(parallel=True)
 def _block_means(image, factor, step, out):
     """Means of the pixels that hold data in every `step`-th row of factor x factor blocks; 0 where
     none does."""

@@ -14,11 +14,12 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
 from processing.geometry.placement import SensorPlacement
 from processing.image.cells import MAX_CELL_PX, fetch_cell, fetch_straight, straight_taps
+from processing.image.compiled_kernel import compiled_kernel
 from processing.image.kernels import KERNELS, Interpolation
 from processing.image.lattice import OUTSIDE
 from processing.image.taps import LINE_LENGTH, MISSING
@@ -117,7 +118,7 @@ def usable_area(placement: SensorPlacement, rows: tuple[int, int]) -> Sequence[f
     )
 
 
-@njit(cache=True, fastmath=True, nogil=True)
+@compiled_kernel(fastmath=True)
 def _weights_along(weights, y, x0, n, line):
     """Weights of n pixels of a target row, bilinear between their nodes."""
     i = y // WEIGHT_STEP_PX
@@ -132,7 +133,7 @@ def _weights_along(weights, y, x0, n, line):
             line[first + d] = left + step * np.float32(np.int32(d))
 
 
-@njit(cache=True, fastmath=True, nogil=True)
+@compiled_kernel(fastmath=True)
 def _add_share(
     weights, y0, x0, rows, n, name, gain, offset, values, flags, line, total, weight, best, mark
 ):
@@ -161,7 +162,7 @@ def _add_share(
             highest[k] = w if leads else highest[k]
 
 
-@njit(cache=True, fastmath=True, nogil=True)
+@compiled_kernel(fastmath=True)
 def _finish_single(values, flags, gain, offset, name, out, source, y0, x0, rows, n):
     """Write a cell that one frame fills alone."""
     rise = offset + np.float32(0.5)
@@ -179,7 +180,7 @@ def _finish_single(values, flags, gain, offset, name, out, source, y0, x0, rows,
             source_index[k] = seen if there else np.uint8(0)
 
 
-@njit(cache=True, nogil=True)
+@compiled_kernel()
 def _serving(lattices, weights, band, column, nodes, chosen):
     """Indices of the frames with weight in a cell; returns how many."""
     found = 0
@@ -201,7 +202,7 @@ def _serving(lattices, weights, band, column, nodes, chosen):
     return found
 
 
-@njit(cache=True, fastmath={"contract", "nnan", "ninf", "nsz"}, nogil=True)
+@compiled_kernel(fastmath={"contract", "nnan", "ninf", "nsz"})
 def _finish_blend(total, weight, mark, out, source, y0, x0, rows, n):
     """Write a cell that several frames share, or none fills.
 
@@ -224,7 +225,7 @@ def _finish_blend(total, weight, mark, out, source, y0, x0, rows, n):
             source_index[k] = np.uint8(marks[k]) if there else np.uint8(0)
 
 
-@njit(cache=True, nogil=True)
+@compiled_kernel()
 def _mixed_cell(
     frames,
     valid,
@@ -303,7 +304,7 @@ def _mixed_cell(
         _finish_blend(total, weight, mark, out, source, y0, x0, rows, n)
 
 
-@njit(cache=True, parallel=True, fastmath=True, nogil=True)
+@compiled_kernel(parallel=True, fastmath=True)
 def _resample(
     frames, valid, lattices, cell, weights, gains, offsets, table, reach, out, source, unclean
 ):

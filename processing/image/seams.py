@@ -14,10 +14,11 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
 from processing.image.balance import NOT_COVERED, UNUSABLE, covered_box
+from processing.image.compiled_kernel import compiled_kernel
 from processing.image.resampling import WEIGHT_STEP_PX, WEIGHT_UNIT
 
 Array = NDArray[Any]
@@ -255,7 +256,7 @@ def _eroded(mask: Array, margin: int) -> Array:
     return inner
 
 
-@njit(cache=True, nogil=True)
+@compiled_kernel()
 def _cheapest_path(cost, step_cost):
     """One position per row, neighbours differing by one at most, of least total cost."""
     rows, positions = cost.shape
@@ -284,7 +285,7 @@ def _cheapest_path(cost, step_cost):
     return path
 
 
-@njit(cache=True, parallel=True, nogil=True)
+@compiled_kernel(parallel=True)
 def _feather(labels, kernel, out):
     rows, columns = labels.shape
     reach = kernel.shape[0] // 2
@@ -308,7 +309,7 @@ def _feather(labels, kernel, out):
                 out[s, i, j] = np.uint8(np.float32(WEIGHT_UNIT) * shares[s] + np.float32(0.5))
 
 
-@njit(cache=True, nogil=True)
+@compiled_kernel()
 def _mixed_along(labels, i, reach):
     """Where in a row of nodes several frames own nodes within reach; (columns,) uint8."""
     rows, columns = labels.shape

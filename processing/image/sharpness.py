@@ -6,9 +6,10 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
+from processing.image.compiled_kernel import compiled_kernel
 from processing.matching.prefetch import fetch_ahead
 from processing.radiometry.level1 import level1_counts_per_dn
 from processing.rig import Sensor
@@ -99,7 +100,7 @@ def _share(sensor: Sensor, sums: Array, counts: float) -> float | None:
     return (near - noise) / (far - noise)
 
 
-@njit(cache=True, parallel=True, nogil=True, fastmath={"reassoc", "contract"})
+@compiled_kernel(parallel=True, fastmath={"reassoc", "contract"})
 def _difference_sums(frame, left, end, pace, sums):
     """Sums of squared differences to the next pixel and to the one after it, of signal, of pixels.
 

@@ -10,8 +10,8 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numba import njit
 
+from processing.image.compiled_kernel import compiled_kernel
 from processing.image.kernels import MARGIN, PHASES
 
 SATURATED: Final = 1
@@ -27,7 +27,7 @@ _VECTOR_WIDTH: Final = 8
 """Words of a vector."""
 
 
-@njit(cache=True, fastmath=True, nogil=True, inline="always")
+@compiled_kernel(fastmath=True, inline="always")
 def weights_at(table, phase):
     """Find the row of a table next to a phase.
 
@@ -44,7 +44,7 @@ def weights_at(table, phase):
     return row + np.int32(MARGIN), (steps - np.float32(row)) / np.float32(PHASES)
 
 
-@njit(cache=True, nogil=True)
+@compiled_kernel()
 def _piece(span, n):
     """How many of n pixels weights go in one straight line, in whole vectors."""
     if span <= _SPAN:
@@ -53,18 +53,18 @@ def _piece(span, n):
     return min(n, (n + pieces * _VECTOR_WIDTH - 1) // (pieces * _VECTOR_WIDTH) * _VECTOR_WIDTH)
 
 
-@njit(cache=True, fastmath=True, nogil=True, inline="always")
+@compiled_kernel(fastmath=True, inline="always")
 def _spread(t):
     """A row of the table as scalars: six weights, six slopes."""
     return (t[0], t[1], t[2], t[3], t[4], t[5]), (t[6], t[7], t[8], t[9], t[10], t[11])
 
 
-@njit(cache=True, fastmath=True, nogil=True, inline="always")
+@compiled_kernel(fastmath=True, inline="always")
 def _sum6(w, a, b, c, d, e, f):
     return w[0] * a + w[1] * b + w[2] * c + w[3] * d + w[4] * e + w[5] * f
 
 
-@njit(cache=True, fastmath=True, nogil=True)
+@compiled_kernel(fastmath=True)
 def _down(flat, start, width, first, step, table, line, n):
     row, beyond = weights_at(table, first + np.float32(0.5) * step * np.float32(np.int32(n - 1)))
     begin = beyond - np.float32(0.5) * step * np.float32(np.int32(n - 1))
@@ -86,7 +86,7 @@ def _down(flat, start, width, first, step, table, line, n):
         line[j] = _sum6(w, b0, b1, b2, b3, b4, b5) + x * _sum6(s, b0, b1, b2, b3, b4, b5)
 
 
-@njit(cache=True, fastmath=True, nogil=True)
+@compiled_kernel(fastmath=True)
 def down(flat, start, width, first, step, table, line, n):
     """Interpolate n columns across six raw rows; phases are first + step * j.
 
@@ -106,7 +106,7 @@ def down(flat, start, width, first, step, table, line, n):
         _down(flat, start + done, width, at, step, table, line[done:], min(piece, n - done))
 
 
-@njit(cache=True, fastmath=True, nogil=True)
+@compiled_kernel(fastmath=True)
 def middle_and_span(phases, steps, rows, n):
     """Middle of the phases of some rows of n pixels, and how far they spread around it.
 
@@ -129,7 +129,7 @@ def middle_and_span(phases, steps, rows, n):
     return np.float32(0.5) * (least + most), most - least
 
 
-@njit(cache=True, fastmath=True, nogil=True)
+@compiled_kernel(fastmath=True)
 def down_strip(flat, start, width, phases, steps, table, lines, rows, n, wide):
     """As `down` for target rows whose taps lie one raw row apart, with one row of the table.
 
@@ -191,7 +191,7 @@ def down_strip(flat, start, width, phases, steps, table, lines, rows, n, wide):
         down(flat, start + y * width, width, phases[y], steps[y], table, line, n)
 
 
-@njit(cache=True, fastmath=True, nogil=True)
+@compiled_kernel(fastmath=True)
 def _along(a, first, step, table, out, n):
     row, beyond = weights_at(table, first + np.float32(0.5) * step * np.float32(np.int32(n - 1)))
     begin = beyond - np.float32(0.5) * step * np.float32(np.int32(n - 1))
@@ -203,7 +203,7 @@ def _along(a, first, step, table, out, n):
         )
 
 
-@njit(cache=True, fastmath=True, nogil=True)
+@compiled_kernel(fastmath=True)
 def along(line, first, step, table, out, n):
     """Interpolate n values along a scratch row; phases are first + step * k, taps from k on.
 
@@ -222,7 +222,7 @@ def along(line, first, step, table, out, n):
         _along(line[done : done + count + 5], at, step, table, out[done : done + count], count)
 
 
-@njit(cache=True, fastmath=True, nogil=True)
+@compiled_kernel(fastmath=True)
 def values_strip(lines, phases, steps, table, gain, offset, out, y0, x0, rows, n):
     """As `along` row by row, times gain plus offset, rounded to words that are signal, 1 to 65535.
 
@@ -266,7 +266,7 @@ def values_strip(lines, phases, steps, table, gain, offset, out, y0, x0, rows, n
             target[k] = np.uint16(np.int32(v))
 
 
-@njit(cache=True, nogil=True)
+@compiled_kernel()
 def is_clean(flat, start, width, rows, columns):
     """Whether a box of raw words holds neither saturated pixels nor holes.
 
@@ -290,7 +290,7 @@ def is_clean(flat, start, width, rows, columns):
     return least != 0 and (odd_bits & np.uint16(1)) == 0
 
 
-@njit(cache=True, nogil=True)
+@compiled_kernel()
 def flags_along(flat, start, width, reach, spare, out, n):
     """Flags of n pixels whose four nearest raw pixels begin at `start` and move along that row.
 

@@ -8,8 +8,9 @@ from __future__ import annotations
 from typing import Any, Final
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from processing.image.compiled_kernel import compiled_kernel
 
 Array = NDArray[Any]
 
@@ -21,7 +22,7 @@ _TAPS: Final = 8
 """Pixels of the template that are taken at once."""
 
 
-@njit(cache=True)
+@compiled_kernel()
 def correlation_scratch(side: int, search: int) -> tuple[Array, Array, Array, Array, Array]:
     """Memory for `correlate`.
 
@@ -44,7 +45,7 @@ def correlation_scratch(side: int, search: int) -> tuple[Array, Array, Array, Ar
     )
 
 
-@njit(cache=True, fastmath=True)
+@compiled_kernel(fastmath=True)
 def correlate(
     a: Array,
     b: Array,
@@ -119,7 +120,7 @@ def correlate(
                 squares[j] += coming * coming - leaving * leaving
 
 
-@njit(cache=True, fastmath=True)
+@compiled_kernel(fastmath=True)
 def _products(flat: Array, first: int, wide: int, template: Array, products: Array) -> None:
     """Sums of template times window for all offsets, the first window beginning at word `first`.
 
@@ -143,7 +144,7 @@ def _products(flat: Array, first: int, wide: int, template: Array, products: Arr
                     _add_taps(source, taps, products[k], vector_count)
 
 
-@njit(cache=True, fastmath=True, inline="always")
+@compiled_kernel(fastmath=True, inline="always")
 def _add_taps(s: Array, w: tuple[Any, ...], o: Array, count: int) -> None:
     w0, w1, w2, w3, w4, w5, w6, w7 = w
     for j in range(count):
@@ -159,7 +160,7 @@ def _add_taps(s: Array, w: tuple[Any, ...], o: Array, count: int) -> None:
         )
 
 
-@njit(cache=True)
+@compiled_kernel()
 def peak(surface: Array, reach: Array, found: Array) -> bool:
     """Find the highest coefficient and the next local maximum.
 
@@ -209,7 +210,7 @@ def peak(surface: Array, reach: Array, found: Array) -> bool:
     return True
 
 
-@njit(cache=True)
+@compiled_kernel()
 def _vertex(before: float, at: float, after: float) -> float:
     curvature = before - 2.0 * at + after
     if curvature >= 0.0:

@@ -10,8 +10,10 @@ from __future__ import annotations
 from typing import Any, Final
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
+
+from processing.image.compiled_kernel import compiled_kernel
 
 Array = NDArray[Any]
 
@@ -21,7 +23,7 @@ _MATHEMATICS: Final = {"contract", "reassoc"}
 """Not a number must stay one: it marks what cannot be used."""
 
 
-@njit(cache=True, parallel=True, nogil=True)
+@compiled_kernel(parallel=True)
 def select_features(
     frame: Array, cells: Array, half_window: int, stride: int, is_uint16: bool
 ) -> Array:
@@ -85,7 +87,7 @@ def select_features(
     return result
 
 
-@njit(cache=True, nogil=True)
+@compiled_kernel()
 def _load(frame, row, column, stride, rows, columns, sides, heres, uppers):
     """Samples of a cell, their left and their upper neighbours, and those of the next samples."""
     two = 2 // stride
@@ -109,7 +111,7 @@ def _load(frame, row, column, stride, rows, columns, sides, heres, uppers):
             target[c] = target[columns - 1]
 
 
-@njit(cache=True, fastmath=_MATHEMATICS, nogil=True)
+@compiled_kernel(fastmath=_MATHEMATICS)
 def _products(sides, heres, uppers, two, wide, n, is_uint16, planes):
     """Products of the gradients xx, xy, yy, and where they cannot be used; whether that is any.
 
@@ -152,7 +154,7 @@ def _products(sides, heres, uppers, two, wide, n, is_uint16, planes):
     return True
 
 
-@njit(cache=True, fastmath=_MATHEMATICS, nogil=True)
+@compiled_kernel(fastmath=_MATHEMATICS)
 def _box_sums(plane, wide, n, reach, spare):
     """Each sample becomes the sum of the reach x reach ones right of it and below, in place."""
     along = n - reach + 1
@@ -174,7 +176,7 @@ def _box_sums(plane, wide, n, reach, spare):
             total[p] += part[p]
 
 
-@njit(cache=True, fastmath=_MATHEMATICS, nogil=True)
+@compiled_kernel(fastmath=_MATHEMATICS)
 def _best(planes, wide, rows, columns):
     """The largest smaller eigenvalue among whole windows, -1 where there is none, and its place."""
     n = (rows - 1) * wide + columns

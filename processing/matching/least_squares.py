@@ -19,9 +19,9 @@ from __future__ import annotations
 from typing import Any, Final
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from processing.image.compiled_kernel import compiled_kernel
 from processing.matching.sampling import (
     INTERPOLATION,
     PATCH_SLACK,
@@ -40,7 +40,7 @@ _CONVERGED_PX: Final = 0.004
 _MAX_SHIFT_PX: Final = 1.2
 
 
-@njit(cache=True)
+@compiled_kernel()
 def refinement_scratch(side: int) -> tuple[Array, Array, Array, Array, Array]:
     """Memory for `refine`.
 
@@ -60,7 +60,7 @@ def refinement_scratch(side: int) -> tuple[Array, Array, Array, Array, Array]:
     )
 
 
-@njit(cache=True, fastmath=True)
+@compiled_kernel(fastmath=True)
 def _centre(values: Array, side: int, stride: int) -> float:
     """Take the mean away; returns the sum of squares that is left."""
     mean = np.float32(0.0)
@@ -73,7 +73,7 @@ def _centre(values: Array, side: int, stride: int) -> float:
     return float(_dot(values, values))
 
 
-@njit(cache=True, fastmath=True)
+@compiled_kernel(fastmath=True)
 def _dot(a: Array, b: Array) -> float:
     total = np.float32(0.0)
     for p in range(a.shape[0]):
@@ -81,7 +81,7 @@ def _dot(a: Array, b: Array) -> float:
     return float(total)
 
 
-@njit(cache=True, fastmath=True)
+@compiled_kernel(fastmath=True)
 def _orthogonalise(values: Array, direction: Array, square: float) -> None:
     """Leave what is orthogonal to a direction, whose sum of squares is given."""
     share = np.float32(_dot(values, direction) / max(square, 1e-12))
@@ -89,7 +89,7 @@ def _orthogonalise(values: Array, direction: Array, square: float) -> None:
         values[p] -= share * direction[p]
 
 
-@njit(cache=True, fastmath=True)
+@compiled_kernel(fastmath=True)
 def _spread(
     jacobian: Array, w: Array, side: int, stride: int, spare: tuple[Array, Array], out: Array
 ) -> None:
@@ -122,7 +122,7 @@ def _spread(
             out[p] += weight * source[p]
 
 
-@njit(cache=True, fastmath=True)
+@compiled_kernel(fastmath=True)
 def refine(
     patches: tuple[Array, Array],
     widths: tuple[int, int],

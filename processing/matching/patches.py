@@ -10,9 +10,10 @@ from __future__ import annotations
 from typing import Any, Final
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
+from processing.image.compiled_kernel import compiled_kernel
 from processing.matching.correlation import (
     MARGIN_PX,
     correlate,
@@ -38,7 +39,7 @@ _AGREEMENT_PX: Final = 0.5
 """How far from its prediction least squares may find a point that is not searched."""
 
 
-@njit(cache=True)
+@compiled_kernel()
 def _load(frame: Array, col: int, row: int, ratio: int, is_uint16: bool, patch: Array) -> bool:
     """Fill a patch with box means of ratio x ratio pixels, the first box beginning at (col, row).
 
@@ -84,7 +85,7 @@ def _load(frame: Array, col: int, row: int, ratio: int, is_uint16: bool, patch: 
     return True
 
 
-@njit(cache=True)
+@compiled_kernel()
 def _load_row(source: Array, origin: Any, line: Array) -> Any:
     """A row of words less the origin; not zero where one is bad."""
     bad = np.int32(0)
@@ -95,7 +96,7 @@ def _load_row(source: Array, origin: Any, line: Array) -> Any:
     return bad
 
 
-@njit(cache=True)
+@compiled_kernel()
 def _load_row_sums(upper: Array, middle: Array, lower: Array, origin: Any, line: Array) -> Any:
     """Sums of three rows of words less the origin; not zero where one is bad."""
     bad = np.int32(0)
@@ -106,7 +107,7 @@ def _load_row_sums(upper: Array, middle: Array, lower: Array, origin: Any, line:
     return bad
 
 
-@njit(cache=True)
+@compiled_kernel()
 def _all_finite(patch: Array) -> bool:
     total = np.float32(0.0)
     for r in range(patch.shape[0]):
@@ -115,7 +116,7 @@ def _all_finite(patch: Array) -> bool:
     return bool(total == 0.0)
 
 
-@njit(cache=True, parallel=True, nogil=True)
+@compiled_kernel(parallel=True)
 def match_patches(
     frame_a: Array,
     frame_b: Array,
@@ -257,7 +258,7 @@ def match_patches(
     return result
 
 
-@njit(cache=True, parallel=True, nogil=True)
+@compiled_kernel(parallel=True)
 def refine_patches(
     frame_a: Array,
     frame_b: Array,
@@ -362,7 +363,7 @@ def refine_patches(
     return result
 
 
-@njit(cache=True)
+@compiled_kernel()
 def _predicted_corners(
     at_a: Array, predicted_b: Array, i: int, ratio: int, margin_px: int
 ) -> tuple[int, int, int, int]:

@@ -8,9 +8,11 @@ from __future__ import annotations
 from typing import Any
 
 from llvmlite import ir
-from numba import njit, types
+from numba import types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
+
+from processing.image.compiled_kernel import compiled_kernel
 
 Array = NDArray[Any]
 
@@ -42,7 +44,7 @@ def _fetch(typing_context: Any, array: Any, row: Any, column: Any) -> Any:
     return types.void(array, types.intp, types.intp), lower
 
 
-@njit(cache=True)
+@compiled_kernel()
 def fetch_ahead(frame: Array, column: int, row: int, columns: int, rows: int) -> None:
     """Begin to bring a box of a frame into the cache; it may lie beyond the frame.
 

@@ -16,8 +16,9 @@ from __future__ import annotations
 from typing import Any, Final
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from processing.image.compiled_kernel import compiled_kernel
 
 Array = NDArray[Any]
 
@@ -60,7 +61,7 @@ INTERPOLATION: Final = _kernel_table()
 """The one table `refine` takes."""
 
 
-@njit(cache=True)
+@compiled_kernel()
 def window_stride(side: int) -> int:
     """Words from row to row of a window: whole vectors of eight; what is beyond `side` is zero.
 
@@ -73,7 +74,7 @@ def window_stride(side: int) -> int:
     return (side + 7) // 8 * 8
 
 
-@njit(cache=True, fastmath=True)
+@compiled_kernel(fastmath=True)
 def _tap_weights(table: Array, order: int, phase: float, out: Array) -> None:
     """Weights of a derivative of that order, between the two nearest phases."""
     at = phase * (table.shape[1] - 1)
@@ -83,7 +84,7 @@ def _tap_weights(table: Array, order: int, phase: float, out: Array) -> None:
         out[k] = table[order, i, k] * (np.float32(1.0) - f) + table[order, i + 1, k] * f
 
 
-@njit(cache=True, fastmath=True, inline="always")
+@compiled_kernel(fastmath=True, inline="always")
 def _row_taps(s: Array, w: tuple[Any, ...], o: Array, count: int) -> None:
     w0, w1, w2, w3, w4, w5, w6, w7 = w
     for c in range(count):
@@ -99,7 +100,7 @@ def _row_taps(s: Array, w: tuple[Any, ...], o: Array, count: int) -> None:
         )
 
 
-@njit(cache=True, fastmath=True)
+@compiled_kernel(fastmath=True)
 def _along_rows(
     source: Array, width: int, first: int, w: Array, out: Array, stride: int, rows: int
 ) -> None:
@@ -118,7 +119,7 @@ def _along_rows(
             _row_taps(s, taps, o, stride)
 
 
-@njit(cache=True, fastmath=True)
+@compiled_kernel(fastmath=True)
 def _along_columns(source: Array, w: Array, out: Array, side: int, stride: int) -> None:
     """Eight taps along the columns; columns beyond `side` become zero."""
     w0, w1, w2, w3, w4, w5, w6, w7 = w[0], w[1], w[2], w[3], w[4], w[5], w[6], w[7]
@@ -145,7 +146,7 @@ def _along_columns(source: Array, w: Array, out: Array, side: int, stride: int) 
     clear_beyond(out, side, stride)
 
 
-@njit(cache=True, fastmath=True)
+@compiled_kernel(fastmath=True)
 def clear_beyond(window: Array, side: int, stride: int) -> None:
     """Set a window's unused words to zero.
 
@@ -159,7 +160,7 @@ def clear_beyond(window: Array, side: int, stride: int) -> None:
             window[c] = np.float32(0.0)
 
 
-@njit(cache=True, fastmath=True)
+@compiled_kernel(fastmath=True)
 def sample_window(
     patch: Array,
     width: int,
@@ -213,7 +214,7 @@ def sample_window(
     return power_x * power_y, 0.5 * (slope_power_x * power_y + slope_power_y * power_x)
 
 
-@njit(cache=True, fastmath=True)
+@compiled_kernel(fastmath=True)
 def add_laplacian(
     patch: Array,
     width: int,

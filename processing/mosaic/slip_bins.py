@@ -10,8 +10,9 @@ import math
 from typing import Any, Final
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from processing.image.compiled_kernel import compiled_kernel
 
 Array = NDArray[Any]
 
@@ -19,7 +20,7 @@ MEDIAN_EFFICIENCY_FACTOR: Final = 1.2533
 """Standard deviation of a median over that of a mean, for normal errors."""
 
 
-@njit(cache=True, nogil=True)
+@compiled_kernel()
 def points_of_frame(
     sensor_a: Array,
     sensor_b: Array,
@@ -60,7 +61,7 @@ def points_of_frame(
     return rows[:count].copy(), raw, own
 
 
-@njit(cache=True, nogil=True)
+@compiled_kernel()
 def order_along(at: Array, size: int) -> Array:
     """Order of points along an axis, equal ones as they are: a stable sort.
 
@@ -97,7 +98,7 @@ def order_along(at: Array, size: int) -> Array:
     return order
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled_kernel(error_model="numpy")
 def bin_residuals(residuals: Array, sigma: Array, per: int) -> tuple[Array, Array, Array, Array]:
     """Medians of residuals in bins, running sums over the bins, and the median of all.
 
@@ -133,7 +134,7 @@ def bin_residuals(residuals: Array, sigma: Array, per: int) -> tuple[Array, Arra
     return medians, sums, weight, level
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled_kernel(error_model="numpy")
 def shifted_runs(sums: Array, weight: Array, level: Array, limit: float) -> Array:
     """The most shifted run of bins of each width whose score is over a limit.
 

@@ -6,9 +6,12 @@ installation a start only loads them.
 
 from __future__ import annotations
 
+import fcntl
 import importlib
+import subprocess
+import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -16,7 +19,15 @@ import numpy as np
 from numba.core.dispatcher import Dispatcher
 
 from processing.pipelines.bands import BandPipeline
-from processing.pipelines.parallel_compilation import Progress, compile_recorded
+from processing.pipelines.parallel_compilation import (
+    COMPILATION_TIMEOUT_S,
+    VARIANTS_FILE,
+    KernelCompilationError,
+    Progress,
+    compile_recorded,
+    missing_variants,
+    recorded_variants,
+)
 from processing.pipelines.perspective import HeadPipeline, has_head_images
 from processing.pipelines.stitched import Pipeline, PipelineSettings
 from processing.pipelines.synthetic_frames import synthetic_radiometry
@@ -84,6 +95,39 @@ def variants() -> dict[str, int]:
     return {name: len(kernel.signatures) for name, kernel in kernels().items()}
 
 
+def compile_missing() -> None:
+    """Let another process compile recorded variants that are not in the cache; this one loads them.
+
+    A process that compiles a kernel itself takes the calls within it to copies of other kernels
+    that later processes, which load it, do not have: its images differ in last bits. Processes that
+    do so at once wait for the first.
+
+    Raises:
+        KernelCompilationError: a kernel could not be compiled.
+    """
+    table = recorded_variants()
+    if not missing_variants(kernels(), table):
+        return
+    with VARIANTS_FILE.open("rb") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # held for COMPILATION_TIMEOUT_S at most
+        missing = missing_variants(kernels(), table)
+        if not missing:
+            return
+        try:
+            done = subprocess.run(
+                [sys.executable, "-m", __name__, *missing],
+                capture_output=True, text=True, timeout=COMPILATION_TIMEOUT_S, check=False,
+            )  # fmt: skip
+        except subprocess.TimeoutExpired:
+            raise KernelCompilationError(
+                f"kernels were not compiled within {COMPILATION_TIMEOUT_S:.0f} s; run: syntopic "
+                "kernels"
+            ) from None
+    if done.returncode != 0:
+        reason = done.stderr.strip() or f"their compiler ended with {done.returncode}"
+        raise KernelCompilationError(reason)
+
+
 def compile_for(
     rig: Rig,
     radiometry: Mapping[str, RadiometricCalibration] | None = None,
@@ -133,3 +177,18 @@ def compile_for(
 
 def _cache_misses() -> int:
     return sum(sum(kernel.stats.cache_misses.values()) for kernel in kernels().values())
+
+
+def main(names: Sequence[str]) -> int:
+    """Compile recorded variants of these kernels that are not in the cache; the exit status."""
+    table = recorded_variants()
+    try:
+        compile_recorded(kernels(), table={name: table[name] for name in names})
+    except KernelCompilationError as error:
+        sys.stderr.write(f"{error}\n")
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -105,6 +105,26 @@ def _is_cached(kernel: Any, arguments: tuple[Any, ...]) -> bool:
     return key in cache._cache_file._load_index()
 
 
+def missing_variants(
+    kernels: Mapping[str, Any], table: Mapping[str, KernelVariants]
+) -> dict[str, KernelVariants]:
+    """Kernels of which the cache does not hold every recorded variant.
+
+    Args:
+        kernels: dispatchers by "module.function".
+        table: the recorded variants.
+
+    Returns:
+        Their entries of the table.
+    """
+    return {
+        name: entry
+        for name, entry in table.items()
+        if name in kernels
+        and not all(_is_cached(kernels[name], argument_types(s)) for s in entry.signatures)
+    }
+
+
 def compile_recorded(
     kernels: Mapping[str, Any],
     *,
@@ -126,13 +146,7 @@ def compile_recorded(
     Raises:
         KernelCompilationError: a kernel could not be compiled, or its process ended.
     """
-    table = recorded_variants() if table is None else table
-    missing = {
-        name: entry
-        for name, entry in table.items()
-        if name in kernels
-        and not all(_is_cached(kernels[name], argument_types(s)) for s in entry.signatures)
-    }
+    missing = missing_variants(kernels, recorded_variants() if table is None else table)
     if not missing:
         return 0
     callees = {name: _callees(kernels, name) & missing.keys() for name in missing}

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
 from processing.geometry.placement import (
@@ -21,6 +21,7 @@ from processing.geometry.placement import (
     vip_mm_from_raw,
 )
 from processing.geometry.topology import exact_colour_ratio
+from processing.image.compiled_kernel import compiled_kernel
 from processing.matching.prefetch import fetch_ahead
 from processing.radiometry.level1 import exposed_rows, level1_counts_per_dn
 from processing.rig import Rig, Sensor
@@ -162,7 +163,7 @@ def _variance(sensor: Sensor, signal: Array) -> Array:
     return variance
 
 
-@njit(cache=True, parallel=True, nogil=True, fastmath={"reassoc", "contract"})
+@compiled_kernel(parallel=True, fastmath={"reassoc", "contract"})
 def _window_sums(frame, corners, step, size, out):
     """Rows of `out`: near, far, curved, fine (each along columns and along rows), the mean, and 1
     where all pixels are good."""

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from typing import Any, Final, Literal
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from processing.image.compiled_kernel import compiled_kernel
 from processing.quality.common_windows import CommonWindows
 from processing.quality.figures.image import LocalBlurFigures
 from processing.rig import Rig
@@ -143,7 +143,7 @@ def _worst_region(
     return float(medians[left, top, axis]), region, _AXES[axis]
 
 
-@njit(cache=True, nogil=True)
+@compiled_kernel()
 def _region_medians(place: Array, deficits: Array) -> Array:
     """Medians (left, top, axis) of finite deficits (n, 2); NaN of fewer than `MIN_WINDOWS`."""
     medians = np.full((CELLS - 1, CELLS - 1, 2), np.nan)
@@ -170,7 +170,7 @@ def _median(values: Array) -> Array:
     return np.asarray(_column_medians(flat).reshape(values.shape[1:]))
 
 
-@njit(cache=True, nogil=True)
+@compiled_kernel()
 def _column_medians(values: Array) -> Array:
     """Medians of the columns (k, n) without NaN; NaN where no value of a column is finite."""
     medians = np.full(values.shape[1], np.nan)

@@ -12,9 +12,9 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from processing.image.compiled_kernel import compiled_kernel
 from processing.image.line_means import LineMeans
 from processing.quality.figures.image import SignalStepFigures
 from processing.quality.ground_steps import Axis, GroundView, LineStep, read_out_frames
@@ -193,7 +193,7 @@ def _usual_change(means: Array) -> tuple[float, float]:
     return middle, _MAD_TO_SIGMA * float(np.median(np.abs(usual - middle)))
 
 
-@njit(cache=True, nogil=True)
+@compiled_kernel()
 def _signs(means: Array) -> tuple[Array, Array]:
     """How many bundles rise and how many fall between each line and the next."""
     bundles, lines = means.shape
@@ -207,7 +207,7 @@ def _signs(means: Array) -> tuple[Array, Array]:
     return rising, falling
 
 
-@njit(cache=True, nogil=True)
+@compiled_kernel()
 def _medians(means: Array, lines: Array) -> Array:
     """Medians over the bundles of the relative change between some lines and the next."""
     bundles = means.shape[0]

@@ -11,9 +11,9 @@ from dataclasses import dataclass, field
 from typing import Any, Final, TypeAlias
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from processing.image.compiled_kernel import compiled_kernel
 from processing.quality.figures.image import ValidAreaFigures
 
 Mask: TypeAlias = NDArray[np.bool_]
@@ -245,7 +245,7 @@ def _is_box(box: object, columns: int, rows: int) -> bool:
     return bool(0 <= left < right <= columns and 0 <= top < bottom <= rows)
 
 
-@njit(cache=True, nogil=True)
+@compiled_kernel()
 def _count_samples(
     raster: NDArray[Any],
     down: NDArray[np.int64],

@@ -8,8 +8,10 @@ from __future__ import annotations
 from typing import Any, Final
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
+
+from processing.image.compiled_kernel import compiled_kernel
 
 Array = NDArray[Any]
 
@@ -49,7 +51,7 @@ def spread_defects(defect: Array, shifts: int, sign: int) -> tuple[Array, Array]
     return mask, np.argwhere(mask).astype(np.int32)
 
 
-@njit(cache=True, parallel=True, nogil=True)
+@compiled_kernel(parallel=True)
 def interpolate_defects(level1, mask, places, period):
     """Fill each defect from the nearest good pixels on both sides, along the least gradient.
 

@@ -12,9 +12,10 @@ from __future__ import annotations
 from typing import Any, Final
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
+from processing.image.compiled_kernel import compiled_kernel
 from processing.radiometry.level1 import LEVEL1_CEILING, LEVEL1_FLOOR
 from processing.rig import Sensor
 
@@ -98,14 +99,14 @@ def _green_taps() -> Array:
 _GREEN_TAPS: Final = _green_taps()
 
 
-@njit(cache=True)
+@compiled_kernel()
 def _saturating_value(value, saturated, floor, ceiling):
     half = int(0.5 * value + 0.5)
     half = min(max(half, floor // 2), ceiling // 2)
     return np.uint16(2 * half + saturated)
 
 
-@njit(cache=True, parallel=True, nogil=True)
+@compiled_kernel(parallel=True)
 def _green(level1, letters, taps, out):
     height, width = level1.shape
     for row in prange(height):
@@ -141,7 +142,7 @@ def _green(level1, letters, taps, out):
             )
 
 
-@njit(cache=True, parallel=True, nogil=True)
+@compiled_kernel(parallel=True)
 def _red_and_blue(level1, letters, out):
     height, width = level1.shape
     green = out[1]

@@ -20,9 +20,10 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
+from processing.image.compiled_kernel import compiled_kernel
 from processing.image.line_means import LineMeans, add_line, add_pixels, line_sums, means_of_sums
 from processing.radiometry.calibration import (
     RadiometricCalibration,
@@ -351,7 +352,7 @@ def exposed_rows(sensor: Sensor, tdi_shifts: int) -> tuple[int, int]:
     return 0, sensor.height_px - 1 - shifts
 
 
-@njit(cache=True, parallel=True, fastmath=_MATHEMATICS, nogil=True)
+@compiled_kernel(parallel=True, fastmath=_MATHEMATICS)
 def _flat_pass(
     raw, offset, factor, full_scale, least, first_row, out, sums, by_row, by_column, unclean
 ):
@@ -393,7 +394,7 @@ def _flat_pass(
         sums[band, 0], sums[band, 1], sums[band, 2] = total, saturated, unread
 
 
-@njit(cache=True, parallel=True, fastmath=_MATHEMATICS, nogil=True)
+@compiled_kernel(parallel=True, fastmath=_MATHEMATICS)
 def _map_pass(
     raw,
     bias,
@@ -479,7 +480,7 @@ def _map_pass(
         sums[band, 0], sums[band, 1], sums[band, 2] = total, saturated, unread
 
 
-@njit(cache=True, nogil=True)
+@compiled_kernel()
 def _unread(line, least):
     """How many of the words compared are below the least one of a pixel that was read out."""
     count = 0

@@ -9,8 +9,9 @@ from __future__ import annotations
 from typing import Any, Final
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from processing.image.compiled_kernel import compiled_kernel
 
 Array = NDArray[Any]
 
@@ -50,7 +51,7 @@ def begin_marks(unclean: Array, height: int, rows: tuple[int, int]) -> None:
         unclean[end // BLOCK_PX :] = 1
 
 
-@njit(cache=True, nogil=True)
+@compiled_kernel()
 def mark_line(line, row, unclean):
     """Mark the blocks in which a line holds saturated pixels.
 
@@ -69,7 +70,7 @@ def mark_line(line, row, unclean):
             unclean[row // BLOCK_PX, j] = np.uint8(1)
 
 
-@njit(cache=True, nogil=True)
+@compiled_kernel()
 def mark_pixels(frame, places, unclean):
     """Mark the blocks of those pixels that are saturated or without data.
 

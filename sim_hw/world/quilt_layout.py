@@ -69,7 +69,7 @@ def arrange(
     return np.asarray(items[:places].reshape(shape))
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, fastmath=False)
 def _cost_at(items, columns, places, right_of, below, own, cells, at):
     """Cost of the patch at a place with its neighbours; none if it is not placed."""
     if at >= places:
@@ -94,7 +94,7 @@ def _cost_at(items, columns, places, right_of, below, own, cells, at):
     return total
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, fastmath=False)
 def _anneal(
     items: Indices,
     columns: int,

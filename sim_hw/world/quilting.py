@@ -195,7 +195,7 @@ def least_error_cut(error: NDArray[np.float32]) -> NDArray[np.int64]:
     return np.asarray(_cut(np.ascontiguousarray(error)))
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, fastmath=False)
 def _cut(error: NDArray[np.float32]) -> NDArray[np.int64]:
     length, width = error.shape
     total = error.astype(np.float64)

@@ -284,7 +284,7 @@ def sample_scene(scene: Scene, band: str, grid: Array, size: tuple[int, int]) ->
 _TABLE = spline.weight_table()
 
 
-@numba.njit(inline="always")
+@numba.njit(inline="always", fastmath=True)
 def _mirrored(index: int, period: int) -> int:
     """Mirrored at 0 and at half the period."""
     index = index % period

@@ -125,6 +125,29 @@ def test_kernels_compile_after_those_they_call_and_only_once(tmp_path: Path) -> 
     assert run() == (0, [])
 
 
+MISSING = """
+from processing.pipelines import kernel_compilation
+from processing.pipelines.parallel_compilation import argument_types, recorded_variants
+all_kernels = kernel_compilation.kernels()
+own = {NAMES}
+kernel_compilation.kernels = lambda: {name: all_kernels[name] for name in own}
+kernel_compilation.compile_missing()
+for name in own:
+    kernel = all_kernels[name]
+    for text in recorded_variants()[name].signatures:
+        kernel.compile(argument_types(text))
+    assert not kernel.stats.cache_misses, name
+    assert kernel.stats.cache_hits, name
+"""
+
+
+def test_a_process_loads_what_another_compiled_for_it(tmp_path: Path) -> None:
+    script = MISSING.replace("{NAMES}", str([ORTHOGONALISE, DOT]))
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    for _ in range(2):
+        subprocess.run([sys.executable, "-c", script], env=environment, timeout=110, check=True)
+
+
 @pytest.mark.parametrize(
     ("signature", "reason"), [("(unicode_type,)", "TypeError"), ("(int64, int64)", "TypingError")]
 )

@@ -57,10 +57,7 @@ def test_only_the_capture_side_of_the_drivers_imports_gi() -> None:
     ("imported", "homes"),
     [
         (r"scipy\.spatial\.transform\b", {"processing/geometry/rotation.py"}),
-        (
-            r"pyproj\b",
-            {"daemon/orientation/geodesy.py", "daemon/onboard/monitoring/maps/hill_shade.py"},
-        ),
+        (r"pyproj\b", {"daemon/orientation/geodesy.py"}),
     ],
 )
 def test_rotations_and_geodesy_have_their_home(imported: str, homes: set[str]) -> None:
@@ -88,9 +85,24 @@ def test_only_kernels_go_without_types() -> None:
         for path in (ROOT / package).rglob("*.py"):
             for node in ast.walk(ast.parse(path.read_text())):
                 if isinstance(node, ast.FunctionDef) and node.returns is None:
-                    assert any("njit" in ast.unparse(d) for d in node.decorator_list), (
+                    decorators = [ast.unparse(one) for one in node.decorator_list]
+                    assert any("njit" in d or "compiled_kernel" in d for d in decorators), (
                         f"{path.relative_to(ROOT)}: {node.name} has no types and is no kernel"
                     )
+
+
+def test_every_kernel_states_its_arithmetic() -> None:
+    """What a kernel does not state, it inherits from whoever compiles it first."""
+    found = 0
+    for package in PACKAGES:
+        for path in (ROOT / package).rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text())):
+                called = ast.unparse(node.func) if isinstance(node, ast.Call) else ""
+                if called.rpartition(".")[2] in {"njit", "jit", "vectorize", "guvectorize"}:
+                    found += 1
+                    keywords = {one.arg for one in node.keywords}
+                    assert "fastmath" in keywords, f"{path.relative_to(ROOT)}:{node.lineno}"
+    assert found
 
 
 def _class_bases(package: str) -> dict[str, tuple[str, ...]]:

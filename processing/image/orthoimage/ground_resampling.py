@@ -14,9 +14,9 @@ from typing import Any, Final
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from processing.image.compiled_kernel import compiled_kernel
 from processing.image.kernels import KERNELS, Interpolation
 from processing.image.orthoimage.ground_grid import GroundSurface
 from processing.image.taps import weights_at
@@ -236,7 +236,7 @@ def _camera_nodes(surface: GroundSurface, pose: ImagePose) -> Array:
     return np.ascontiguousarray(np.concatenate([base, surface.up_m @ pose.rotation], axis=-1))
 
 
-@njit(cache=True, nogil=True, inline="always")
+@compiled_kernel(inline="always")
 def _place(nodes, i, j, step, above, scale, x0, y0):
     """Column and row of ground pixel (i, j); NaN where it is not seen."""
     r, c = i // step, j // step
@@ -256,7 +256,7 @@ def _place(nodes, i, j, step, above, scale, x0, y0):
     return x0 - scale * x / z, y0 + scale * y / z
 
 
-@njit(cache=True, nogil=True)
+@compiled_kernel()
 def _project(nodes, above, step, scale, x0, y0, out):
     for i in range(above.shape[0]):
         for j in range(above.shape[1]):
@@ -265,7 +265,7 @@ def _project(nodes, above, step, scale, x0, y0, out):
             out[1, i, j] = row
 
 
-@njit(cache=True, nogil=True)
+@compiled_kernel()
 def _resample_to_ground(pixels, nodes, above, wanted, step, scale, x0, y0, table, out):
     bands, height, width = pixels.shape
     wx = np.empty(6, np.float32)
