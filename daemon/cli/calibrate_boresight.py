@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated
@@ -22,6 +23,8 @@ without its antenna positions and attitudes. The result is compared with the tra
 required unless `syntopic triangulate` wrote the project. Fly two heights, opposite and crossing
 lines and two speeds. Parameters the flight cannot separate are named and keep their given values.
 The rig (--rig, or the mission's) holds the serial numbers of heads, lenses and probes.
+Heads of the project whose delay, readout time or jitter is free are calibrated with them: fly
+figures of eight.
 
 Writes a dated folder with mount.toml, report.html and calibration.json.
 
@@ -58,6 +61,14 @@ def boresight(
     attitude_sigma: Annotated[
         tuple[float, float, float], typer.Option(help="Standard deviation of attitudes in mdeg.")
     ] = (3.0, 3.0, 7.0),
+    position_correlation: Annotated[
+        float | None,
+        typer.Option(help="Correlation time of position errors in s (default: none).", min=1e-3),
+    ] = None,
+    attitude_correlation: Annotated[
+        float | None,
+        typer.Option(help="Correlation time of attitude errors in s (default: none).", min=1e-3),
+    ] = None,
     previous: Annotated[
         Path | None, typer.Option(help="Folder of the calibration to compare with.")
     ] = None,
@@ -74,9 +85,15 @@ def boresight(
         read_previous,
         serial_warnings,
     )
-    from processing.bundle.adjust import adjust
+    from daemon.postflight.calibration.delay_calibration import (
+        compare_with_delays,
+        delay_quantities,
+        delay_warnings,
+        has_times,
+    )
+    from processing.bundle.adjust import Adjustment, adjust
     from processing.bundle.initial_values import completed
-    from processing.bundle.network import NetworkError
+    from processing.bundle.network import Network, NetworkError
     from processing.bundle.rank_diagnosis import RankDefectError
     from processing.rig import find_rig, load_rig
 
@@ -108,30 +125,54 @@ def boresight(
         )
     if mount is not None:
         section = read_mount(mount)
+    if (position_correlation or attitude_correlation) and inertial.time_s is None:
+        raise flight.BoresightError(
+            f"{path.parent / 'inertial.csv'}: a correlation time needs the column time_s"
+        )
+    inertial = replace(
+        inertial,
+        position_correlation_s=position_correlation,
+        attitude_correlation_s=attitude_correlation,
+    )
+    held = tuple(hold or ())
     try:
         with Progress(console=Console(stderr=True), transient=True) as progress:
             task = progress.add_task("starting values", total=None)
-            adjusted = adjust(
-                completed(flight.control_only(given.network)),
-                given.settings,
-                progress=lambda what, number, value: progress.update(
-                    task, description=f"{what} {number}: {value:.6g}"
-                ),
-            )
+
+            def adjusted(block: Network) -> Adjustment:
+                return adjust(
+                    block,
+                    given.settings,
+                    progress=lambda what, number, value: progress.update(
+                        task, description=f"{what} {number}: {value:.6g}"
+                    ),
+                )
+
+            network = completed(flight.control_only(given.network))
+            if has_times(network):
+                done = compare_with_delays(
+                    network, adjusted, exposures, inertial, section, held=held,
+                    lever_sigma_m=lever_sigma,
+                )  # fmt: skip
+            else:
+                done = flight.compare_boresight(
+                    adjusted(network), exposures, inertial, section, held=held,
+                    lever_sigma_m=lever_sigma,
+                )  # fmt: skip
     except (NetworkError, RankDefectError) as error:
         raise flight.BoresightError(
             f"the images cannot be oriented by their control: {error}"
         ) from error
-    done = flight.compare_boresight(
-        adjusted, exposures, inertial, section, held=tuple(hold or ()), lever_sigma_m=lever_sigma
-    )
     serials = {} if flown_with is None else flown_with.serials
     warnings = [] if before is None else serial_warnings(before, serials)
     if flown_with is None:
         warnings.append("the rig and the serial numbers of its parts are unknown: give --rig")
+    warnings += delay_warnings(done)
+    delays = delay_quantities(done)
     report = flight.report_of(
         done,
         given,
+        delays=delays,
         calibration_id=place.name,
         date=today,
         serials=serials,
@@ -146,9 +187,10 @@ def boresight(
             table.add_row(q.where, q.what, f"{q.value:.6f}", known, q.unit)
         console.print(table)
         console.print(f"sigma0 {done.found.sigma0:.3f}, redundancy {done.found.redundancy}")
+    mount_file = flight.mount_toml(done, date=today, project=given.name, delays=delays)
     publish_calibration(
         report,
         place,
-        files={"mount.toml": flight.mount_toml(done, date=today, project=given.name)},
+        files={"mount.toml": mount_file},
         as_json=as_json,
     )

@@ -20,6 +20,7 @@ from processing.bundle.camera_model import (
     term_derivatives,
 )
 from processing.bundle.curvature_refraction import corrected_rays
+from processing.bundle.exposure_motion import RowMotion, row_motion, time_columns
 from processing.bundle.network import INTERIOR, Network
 from processing.bundle.unknowns import ParameterLayout, ParameterValues
 from processing.geometry.rotation import skew, vectors_from_rotations
@@ -73,6 +74,7 @@ GROUPS = (
     "attitude",
     "distance",
     "prior",
+    "jitter",
 )
 
 
@@ -192,14 +194,18 @@ def _image_rows(
         image, point = measured.image[rows], measured.point[rows]
         station, attitude, head = images.station[image], images.attitude[image], images.head[image]
         object_from_rig = state.attitude[attitude]
+        place = state.station[station]
+        motion = row_motion(network, state, image, measured.xy_mm[rows, 1])
+        if motion is not None:
+            place = place + motion.shift_m
         scale = np.where(network.points.at_infinity[point], 0.0, 1.0)
-        ray = state.points[point] - scale[:, None] * state.station[station]
+        ray = state.points[point] - scale[:, None] * place
         is_straight = network.rays.is_straight
         if not is_straight:
-            ray, ray_by_point, ray_by_station = corrected_rays(
-                ray, state.station[station, 2], network.rays
-            )
-        in_rig = np.einsum("nji,nj->ni", object_from_rig, ray)
+            ray, ray_by_point, ray_by_station = corrected_rays(ray, place[:, 2], network.rays)
+        in_rig = at_exposure = np.einsum("nji,nj->ni", object_from_rig, ray)
+        if motion is not None:
+            in_rig = np.einsum("nji,nj->ni", motion.rotation, at_exposure)
         rig_from_camera = np.broadcast_to(np.eye(3), (len(rows), 3, 3)).copy()
         offset = np.zeros((len(rows), 3))
         mounted = head >= 0
@@ -221,7 +227,10 @@ def _image_rows(
             by_seen[:, 0, 0] = by_seen[:, 1, 1] = -c / seen[:, 2]
             by_seen[:, :, 2] = -projected / seen[:, 2:]
             by_rig = np.einsum("nij,nkj->nik", by_seen, rig_from_camera)
-            by_point = np.einsum("nij,nkj->nik", by_rig, object_from_rig)
+            by_exposure = by_rig
+            if motion is not None:
+                by_exposure = np.einsum("nij,nkj->nik", by_rig, motion.rotation)
+            by_point = np.einsum("nij,nkj->nik", by_exposure, object_from_rig)
             by_station = -by_point * scale[:, None, None]
             if not is_straight:
                 by_point, by_station = by_point @ ray_by_point, by_point @ ray_by_station
@@ -230,7 +239,7 @@ def _image_rows(
                 by_interior[:, :, 2] = -projected / c
             blocks = [
                 (layout.station[station], by_station),
-                (layout.attitude[attitude], by_rig @ skew(in_rig)),
+                (layout.attitude[attitude], by_exposure @ skew(at_exposure)),
                 (np.broadcast_to(layout.interior[index], (len(rows), 10)), by_interior),
                 (layout.retained_points[point], by_point),
             ]
@@ -243,6 +252,9 @@ def _image_rows(
                     (_where(layout.head_rotation, head), by_seen @ skew(seen)),
                     (_where(layout.head_offset, head), -by_rig * scale[:, None, None]),
                 ]
+            if motion is not None:
+                by_time = _by_time(motion, in_rig, by_rig, by_station)
+                blocks += time_columns(layout, network, image, by_time, motion.by_readout)
             entries = [(columns, values.reshape(len(rows), 2, -1)) for columns, values in blocks]
         locked = layout.locked[point]
         for axis in range(2):
@@ -259,6 +271,13 @@ def _image_rows(
             )
     if behind:
         raise BehindCameraError(np.concatenate(behind))
+
+
+def _by_time(motion: RowMotion, in_rig: Array, by_rig: Array, by_station: Array) -> Array:
+    """d(projected) / d(instant of the row), (n, 2), mm/s."""
+    turned = np.cross(in_rig, motion.rate_rad_per_s)
+    by_rotation = np.einsum("nij,nj->ni", by_rig, turned)
+    return np.asarray(by_rotation + np.einsum("nij,nj->ni", by_station, motion.velocity_mps))
 
 
 def _active(columns: Indices, by_term: Array) -> list[tuple[Indices, Array]]:
@@ -421,6 +440,28 @@ def _prior_rows(
             moved = head.offset_m - state.head_offset[index]
             sigma = np.full(3, head.offset_sigma_m)
             _add_prior(build, moved, sigma, layout.head_offset[index][:, None], None)
+        timing = head.timing
+        for difference, spread, column in (
+            (timing.delay_s - state.head_delay[index], timing.delay_sigma_s, layout.head_delay),
+            (timing.readout_s - state.readout[index], timing.readout_sigma_s, layout.readout),
+        ):
+            if column[index] >= 0 and spread is not None:
+                at_head = column[index : index + 1, None]
+                _add_prior(build, np.array([difference]), np.array([spread]), at_head, None)
+    _jitter_rows(build, network, layout, state)
+
+
+def _jitter_rows(
+    build: _Builder, network: Network, layout: ParameterLayout, state: ParameterValues
+) -> None:
+    """Pseudo-observations of the images' own delays: zero."""
+    rows = np.flatnonzero(layout.jitter >= 0)
+    if not rows.size:
+        return
+    sigma = np.array([network.heads[h].timing.jitter_sigma_s for h in network.images.head[rows]])
+    n = len(rows)
+    entry = [(layout.jitter[rows][:, None], np.ones((n, 1)))]
+    build.add(-state.jitter[rows], sigma, np.full(n, 9), rows, entry)
 
 
 def _add_prior(

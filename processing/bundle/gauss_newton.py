@@ -20,6 +20,7 @@ from processing.bundle.normal_equations import (
     GaussNewtonStep,
     ReducedEquations,
     SingularError,
+    cofactor_matrix,
     point_normals,
     reduced_equations,
     solve,
@@ -52,6 +53,10 @@ a posteriori sigma where residuals are larger than expected."""
 
 _WEAK_INFORMATION: Final = 1e-3
 """Smallest over largest eigenvalue of a point's normal matrix: rays about 3 degrees apart."""
+
+_USELESS_TIME_S: Final = 0.1
+"""A priori standard deviation of a delay that is not determined: the motion within it is not that
+of the second order, and iterations do not converge."""
 
 _FLAT: Final = 1e-12
 _WEAK_MOVE: Final = 1e-3
@@ -115,6 +120,8 @@ def iterate(run: Run) -> tuple[Equations, ReducedEquations]:
         run.report_progress("iteration", iteration, objective)
         trial = _Trial(run, rows, rays)
         reduced, step = trial.step(damping.value)
+        if iteration == 0 and not run.minimum_norm:
+            _refuse_unseparated_times(run, reduced)
         small = max(_CONVERGED * objective, _OBJECTIVE_CONVERGED)
         if damping.value > 0.0 and step.predicted_decrease <= 1e6 * small:
             damping.value = 0.0
@@ -161,6 +168,28 @@ def solved(run: Run, reduced: ReducedEquations) -> GaussNewtonStep:
         raise RankDefectError(
             rank_defects(run.network, run.layout, run.state, error.reduced, singular=True)
         ) from None
+
+
+def _refuse_unseparated_times(run: Run, reduced: ReducedEquations) -> None:
+    """Name delays and readout times that the motion of the rig does not separate from the rest."""
+    layout = run.layout
+    times = np.concatenate([layout.head_delay, layout.readout])
+    times = times[times >= 0]
+    if not times.size:
+        return
+    try:
+        cofactor = cofactor_matrix(reduced, layout.constraints)
+    except SingularError as error:
+        raise RankDefectError(
+            rank_defects(run.network, layout, run.state, error.reduced, singular=True)
+        ) from None
+    lost = times[np.sqrt(np.diag(cofactor)[times]) > _USELESS_TIME_S]
+    if not lost.size:
+        return
+    directions = np.linalg.qr(cofactor[:, lost] * reduced.scale[:, None])[0]
+    raise RankDefectError(
+        rank_defects(run.network, layout, run.state, reduced, singular=True, directions=directions)
+    )
 
 
 def front(run: Run, state: ParameterValues) -> Equations:

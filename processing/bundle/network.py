@@ -11,6 +11,7 @@ metres.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final, Literal
@@ -67,6 +68,32 @@ class CameraModel:
 
 
 @dataclass(frozen=True)
+class HeadTiming:
+    """When a head exposes, against the instant of the exposure's station.
+
+    `delay_s`: the middle row's mid-exposure is later by this. `readout_s`: the row of the smallest
+    y is exposed later than that of the largest, `frame_height_mm` away, by this (rolling shutter).
+    Each is held, estimated, or (sigma given) estimated with its value as an observation. With
+    `jitter_sigma_s` every image has a further delay of its own, zero with this standard deviation.
+    """
+
+    delay_s: float = 0.0
+    delay_free: bool = False
+    delay_sigma_s: float | None = None
+    readout_s: float = 0.0
+    readout_free: bool = False
+    readout_sigma_s: float | None = None
+    frame_height_mm: float = math.inf
+    jitter_sigma_s: float | None = None
+
+    @property
+    def uses_motion(self) -> bool:
+        """Whether an image of this head depends on the motion of the rig."""
+        free = self.delay_free or self.readout_free or self.jitter_sigma_s is not None
+        return free or self.delay_s != 0.0 or self.readout_s != 0.0
+
+
+@dataclass(frozen=True)
 class HeadMounting:
     """Mounting of a camera in a rig: rotation rig_from_camera (3, 3), offset in rig axes, m (3,).
 
@@ -81,6 +108,22 @@ class HeadMounting:
     offset_free: bool = False
     rotation_sigma_rad: float | None = None
     offset_sigma_m: float | None = None
+    timing: HeadTiming = field(default_factory=HeadTiming)
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Motion of the rig at the instants of the n stations, from a trajectory.
+
+    `velocity_mps` and `acceleration_mps2` (n, 3) of the rig's origin in object axes;
+    `rate_rad_per_s` and `rate_change_rad_per_s2` (n, 3) about the axes of the rig (camera axes: x
+    right, y forward, z up).
+    """
+
+    velocity_mps: Array
+    acceleration_mps2: Array
+    rate_rad_per_s: Array
+    rate_change_rad_per_s2: Array
 
 
 @dataclass(frozen=True)
@@ -226,6 +269,7 @@ class Network:
     measured_attitudes: MeasuredAttitudes = field(default_factory=no_measured_attitudes)
     constraints: tuple[LinearConstraint, ...] = ()
     rays: RayModel = field(default_factory=RayModel)
+    motion: Motion | None = None
 
     def problems(self) -> tuple[str, ...]:
         """Check shapes, indices and numbers.
@@ -308,8 +352,39 @@ def _problems(n: Network) -> list[str]:
         if len(set(names)) < len(names):
             twice = next(name for name in names if list(names).count(name) > 1)
             found.append(f"{what} {twice} is given twice")
+    found += _motion_problems(n)
     if not n.rays.is_straight and n.points.at_infinity.any():
         found.append("directions of a collimator have neither earth curvature nor refraction")
+    return found
+
+
+def _motion_problems(n: Network) -> list[str]:
+    found: list[str] = []
+    for head in n.heads:
+        timing, own = head.timing, f"head {head.name}"
+        if timing.uses_motion and n.motion is None:
+            found.append(f"{own} has a delay, jitter or readout time, and no motion is given")
+        sigmas = (timing.delay_sigma_s, timing.readout_sigma_s, timing.jitter_sigma_s)
+        if any(sigma is not None and not sigma > 0.0 for sigma in sigmas):
+            found.append(f"{own}: a sigma of delay, readout time or jitter is not positive")
+        if not timing.frame_height_mm > 0.0:
+            found.append(f"{own}: frame height {timing.frame_height_mm} mm; it is positive")
+        reads = timing.readout_free or timing.readout_s != 0.0
+        if reads and not math.isfinite(timing.frame_height_mm):
+            found.append(f"{own} has a readout time, and the height of its frame is not given")
+    if n.motion is None:
+        return found
+    shape = (len(n.stations.names), 3)
+    for what, array in (
+        ("velocities", n.motion.velocity_mps),
+        ("accelerations", n.motion.acceleration_mps2),
+        ("rates", n.motion.rate_rad_per_s),
+        ("changes of rates", n.motion.rate_change_rad_per_s2),
+    ):
+        if array.shape != shape:
+            found.append(f"{what} are {array.shape}; {shape} fits the other tables")
+        elif not np.isfinite(array).all():
+            found.append(f"{what} hold a value that is not a finite number")
     return found
 
 

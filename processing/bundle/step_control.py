@@ -76,13 +76,16 @@ class Rays:
     """The projection centres that see each eliminated point.
 
     Attributes:
-        stations, points: station and eliminated point of each image point.
+        stations, attitudes, heads, points: station, attitude, head (-1: none) and eliminated point
+            of each image point.
         count: (p,) image points of each.
         free: (p,) points at finite distance whose place follows from rays alone, without a given
             coordinate.
     """
 
     stations: NDArray[np.int64]
+    attitudes: NDArray[np.int64]
+    heads: NDArray[np.int64]
     points: NDArray[np.int64]
     count: Array
     free: Flags
@@ -97,8 +100,15 @@ class Rays:
             Shapes (p, 3) and (p,), m.
         """
         of = np.maximum(self.count, 1.0)
-        mean = self._sums(state.station[self.stations]) / of[:, None]
-        off = state.station[self.stations] - mean[self.points]
+        place = state.station[self.stations]
+        # Heads of one exposure see from different places, too.
+        mounted = self.heads >= 0
+        if mounted.any():
+            offset = state.head_offset[self.heads[mounted]]
+            rotation = state.attitude[self.attitudes[mounted]]
+            place[mounted] += np.einsum("nij,nj->ni", rotation, offset)
+        mean = self._sums(place) / of[:, None]
+        off = place - mean[self.points]
         return mean, np.sqrt(self._sums(off**2).sum(axis=1) / of)
 
     def _sums(self, values: Array) -> Array:
@@ -125,8 +135,11 @@ def rays_of(network: Network, layout: ParameterLayout) -> Rays:
     point = layout.eliminated[table.point]
     own = point >= 0
     points = layout.eliminated_points
+    image = table.image[own]
     return Rays(
-        network.images.station[table.image[own]],
+        network.images.station[image],
+        network.images.attitude[image],
+        network.images.head[image],
         point[own],
         np.bincount(point[own], minlength=len(points)).astype(np.float64),
         np.isnan(network.points.sigma_m[points]).all(axis=1) & ~network.points.at_infinity[points],

@@ -102,7 +102,10 @@ def _bare_equations(
         layout,
         **{
             name: np.full_like(getattr(layout, name), -1)
-            for name in ("station", "attitude", "head_rotation", "head_offset", "interior")
+            for name in (
+                *("station", "attitude", "head_rotation", "head_offset"),
+                *("head_delay", "readout", "jitter", "interior"),
+            )
         },
         terms=tuple(np.full_like(t, -1) for t in layout.terms),
     )

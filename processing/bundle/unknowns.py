@@ -40,6 +40,8 @@ class ParameterLayout:
     Attributes:
         station, attitude: (n, 3).
         head_rotation, head_offset: (heads, 3).
+        head_delay, readout: (heads,).
+        jitter: (images,).
         interior: (cameras, 10).
         terms: (t,) per camera.
         shift, drift: (lines, 3).
@@ -54,6 +56,9 @@ class ParameterLayout:
     attitude: Indices
     head_rotation: Indices
     head_offset: Indices
+    head_delay: Indices
+    readout: Indices
+    jitter: Indices
     interior: Indices
     terms: tuple[Indices, ...]
     shift: Indices
@@ -83,6 +88,9 @@ class ParameterValues:
     attitude: Array
     head_rotation: Array
     head_offset: Array
+    head_delay: Array
+    readout: Array
+    jitter: Array
     interior: Array
     terms: tuple[Array, ...]
     shift: Array
@@ -97,7 +105,7 @@ def initial_values(network: Network) -> ParameterValues:
         network: starting values.
 
     Returns:
-        Copies of them; shifts and drifts of lines are zero.
+        Copies of them; shifts and drifts of lines and jitter are zero.
     """
     heads = network.heads
     lines = len(network.gnss.lines)
@@ -106,6 +114,9 @@ def initial_values(network: Network) -> ParameterValues:
         attitude=network.attitudes.rotation.copy(),
         head_rotation=np.array([h.rotation for h in heads]).reshape(-1, 3, 3),
         head_offset=np.array([h.offset_m for h in heads]).reshape(-1, 3),
+        head_delay=np.array([h.timing.delay_s for h in heads], dtype=np.float64),
+        readout=np.array([h.timing.readout_s for h in heads], dtype=np.float64),
+        jitter=np.zeros(len(network.images.names)),
         interior=np.array([c.interior for c in network.cameras], dtype=np.float64),
         terms=tuple(np.array([t.value for t in c.terms]) for c in network.cameras),
         shift=np.zeros((lines, 3)),
@@ -125,7 +136,8 @@ def layout_of(
         retained: names of object points that have columns although no distance ties them.
 
     Returns:
-        Columns of stations, attitudes, heads, cameras, lines and tied points, in this order.
+        Columns of stations, attitudes, heads, images, cameras, lines and tied points, in this
+        order.
 
     Raises:
         NetworkError: a constraint or a name of a retained point that is not there.
@@ -158,6 +170,22 @@ def layout_of(
         for h in network.heads
     ]
     head_offset = [take(h.offset_free, "head offset", h.name, xyz) for h in network.heads]
+    timings = [(h.name, h.timing) for h in network.heads]
+    delay = [take(t.delay_free, "head", name, ("delay",)) for name, t in timings]
+    readout = [take(t.readout_free, "head", name, ("readout time",)) for name, t in timings]
+    has_points = np.zeros(len(network.images.names), dtype=bool)
+    has_points[network.image_points.image] = True
+    jitter = [
+        take(
+            bool(used) and head >= 0 and timings[head][1].jitter_sigma_s is not None,
+            "image",
+            name,
+            ("jitter",),
+        )
+        for name, head, used in zip(
+            network.images.names, network.images.head, has_points, strict=True
+        )
+    ]
     interior, terms = [], []
     for camera in network.cameras:
         interior.append(
@@ -190,6 +218,9 @@ def layout_of(
         attitude=_table(attitude, 3),
         head_rotation=_table(head_rotation, 3),
         head_offset=_table(head_offset, 3),
+        head_delay=_table(delay, 1)[:, 0],
+        readout=_table(readout, 1)[:, 0],
+        jitter=_table(jitter, 1)[:, 0],
         interior=_table(interior, 10),
         terms=tuple(terms),
         shift=_table(shift, 3),
@@ -233,6 +264,9 @@ def apply_corrections(
         attitude=state.attitude @ rotations_from_vectors(part(layout.attitude)),
         head_rotation=state.head_rotation @ rotations_from_vectors(part(layout.head_rotation)),
         head_offset=state.head_offset + part(layout.head_offset),
+        head_delay=state.head_delay + part(layout.head_delay),
+        readout=state.readout + part(layout.readout),
+        jitter=state.jitter + part(layout.jitter),
         interior=state.interior + part(layout.interior),
         terms=tuple(v + part(c) for v, c in zip(state.terms, layout.terms, strict=True)),
         shift=state.shift + part(layout.shift),

@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from processing.bundle.network import Network
+from processing.bundle.network import HeadMounting, Network
 from processing.bundle.statistics import ObservationGroup
 
 _CONVERGED: Final = 0.02
@@ -93,7 +93,15 @@ def rescaled(network: Network, factors: Mapping[str, float]) -> Network:
             sigma_rad=network.measured_attitudes.sigma_rad * of("attitude"),
         ),
         distances=replace(network.distances, sigma_m=network.distances.sigma_m * of("distance")),
+        heads=tuple(_with_jitter(head, of("jitter")) for head in network.heads),
     )
+
+
+def _with_jitter(head: HeadMounting, factor: float) -> HeadMounting:
+    sigma_s = head.timing.jitter_sigma_s
+    if sigma_s is None:
+        return head
+    return replace(head, timing=replace(head.timing, jitter_sigma_s=sigma_s * factor))
 
 
 def _is_estimable(group: ObservationGroup) -> bool:

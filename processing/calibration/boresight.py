@@ -16,6 +16,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.bundle.exposure_motion import advanced, moved
+from processing.bundle.network import Motion
 from processing.geometry.orientation import BODY_FROM_CAMERA
 from processing.geometry.rotation import (
     angles_by_rotation_vector,
@@ -64,6 +66,11 @@ class InertialOrientations:
     `position_m` (n, 3) of the antenna; `velocity_mps` (n, 3); `rotation` (n, 3, 3) object from
     inertial unit (forward, right, down); `rate_rad_per_s` (n, 3) about the unit's axes; sigmas (3,)
     of position in object axes and of attitude about the unit's axes.
+
+    `acceleration_mps2` of the antenna, object axes, and `rate_change_rad_per_s2` about the unit's
+    axes, (n, 3), carry the trajectory over a time offset to the second order; None: zero. `time_s`
+    (n,) and the times over which errors are correlated (Gauss-Markov, first order) make exposures
+    depend on each other; None: they are independent.
     """
 
     position_m: Array
@@ -72,6 +79,22 @@ class InertialOrientations:
     rate_rad_per_s: Array
     position_sigma_m: Array
     attitude_sigma_rad: Array
+    acceleration_mps2: Array | None = None
+    rate_change_rad_per_s2: Array | None = None
+    time_s: Array | None = None
+    position_correlation_s: float | None = None
+    attitude_correlation_s: float | None = None
+
+    @property
+    def motion(self) -> Motion:
+        """Motion of the antenna, rates about the axes of the inertial unit."""
+        none = np.zeros_like(self.velocity_mps)
+        return Motion(
+            self.velocity_mps,
+            none if self.acceleration_mps2 is None else self.acceleration_mps2,
+            self.rate_rad_per_s,
+            none if self.rate_change_rad_per_s2 is None else self.rate_change_rad_per_s2,
+        )
 
 
 @dataclass(frozen=True)
@@ -119,6 +142,9 @@ class BoresightCalibration:
     attitude_residual_rad: Array
     sigma0: float
     redundancy: int
+    by_image: Array
+    """(10, 6n) change of the ten by the orientations from images, as `ImageOrientations` has
+    them."""
 
     @property
     def sigma(self) -> Array:
@@ -188,7 +214,7 @@ def calibrate_boresight(
         at = _with_step(at, step)
         if np.abs(step / PARAMETER_SCALES).max(initial=0.0) < 1e-9:
             break
-    misclosure, _, _ = _equations(image_orientations, inertial, at)
+    misclosure, _, by_image = _equations(image_orientations, inertial, at)
     full_basis = np.zeros((10, int(known.sum())))
     full_basis[free] = basis
     covariance = (
@@ -196,6 +222,7 @@ def calibrate_boresight(
         / values[known]
         @ (full_basis * PARAMETER_SCALES[:, None]).T
     )
+    gain = covariance @ (design.T @ weight)
     lost = np.zeros((10, int((~known).sum())))
     lost[free] = vectors[:, ~known]
     squares = float(misclosure @ weight @ misclosure)
@@ -216,6 +243,7 @@ def calibrate_boresight(
         attitude_residual_rad=residual[:, 3:],
         sigma0=math.sqrt(squares / redundancy) if redundancy > 0 else math.nan,
         redundancy=redundancy,
+        by_image=np.einsum("pna,nab->pnb", gain.reshape(10, n, 6), by_image).reshape(10, 6 * n),
     )
 
 
@@ -230,6 +258,46 @@ def angle_covariance(found: BoresightCalibration) -> Array:
     """
     by = angles_by_rotation_vector("ZYX", found.mounting.imu_from_body)[::-1]
     return np.asarray(by @ found.covariance[:3, :3] @ by.T)
+
+
+def rig_motion(inertial: InertialOrientations, mounting: ImuMounting) -> Motion:
+    """Motion of the rig at the exposures' own instants, from the trajectory and a mounting.
+
+    Args:
+        inertial: at the marks.
+        mounting: boresight, lever arm and time offset so far. An error of 0.1 m and 1 degree makes
+            0.2 mm and 20 urad in 20 ms at 0.1 rad/s.
+
+    Returns:
+        Motion of the rig's origin in object axes, rates about its camera axes, the time offset
+        after the marks.
+
+    Source: docs/explanation/mathematics/boresight.md#delays-of-heads.
+
+    Example:
+        The antenna 2 m ahead of a rig that turns about its down axis moves to the right.
+
+        >>> one = np.array([[0.0, 0.0, 0.1]])
+        >>> inertial = InertialOrientations(
+        ...     0 * one, 0 * one, np.eye(3)[None], one, np.ones(3), np.ones(3)
+        ... )
+        >>> mounting = mounting_of(np.array([2.0, 0.0, 0.0]), np.zeros(3))
+        >>> rig_motion(inertial, mounting).velocity_mps + 0.0
+        array([[ 0. , -0.2,  0. ]])
+    """
+    given = inertial.motion
+    arm = mounting.imu_from_body @ mounting.antenna_m
+    rate, change = given.rate_rad_per_s, given.rate_change_rad_per_s2
+    circling = np.cross(rate, arm)
+    pull = np.cross(change, arm) + np.cross(rate, circling)
+    camera_from_imu = BODY_FROM_CAMERA.T @ mounting.imu_from_body.T
+    motion = Motion(
+        given.velocity_mps - np.einsum("nij,nj->ni", inertial.rotation, circling),
+        given.acceleration_mps2 - np.einsum("nij,nj->ni", inertial.rotation, pull),
+        rate @ camera_from_imu.T,
+        change @ camera_from_imu.T,
+    )
+    return advanced(motion, mounting.time_offset_s)
 
 
 def mounting_of(
@@ -274,6 +342,11 @@ def _check(
         raise ValueError(f"{unknown} cannot be held; one of {', '.join(GROUPS)} can")
     if n < 3:
         raise ValueError(f"{n} exposures with both orientations; a comparison takes three or more")
+    correlated = (inertial.position_correlation_s, inertial.attitude_correlation_s)
+    if any(own is not None for own in correlated) and inertial.time_s is None:
+        raise ValueError("a correlation time needs the instants of the exposures")
+    if any(own is not None and not own > 0.0 for own in correlated):
+        raise ValueError("a correlation time is positive")
     if len(inertial.position_m) != n or image_orientations.covariance.shape != (6 * n, 6 * n):
         raise ValueError(
             f"{n} controlled exposures, {len(inertial.position_m)} inertial ones, covariance "
@@ -319,11 +392,13 @@ def _equations(
     controlled orientations (n, 6, 6)."""
     n = len(image_orientations.centre_m)
     body = image_orientations.rotation @ BODY_FROM_CAMERA.T
-    rotation_in_offset = rotations_from_vectors(inertial.rate_rad_per_s * at.time_offset_s)
+    shift_m, rotation_in_offset, velocity_mps, rate = moved(
+        inertial.motion, np.arange(n), np.full(n, at.time_offset_s)
+    )
     misclosure = np.zeros((n, 6))
     misclosure[:, :3] = (
         inertial.position_m
-        + inertial.velocity_mps * at.time_offset_s
+        + shift_m
         - image_orientations.centre_m
         - body @ at.antenna_m
         - at.shift_m
@@ -335,8 +410,8 @@ def _equations(
     design = np.zeros((n, 6, 10))
     design[:, 3:, :3] = -np.eye(3)
     design[:, :3, 3:6] = body
-    design[:, :3, 6] = -inertial.velocity_mps
-    design[:, 3:, 6] = -inertial.rate_rad_per_s @ at.imu_from_body
+    design[:, :3, 6] = -velocity_mps
+    design[:, 3:, 6] = -rate @ at.imu_from_body
     design[:, :3, 7:] = np.eye(3)
     by_image = np.zeros((n, 6, 6))
     by_image[:, :3, :3] = -np.eye(3)
@@ -356,10 +431,20 @@ def _observation_covariance(
     blocks = image_orientations.covariance.reshape(n, 6, n, 6)
     covariance = np.einsum("iab,ibjc,jdc->iajd", by_image, blocks, by_image, optimize=True)
     own = at.imu_from_body.T @ np.diag(inertial.attitude_sigma_rad**2) @ at.imu_from_body
-    for k in range(n):
-        covariance[k, :3, k, :3] += np.diag(inertial.position_sigma_m**2)
-        covariance[k, 3:, k, 3:] += own
+    position = _alike(n, inertial.time_s, inertial.position_correlation_s)
+    attitude = _alike(n, inertial.time_s, inertial.attitude_correlation_s)
+    covariance[:, :3, :, :3] += np.einsum(
+        "ij,ab->iajb", position, np.diag(inertial.position_sigma_m**2)
+    )
+    covariance[:, 3:, :, 3:] += np.einsum("ij,ab->iajb", attitude, own)
     return np.asarray(covariance.reshape(6 * n, 6 * n))
+
+
+def _alike(n: int, time_s: Array | None, correlation_s: float | None) -> Array:
+    """Correlations of errors of the same quantity at n instants, (n, n)."""
+    if time_s is None or correlation_s is None:
+        return np.eye(n)
+    return np.asarray(np.exp(-np.abs(time_s[:, None] - time_s) / correlation_s))
 
 
 def _named(lost: Array, inertial: InertialOrientations) -> tuple[InseparableParameters, ...]:

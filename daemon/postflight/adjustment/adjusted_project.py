@@ -72,8 +72,12 @@ def initial_state(result: Adjustment) -> ParameterValues:
     """
     network, given = result.network, initial_values(result.network)
     observed = any(camera.sigma for camera in network.cameras) or any(
-        head.rotation_sigma_rad is not None or head.offset_sigma_m is not None
+        sigma is not None
         for head in network.heads
+        for sigma in (
+            *(head.rotation_sigma_rad, head.offset_sigma_m),
+            *(head.timing.delay_sigma_s, head.timing.readout_sigma_s),
+        )
     )
     if observed and (network.constraints or any(c.gauges for c in network.cameras)):
         return given
@@ -87,11 +91,22 @@ def initial_state(result: Adjustment) -> ParameterValues:
             if term.name in camera.sigma:
                 terms[k][at] = given.terms[k][at]
     rotation, offset = state.head_rotation.copy(), state.head_offset.copy()
+    delay, readout = state.head_delay.copy(), state.readout.copy()
     for k, head in enumerate(network.heads):
+        if head.timing.delay_sigma_s is not None:
+            delay[k] = given.head_delay[k]
+        if head.timing.readout_sigma_s is not None:
+            readout[k] = given.readout[k]
         if head.rotation_sigma_rad is not None:
             rotation[k] = given.head_rotation[k]
         if head.offset_sigma_m is not None:
             offset[k] = given.head_offset[k]
     return replace(
-        state, interior=interior, terms=tuple(terms), head_rotation=rotation, head_offset=offset
+        state,
+        interior=interior,
+        terms=tuple(terms),
+        head_rotation=rotation,
+        head_offset=offset,
+        head_delay=delay,
+        readout=readout,
     )

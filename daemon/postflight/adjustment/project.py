@@ -6,7 +6,6 @@ network and found by `processing.bundle.initial_values`.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 
 from daemon.mission.foreign_files import ForeignFileError, within
 from daemon.postflight.adjustment.csv_tables import CsvTable, ProjectError, read_table
+from daemon.postflight.adjustment.heads_and_motion import KNOWN, NEEDED, head_of, motion_of
 from daemon.postflight.adjustment.plausibility import (
     check_control,
     check_distances,
@@ -24,7 +24,6 @@ from daemon.postflight.adjustment.plausibility import (
     check_rows,
 )
 from daemon.postflight.adjustment.project_file import (
-    AdjustmentHeadSection,
     CameraSection,
     ProjectFile,
     read_project_file,
@@ -37,11 +36,11 @@ from processing.bundle.network import (
     CameraModel,
     Distances,
     Gnss,
-    HeadMounting,
     ImagePoints,
     Images,
     LinearConstraint,
     MeasuredAttitudes,
+    Motion,
     Network,
     Points,
     Stations,
@@ -91,7 +90,7 @@ def read_project(path: Path) -> Project:
     folder = path.parent
     problems: list[str] = []
     cameras = tuple(_camera(section, folder, problems) for section in file.camera)
-    heads = tuple(_head(section) for section in file.head)
+    heads = tuple(head_of(section) for section in file.head)
     images = _read(folder, file.files.images, ("image", "camera"), ("exposure", "head", *ANGLES))
     exposures = _optional(
         folder, file.files.exposures, ("exposure",), (*XYZ, *ANGLES, "position", "attitude")
@@ -123,6 +122,7 @@ def read_project(path: Path) -> Project:
         gnss=_gnss(folder, file, build),
         measured_attitudes=_bearings(folder, file, build),
         constraints=tuple(LinearConstraint(dict(c.coefficients)) for c in file.constraint),
+        motion=_motion(folder, file, build),
         rays=RayModel(file.adjust.earth_radius_m, file.adjust.refraction, file.adjust.ground_m),
     )
     build.check(network)
@@ -388,20 +388,6 @@ def _with_selected_parameters(
     )
 
 
-def _head(section: AdjustmentHeadSection) -> HeadMounting:
-    angles = np.array([section.omega_deg, section.phi_deg, section.kappa_deg])
-    sigma = section.rotation_sigma_deg
-    return HeadMounting(
-        section.name,
-        _rotation(angles),
-        np.array([section.x_m, section.y_m, section.z_m]),
-        rotation_free=section.rotation == "free",
-        offset_free=section.offset == "free",
-        rotation_sigma_rad=None if sigma is None else math.radians(sigma),
-        offset_sigma_m=section.offset_sigma_m,
-    )
-
-
 def _rotation(angles_deg: Array) -> Array:
     return rotation_matrix(*np.radians(angles_deg))
 
@@ -476,6 +462,14 @@ def _gnss(folder: Path, file: ProjectFile, build: _TableIndex) -> Gnss:
         lines=lines,
         drift=file.adjust.gnss,
     )
+
+
+def _motion(folder: Path, file: ProjectFile, build: _TableIndex) -> Motion | None:
+    table = _optional(folder, file.files.motion, NEEDED, KNOWN)
+    if table is None:
+        return None
+    build.tables.append(table)
+    return motion_of(table, build.exposure_names)
 
 
 def _bearings(folder: Path, file: ProjectFile, build: _TableIndex) -> MeasuredAttitudes:

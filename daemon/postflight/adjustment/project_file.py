@@ -70,6 +70,7 @@ class FilesSection(_ProjectSection):
     distances: str | None = None
     gnss: str | None = None
     attitudes: str | None = None
+    motion: str | None = None
 
 
 class CameraSection(_ProjectSection):
@@ -116,6 +117,14 @@ class AdjustmentHeadSection(_ProjectSection):
     offset: Literal["held", "free"] = "held"
     rotation_sigma_deg: float | None = Field(default=None, gt=0.0)
     offset_sigma_m: float | None = Field(default=None, gt=0.0)
+    delay_ms: float = 0.0
+    delay: Literal["held", "free"] = "held"
+    delay_sigma_ms: float | None = Field(default=None, gt=0.0)
+    readout_ms: float = 0.0
+    readout: Literal["held", "free"] = "held"
+    readout_sigma_ms: float | None = Field(default=None, gt=0.0)
+    frame_height_mm: float | None = Field(default=None, gt=0.0)
+    jitter_sigma_ms: float | None = Field(default=None, gt=0.0)
 
 
 class ConstraintSection(_ProjectSection):

@@ -19,6 +19,7 @@ from daemon.postflight.adjustment.adjusted_project import (
     with_settings,
 )
 from daemon.postflight.adjustment.csv_tables import ProjectError, write_table
+from daemon.postflight.adjustment.heads_and_motion import timing_values, write_motion
 from daemon.postflight.adjustment.html_report import report_page
 from daemon.postflight.adjustment.project import (
     ANGLES,
@@ -131,6 +132,9 @@ def _write_project(
     if len(network.gnss.station):
         tables["gnss"] = "gnss.csv"
         _gnss(folder, network)
+    if network.motion is not None:
+        tables["motion"] = "motion.csv"
+        write_motion(folder / "motion.csv", network)
     if len(network.measured_attitudes.attitude):
         tables["attitudes"] = "attitudes.csv"
         b = network.measured_attitudes
@@ -352,6 +356,7 @@ def _toml(
         content = head.model_dump(exclude_none=True, exclude_defaults=True)
         content |= dict(zip(ANGLES, (float(v) for v in angles[k]), strict=True))
         content |= dict(zip(XYZ, (float(v) for v in state.head_offset[k]), strict=True))
+        content |= timing_values(state, k)
         lines += ["", "[[head]]", *_keys(content)]
     for constraint in file.constraint:
         lines += ["", "[[constraint]]", *_keys(constraint.model_dump())]

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.mission.store.durable import new_file
+from daemon.postflight.adjustment.head_time_report import time_rows
 from daemon.postflight.adjustment.project import CheckPoints
 from processing.bundle.adjust import Adjustment
 from processing.bundle.adjustment_results import (
@@ -89,6 +90,11 @@ def _lines(result: Adjustment, checks: CheckPoints, report: Mapping[str, Any]) -
                 for h in report["heads"]
             ),
         )  # fmt: skip
+    if report["times"]["heads"]:
+        yield from _table(
+            ("head", "delay ms", "readout ms", "jitter ms"), time_rows(report["times"])
+        )
+        yield from report["times"]["not_separated"]
     if report["gnss_lines"]:
         yield from _section("6 GNSS shift (m) and drift (m/s) of lines")
         yield from _table(

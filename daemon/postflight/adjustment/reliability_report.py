@@ -19,6 +19,7 @@ UNIT_OF_GROUP: Final = {
     "image y": ("um", 1e3),
     "attitude": ("mrad", 1e3),
     "prior": ("", 1.0),
+    "jitter": ("ms", 1e3),
 }
 
 OBSERVATION_COLUMNS: Final = (

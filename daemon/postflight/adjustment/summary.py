@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from daemon.postflight.adjustment.head_time_report import print_times, times_of
 from daemon.postflight.adjustment.likely_mistakes import SUSPICIOUS_SIGMA0
 from daemon.postflight.adjustment.project import CheckPoints
 from daemon.postflight.adjustment.reliability_report import reliability_summary, unit_of
@@ -107,6 +108,7 @@ def report_of(
                 }
                 for h in heads_of(result)
             ],
+            "times": times_of(result),
             "gnss_lines": _lines(result),
             "control": _agreement(control),
             "checks": _agreement(against),
@@ -195,6 +197,7 @@ def print_report(console: Console, report: Mapping[str, Any]) -> None:
                 ]
                 table.add_row(h["name"], *cells, unit)
         console.print(table)
+    print_times(console, report["times"])
     for key, title in (("control", "Control points"), ("checks", "Check points")):
         a = report[key]
         if a["count"]:

@@ -48,6 +48,7 @@ from processing.calibration.boresight import (
     calibrate_boresight,
     mounting_of,
 )
+from processing.calibration.head_delays import attitudes_of_stations, orientation_columns
 from processing.geometry.orientation import ENU_FROM_NED, grid_from_enu
 from processing.geometry.rotation import level_from_body, roll_pitch_heading, vectors_from_rotations
 
@@ -58,6 +59,11 @@ STEP_NS = 20_000_000
 
 ANGLES = ("roll_deg", "pitch_deg", "heading_deg")
 RATES = ("rate_forward_deg_s", "rate_right_deg_s", "rate_down_deg_s")
+RATE_CHANGES = (
+    *("rate_change_forward_deg_s2", "rate_change_right_deg_s2", "rate_change_down_deg_s2"),
+)
+ACCELERATION = ("ax_mps2", "ay_mps2", "az_mps2")
+OPTIONAL = (*RATES, *ACCELERATION, *RATE_CHANGES, "time_s")
 VELOCITY = ("vx_mps", "vy_mps", "vz_mps")
 
 
@@ -67,9 +73,10 @@ class BoresightError(DaemonError, ValueError):
 
 @dataclass(frozen=True)
 class BoresightComparison:
-    """A comparison: names of exposures, both orientations, and the result."""
+    """A comparison: exposures by name and by index, both orientations, and the result."""
 
     names: tuple[str, ...]
+    exposures: tuple[int, ...]
     inertial: InertialOrientations
     given: ImuMounting
     found: BoresightCalibration
@@ -87,21 +94,18 @@ def controlled_of(result: Adjustment, exposures: Sequence[int]) -> ImageOrientat
     Raises:
         BoresightError: a station's orientation is held, so that nothing was determined.
     """
-    network, layout = result.network, result.layout
-    attitude_of = _attitude_of_station(network)
-    columns = []
-    for station in exposures:
-        own = np.concatenate([layout.station[station], layout.attitude[attitude_of[station]]])
-        if (own < 0).any():
-            raise BoresightError(
-                f"exposure {network.stations.names[station]} is held or not seen in the project; "
-                "leave its position and attitude free"
-            )
-        columns.append(own)
-    at = np.concatenate(columns)
+    attitudes = attitudes_of_stations(result.network, exposures)
+    at = orientation_columns(result, exposures)
+    held = np.flatnonzero(at < 0)
+    if held.size:
+        name = result.network.stations.names[exposures[int(held[0]) // 6]]
+        raise BoresightError(
+            f"exposure {name} is held or not seen in the project; leave its position and attitude "
+            "free"
+        )
     return ImageOrientations(
         result.state.station[list(exposures)],
-        result.state.attitude[[attitude_of[s] for s in exposures]],
+        result.state.attitude[attitudes],
         result.sigma0**2 * result.cofactor[np.ix_(at, at)],
     )
 
@@ -116,7 +120,7 @@ def inertial_table(
         BoresightError: no exposure of the project is in it.
     """
     places = ("x_m", "y_m", "z_m")
-    table = read_table(path, ("exposure", *places, *ANGLES, *VELOCITY), RATES)
+    table = read_table(path, ("exposure", *places, *ANGLES, *VELOCITY), OPTIONAL)
     at = {name: k for k, name in enumerate(stations)}
     names = table.names("exposure")
     rows = [k for k, name in enumerate(names) if name in at]
@@ -125,8 +129,10 @@ def inertial_table(
             f"{path}: none of its exposures ({', '.join(names[:3])} ...) is in the project "
             f"({', '.join(list(stations)[:3])} ...); both must use the same names"
         )
-    columns = (*places, *VELOCITY, *ANGLES, *RATES)
-    values = np.array([table.numbers(c, 0.0 if c in RATES else math.nan) for c in columns]).T[rows]
+    columns = (*places, *VELOCITY, *ANGLES, *OPTIONAL)
+    values = np.array([table.numbers(c, 0.0 if c in OPTIONAL else math.nan) for c in columns]).T[
+        rows
+    ]
     if table.problems or not np.isfinite(values).all():
         quantities = "; ".join(table.problems) or "an empty cell where a number is needed"
         raise BoresightError(f"{path}: {quantities}")
@@ -135,9 +141,12 @@ def inertial_table(
         values[:, :3],
         values[:, 3:6],
         np.array([ENU_FROM_NED @ level_from_body(*a) for a in angles]),
-        np.radians(values[:, 9:]),
+        np.radians(values[:, 9:12]),
         position_sigma_m,
         attitude_sigma_rad,
+        values[:, 12:15],
+        np.radians(values[:, 15:18]),
+        values[:, 18] if table.has("time_s") else None,
     )
 
 
@@ -200,9 +209,28 @@ def inertial_of_mission(
             f"{trajectory.name}; stations are named like the exposures' folders (000001), and a "
             "receiver without attitude needs --trajectory"
         )
-    position, velocity, rotation, rate = (np.array(part) for part in zip(*rows, strict=True))
+    position, velocity, rotation, rate, acceleration, rate_change, time_s = (
+        np.array(part) for part in zip(*rows, strict=True)
+    )
     return tuple(used_stations), InertialOrientations(
-        position, velocity, rotation, rate, position_sigma_m, attitude_sigma_rad
+        position,
+        velocity,
+        rotation,
+        rate,
+        position_sigma_m,
+        attitude_sigma_rad,
+        acceleration,
+        rate_change,
+        time_s - time_s.min(),
+    )
+
+
+def given_mounting(mount: MountSection) -> ImuMounting:
+    """The mounting of a configuration."""
+    return mounting_of(
+        np.array(mount.antenna_m),
+        np.radians(mount.boresight_deg),
+        time_offset_s=mount.time_offset_ms * 1e-3,
     )
 
 
@@ -216,11 +244,7 @@ def compare_boresight(
     lever_sigma_m: float | None = None,
 ) -> BoresightComparison:
     """Compare, beginning with the mount that is in use."""
-    given = mounting_of(
-        np.array(mount.antenna_m),
-        np.radians(mount.boresight_deg),
-        time_offset_s=mount.time_offset_ms * 1e-3,
-    )
+    given = given_mounting(mount)
     try:
         found = calibrate_boresight(
             controlled_of(adjustment, exposures),
@@ -232,7 +256,7 @@ def compare_boresight(
     except ValueError as error:
         raise BoresightError(str(error)) from error
     names = tuple(adjustment.network.stations.names[k] for k in exposures)
-    return BoresightComparison(names, inertial, given, found, adjustment)
+    return BoresightComparison(names, tuple(exposures), inertial, given, found, adjustment)
 
 
 def quantities_of(done: BoresightComparison) -> tuple[Quantity, ...]:
@@ -264,6 +288,7 @@ def report_of(
     done: BoresightComparison,
     project: Project,
     *,
+    delays: Sequence[Quantity] = (),
     calibration_id: str,
     date: str,
     serials: Mapping[str, str],
@@ -272,7 +297,7 @@ def report_of(
 ) -> CalibrationReport:
     """The calibration report, as printed and written."""
     found, n = done.found, len(done.names)
-    quantities = quantities_of(done)
+    quantities = (*quantities_of(done), *delays)
     speed = np.linalg.norm(done.inertial.velocity_mps, axis=1)
     sentences = [u.sentence for u in found.inseparable]
     held = [f"{group} held at what was given" for group in found.held]
@@ -352,8 +377,10 @@ def report_of(
     )
 
 
-def mount_toml(done: BoresightComparison, *, date: str, project: str) -> bytes:
-    """The `[mount]` section as the configuration holds it."""
+def mount_toml(
+    done: BoresightComparison, *, date: str, project: str, delays: Sequence[Quantity] = ()
+) -> bytes:
+    """The `[mount]` section as the configuration holds it, delays of heads as remarks."""
     at = done.found.mounting
     angles = ", ".join(f"{v:.6f}" for v in np.degrees(roll_pitch_heading(at.imu_from_body)))
     arm = ", ".join(f"{v:.4f}" for v in at.antenna_m)
@@ -363,6 +390,7 @@ def mount_toml(done: BoresightComparison, *, date: str, project: str) -> bytes:
         "# It counts where it is configured: put it in place of [mount] in the configuration, or",
         "# `syntopic orient MISSION --mount FILE`.",
         *(f"# Not from this flight: {u.sentence}" for u in done.found.inseparable),
+        *(f"# {q.where}: {q.what} {q.value:.4f} {q.unit}" for q in delays),
         "[mount]",
         f"antenna_m = [{arm}]",
         f"boresight_deg = [{angles}]",
@@ -381,18 +409,11 @@ def _correlated(found: BoresightCalibration) -> list[str]:
     ]
 
 
-def _attitude_of_station(network: Network) -> dict[int, int]:
-    """The attitude that represents an exposure: the shared one, else that of its first image."""
-    found: dict[int, int] = {}
-    for station, attitude in zip(network.images.station, network.images.attitude, strict=True):
-        found.setdefault(int(station), int(attitude))
-    return found
-
-
 def _at_mark(
     exposure: Exposure, trajectory: Trajectory, system: Georeference | LocalFrame
-) -> tuple[Array, Array, Array, Array] | None:
-    """Position, velocity, rotation and rates at the mark, in grid axes; None: not known."""
+) -> tuple[Array, Array, Array, Array, Array, Array, float] | None:
+    """Position, velocity, rotation, rates, acceleration, change of rates and instant (s) at the
+    mark, in grid axes; None: not known."""
     if exposure.mark_gps_ns is None:
         return None
     there = [trajectory.at(exposure.mark_gps_ns + k * STEP_NS) for k in (-1, 0, 1)]
@@ -417,15 +438,27 @@ def _at_mark(
         grid = grid_from_enu(place.azimuth_of_north_rad)
     per_latitude, per_longitude = metres_per_degree(here.latitude_deg, heights_m[1])
     span_s = 2 * STEP_NS * 1e-9
-    velocity = (
-        np.array(
-            [
-                (after.longitude_deg - before.longitude_deg) * per_longitude,
-                (after.latitude_deg - before.latitude_deg) * per_latitude,
-                heights_m[2] - heights_m[0],
-            ]
-        )
-        / span_s
-    )
+    scale = np.array([per_longitude, per_latitude, 1.0])
+    path = np.array(
+        [
+            (one.longitude_deg - here.longitude_deg, one.latitude_deg - here.latitude_deg, h - mid)
+            for one, h, mid in zip(
+                (before, here, after), heights_m, (heights_m[1],) * 3, strict=True
+            )
+        ]
+    ) * scale  # fmt: skip
+    half_s = STEP_NS * 1e-9
+    velocity = (path[2] - path[0]) / span_s
+    acceleration = (path[2] - 2.0 * path[1] + path[0]) / half_s**2
     rate = vectors_from_rotations(level[0].T @ level[2]) / span_s
-    return position, grid @ velocity, grid @ ENU_FROM_NED @ level[1], rate
+    ahead = vectors_from_rotations(level[1].T @ level[2])
+    back = vectors_from_rotations(level[0].T @ level[1])
+    return (
+        position,
+        grid @ velocity,
+        grid @ ENU_FROM_NED @ level[1],
+        rate,
+        grid @ acceleration,
+        (ahead - back) / half_s**2,
+        exposure.mark_gps_ns * 1e-9,
+    )
