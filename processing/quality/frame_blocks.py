@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from processing.geometry.placement import SensorPlacement, raw_from_vip_mm, vip_mm_from_raw
+from processing.image.compiled_kernel import compiled_kernel
 from processing.image.line_means import BUNDLE_PX, LineMeans
 from processing.quality.figures.image import BlockFigures
 from processing.quality.ground_steps import (
@@ -54,6 +54,9 @@ those count that are so far from the next one, in distances at which other heads
 CANDIDATES: Final = 6
 """Edges of a frame that are compared with other heads, the largest."""
 MIN_HEADS: Final = 2
+MIN_LASTING: Final = 0.3
+"""Of the step between two lines, that is still there where other heads are compared: a block has
+another offset all over, a line of plants or vehicles only itself."""
 _RELATIVE: Final = 0.02
 
 
@@ -106,7 +109,7 @@ def block_edges(
     for name, of_frame in edges.items():
         sensor = rig.sensor(name)
         for edge in of_frame[:CANDIDATES]:
-            block = _unshared(view, edge, sensor)
+            block = _unshared(view, edge, sensor, means)
             if block is not None:
                 found.append(block)
                 break
@@ -176,6 +179,7 @@ class _Edge:
     first: int
     last: int
     step: float
+    relative: float
 
 
 def _candidates(sensor: Sensor, lines: LineMeans, limits: tuple[float, float]) -> list[_Edge]:
@@ -195,11 +199,14 @@ def _candidates(sensor: Sensor, lines: LineMeans, limits: tuple[float, float]) -
             for k in np.flatnonzero(blurs <= MAX_BLUR * np.abs(steps)):
                 first = int(starts[k]) * pace
                 last = min((int(stops[k]) - 1) * pace + BUNDLE_PX, length) - 1
-                edges.append(_Edge(axis, int(places[k]) + offset, first, last, float(steps[k])))
+                at, step = int(places[k]), float(steps[k])
+                around = by_line[starts[k] : stops[k], at : at + 2]
+                relative = step / max(float(np.median(around)), 1.0)
+                edges.append(_Edge(axis, at + offset, first, last, step, relative))
     return sorted(edges, key=lambda e: -abs(e.step) * (e.last - e.first))
 
 
-@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
+@compiled_kernel(fastmath={"reassoc", "contract"})
 def _texture(means: Array) -> float:
     """RMS change from line to line."""
     bundles, lines = means.shape
@@ -214,7 +221,7 @@ def _texture(means: Array) -> float:
     return math.sqrt(total / (bundles * (lines - 1)))
 
 
-@njit(cache=True, nogil=True)
+@compiled_kernel()
 def _has_run(means: Array, sign: float, limit: float, length: int) -> Array:
     """Between which lines so many neighbouring bundles change by more than a limit."""
     bundles, lines = means.shape
@@ -228,7 +235,7 @@ def _has_run(means: Array, sign: float, limit: float, length: int) -> Array:
     return np.asarray(longest >= length)
 
 
-@njit(cache=True, nogil=True)
+@compiled_kernel()
 def _runs(
     means: Array, places: Array, sign: float, limit: float, length: int
 ) -> tuple[Array, Array, Array, Array]:
@@ -263,6 +270,21 @@ def _runs(
     return starts, stops, steps, blurs
 
 
+def _steps_there(sensor: Sensor, lines: LineMeans, edge: _Edge) -> bool:
+    """Whether another frame steps alike at the same line, where it sees other ground."""
+    by_line, at, length = lines.by_column, edge.at, sensor.height_px
+    if edge.axis == "rows":
+        by_line, at, length = lines.by_row, edge.at - lines.first_row, sensor.width_px
+    if not len(by_line) or not 0 <= at < by_line.shape[1] - 1:
+        return False
+    pace = length // len(by_line)
+    bundles = slice(edge.first // pace, max(edge.last // pace, edge.first // pace + 1))
+    changes = by_line[bundles, at + 1] - by_line[bundles, at]
+    return len(changes) > 0 and bool(
+        np.median(changes) * np.sign(edge.step) > MAX_SHARED * abs(edge.step)
+    )
+
+
 def _cornered(edges: list[_Edge]) -> list[_Edge]:
     """The edges that meet another one in a corner, or have one of the other sign opposite."""
 
@@ -289,17 +311,22 @@ def _is_isolated(edge: _Edge, every: list[_Edge], reach_px: float) -> bool:
     )
 
 
-def _unshared(view: GroundView, edge: _Edge, sensor: Sensor) -> BlockEdge | None:
+def _unshared(
+    view: GroundView, edge: _Edge, sensor: Sensor, means: Mapping[str, LineMeans]
+) -> BlockEdge | None:
     """The edge as a block where no other head shows half of it; None where one does, or too few see
     it.
 
-    An edge that all colour heads show is none of the ground where PAN shows less than half of it.
+    An edge that all colour heads show at the same line is none of the ground where PAN shows less
+    than half of it.
     """
     name, away = sensor.name, view.reach_px(sensor.name)
     along = np.linspace(edge.first + 2, edge.last - 2, min(SAMPLES, edge.last - edge.first))
     sides = sides_of(edge.axis, edge.at, along, away)
     own = signal_change(view.frames[name], view.placements[name], sides, 1)
-    if own is None or not edge.step * own > _RELATIVE * abs(edge.step):
+    if own is None or own * np.sign(edge.step) <= _RELATIVE:
+        return None
+    if abs(own) < MIN_LASTING * abs(edge.relative):
         return None
     ground = [vip_mm_from_raw(view.placements[name], side) for side in sides]
     others: list[float] = []
@@ -317,7 +344,16 @@ def _unshared(view: GroundView, edge: _Edge, sensor: Sensor) -> BlockEdge | None
     if len(others) + len(pan) < MIN_HEADS:
         return None
     least = min(abs(own), *others) if others and len(others) == colours else 0.0
-    by_all_colours = not view.is_pan(name) and pan and np.median(pan) < MAX_SHARED * least
+    by_all_colours = (
+        not view.is_pan(name)
+        and pan
+        and np.median(pan) < MAX_SHARED * least
+        and all(
+            _steps_there(view.rig.sensor(other), lines, edge)
+            for other, lines in means.items()
+            if other != name and not view.is_pan(other)
+        )
+    )
     if max(others + pan) > MAX_SHARED * abs(own) and not by_all_colours:
         return None
     counts = level1_counts_per_dn(sensor.bits)
