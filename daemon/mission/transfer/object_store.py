@@ -3,7 +3,8 @@
 Requests are repeated after time-outs, throttling and errors of the server. What was read counts
 only with the length that the store states. Credentials and the endpoint come from the environment
 (`AWS_ACCESS_KEY_ID`, `AWS_ENDPOINT_URL`, `GOOGLE_APPLICATION_CREDENTIALS`,
-`AZURE_STORAGE_ACCOUNT_KEY` and others of the vendors).
+`AZURE_STORAGE_ACCOUNT_KEY` and others of the vendors), and so does the permission to do without TLS
+(`AWS_ALLOW_HTTP`, `GOOGLE_ALLOW_HTTP`, `AZURE_ALLOW_HTTP`).
 """
 
 from __future__ import annotations
@@ -30,6 +31,11 @@ CONNECT_TIMEOUT_S: Final = 10.0
 RETRIES: Final = 8
 RETRY_TIMEOUT_S: Final = 180.0
 _FIRST_PAUSE_S: Final = 0.1
+_ALLOW_HTTP: Final = {
+    "s3": "AWS_ALLOW_HTTP",
+    "gs": "GOOGLE_ALLOW_HTTP",
+    "az": "AZURE_ALLOW_HTTP",
+}
 _URL = re.compile(r"([a-z0-9]+)://([^/?#@]+)(/[^?#]*)?")
 
 T = TypeVar("T")
@@ -83,7 +89,7 @@ class ObjectStore:
                 "timeout": timedelta(seconds=REQUEST_TIMEOUT_S),
                 "connect_timeout": timedelta(seconds=CONNECT_TIMEOUT_S),
                 # Options given here take the place of those in the environment.
-                "allow_http": os.environ.get("AWS_ALLOW_HTTP", "").lower() in ("1", "true"),
+                "allow_http": os.environ.get(_ALLOW_HTTP[match[1]], "").lower() in ("1", "true"),
             },
             "retry_config": {
                 "max_retries": RETRIES,
