@@ -22,8 +22,10 @@ PREFIX: Final = "server."
 SENTENCE_MAX: Final = 2000
 """Characters; a longer sentence is shown as it is."""
 DEPTH_MAX: Final = 4
-LISTS: Final = ("missing", "problems", "reasons", "notes")
+LISTS: Final = ("missing", "problems", "reasons", "notes", "recovery")
 """Keys of lists of sentences."""
+FURTHER: Final = ("poweroff",)
+"""Keys of sentences of which a record has several."""
 SEPARATOR: Final = "; "
 """Between the sentences of a list."""
 NUMBERS: Final = frozenset(
@@ -157,6 +159,10 @@ def with_messages(value: Any) -> Any:
             found[f"{key}_messages"] = [
                 (message_of(one) or one) if isinstance(one, str) else one for one in listed
             ]
+    for key in FURTHER:
+        text = value.get(key)
+        if isinstance(text, str) and (message := message_of(text)) is not None:
+            found[f"{key}_message"] = message
     return with_message(found)
 
 

@@ -175,7 +175,7 @@ def test_degraded_with_many_faults(cockpit: Cockpit) -> None:
     cockpit.until("document.querySelectorAll('#faults > li').length > 20")
     for lamp, state in (
         ("heads", "warning"),
-        ("disk", "caution"),
+        ("disk", "warning"),
         ("position", "caution"),
         ("trigger", "good"),
     ):
@@ -384,9 +384,11 @@ def test_the_link_is_lost_and_comes_back_by_itself(cockpit: Cockpit) -> None:
 
 
 def test_after_landing_the_summary_stays_without_an_alarm(cockpit: Cockpit) -> None:
+    browser = cockpit.browser
+    browser.click("#tab-alarms")
     cockpit.emit({"event": "phase", "phase": "landed"})
     cockpit.status("landed", triggers=9)
-    browser = cockpit.browser
+    cockpit.until("document.querySelector('#landing').checkVisibility()")
     cockpit.until("document.querySelectorAll('[data-file]').length === 4")
     cockpit.service.end()
     cockpit.until("document.body.classList.contains('flight-ended')")

@@ -24,6 +24,7 @@ NO_IMAGE = "Head SU03 sent no image. Check power and cable."
 MISSING = "GPS time is not known (wait for the receiver's fix; check its antenna)"
 REFUSED = f"not armed: {MISSING}; override to fly without"
 NO_FRAME = "no head sent a frame"
+RECOVERED = "exposure 7: was stored but not sealed; sealed from the log (mark)"
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +36,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def service(folder: Path) -> Iterator[Service]:
     service = Service(folder)
-    service.emit(flight_events.mission())
+    service.emit(flight_events.mission() | {"recovery": [RECOVERED]})
     service.emit({"event": "bound", "device": "SU03", "kind": "head", "found": {}})
     service.emit(flight_events.device_event("SU03", "lost", LOST, fault=True))
     service.emit({"event": "disk-health", "disk": "b", "fault": True, "sentence": DISK})
@@ -94,6 +95,9 @@ def test_sentences_of_the_service_are_shown_in_the_language_of_the_page(
     assert in_language(language, LOST) in device
     # The newest exposure is the lost one; its cause stands where findings of others stand.
     assert in_language(language, NO_FRAME) in browser.text("#findings")
+    for listed, sentence in (("#missing", MISSING), ("#recovery", RECOVERED)):
+        text = browser.evaluate(f"document.querySelector('{listed}').textContent")
+        assert in_language(language, sentence) in text
 
 
 def test_an_answer_and_what_is_missing_are_shown_in_the_language_of_the_page(
@@ -121,7 +125,15 @@ def test_no_english_sentence_of_the_service_stays_in_the_pseudo_language(
 ) -> None:
     """A text of the catalogs has accents; a sentence without a code keeps its plain letters."""
     open_in(browser, service, "qps")
-    for selector in ("#faults", "#findings", "#devices", "#alarm-bar", "#rows"):
+    for selector in (
+        "#faults",
+        "#findings",
+        "#missing",
+        "#recovery",
+        "#devices",
+        "#alarm-bar",
+        "#rows",
+    ):
         plain = browser.evaluate(
             f"""(() => {{
               const found = [];

@@ -35,6 +35,7 @@ SOURCES = (
     *("daemon/onboard/pipeline/worker.py", "daemon/mission/mirror/mirrored.py"),
     *("daemon/onboard/service/landed_stage.py", "daemon/onboard/service/operator_journal.py"),
     *("daemon/onboard/service/triangulation_link.py", "daemon/onboard/flight/fault_latches.py"),
+    *("daemon/onboard/service/poweroff.py", "daemon/mission/verification/recovery.py"),
 )
 """What writes the sentences of findings, faults, commands and landing."""
 WORDS_MIN = 5
@@ -43,6 +44,7 @@ PARTS = (
     r"^[;.,:)( ]|[:(] ?$|coverage counts as a gap$|^by their places|^by the fixed pattern",
     r"\(common scale .*cone SU11$|^Motion blur SU11|^probe SU11 reads|^A block of",
     r"^SU11 m SU11 the planned",
+    r"^Columns SU11 to|^was (triggered|stored) but",
     r"^(rejected|accepted); |^has its computed|^parity SU11|^SU11 cannot be read",
 )
 """Parts of sentences, which are in the sentences below."""
@@ -70,6 +72,11 @@ SENTENCES = (
     "cable. Fly this exposure again.",
     "Motion blur along track; shorten the exposure, check TDI, speed, mount and crab.",
     "Tilted by 4.1 deg, 3.0 deg allowed; fly this part again, level.",
+    "Columns 5 to 90, rows 7 to 80 of SU11 (or of SU12 at the same place) show other ground than "
+    "the other heads although they have texture: a part of another exposure. Check the head, "
+    "cable and transfer. Fly this exposure again.",
+    "exposure 7: was stored but not sealed; sealed from the log (mark)",
+    "exposure 7: was triggered but never stored; recorded as lost",
     "The signal changes by +8% after line 812 of the rows of SU11: gain or offset changed during "
     "read-out. Radiometry of this frame is wrong. Check the head. 3 frames step while other heads "
     "show no such ground: check what these heads share, supply and clock.",
@@ -179,8 +186,12 @@ def test_the_records_of_the_api_have_messages_next_to_their_sentences() -> None:
     record = {
         "faults": [{"sentence": sentence}, {"sentence": "Unknown."}],
         "status": {"missing": ["token rejected", "Unknown."]},
+        "landing": {"poweroff": "Unknown."},
     }
+    assert with_messages(record)["landing"] == record["landing"]
+    record["landing"] = {"poweroff": "token rejected"}
     found = with_messages(record)
+    assert found["landing"]["poweroff_message"]["code"] == "command.token_rejected"
     assert found["faults"] == [{"sentence": sentence, "message": message}, {"sentence": "Unknown."}]
     assert found["status"]["missing"] == ["token rejected", "Unknown."]
     assert found["status"]["missing_messages"] == [

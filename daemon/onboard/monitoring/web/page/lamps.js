@@ -59,7 +59,9 @@ function disk(flight) {
   if (left == null) return { state: "off", value: "–" };
   const hasProblem = disks.some((one) => one.state !== "in use" || one.healthy === false);
   const isShort = planned != null && left < planned;
-  return { state: left === 0 ? "warning" : isLow || isShort || hasProblem ? "caution" : "good", value: number(left) };
+  // As severe as what is reported of the disks.
+  const isSevere = flight.brief.faults.some((one) => one.stands && one.severity === "warning" && /^disk\b/.test(one.device));
+  return { state: left === 0 || isSevere ? "warning" : isLow || isShort || hasProblem ? "caution" : "good", value: number(left) };
 }
 
 function processing(flight) {

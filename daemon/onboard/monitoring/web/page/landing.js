@@ -106,14 +106,16 @@ async function saveReport() {
 }
 
 // Buttons of an action: one for each folder that a mission may be copied into, none where it is not possible.
-function buttonsOf(name, { folders, poweroff }, isBusy, feed) {
+function buttonsOf(name, { folders, poweroff, poweroff_message: message }, isBusy, feed) {
   const one = (label, body) => button(label, (event) => {
     event.target.disabled = true;
     feed.command(name, body).finally(() => { event.target.disabled = isBusy; });
   }, { disabled: isBusy, dataset: { action: name } });
   if (name === "copy") return folders.length ? folders.map((folder) => one(t("landing.copy_to", { folder }), { folder }))
     : [element("span", { className: "note", textContent: t("landing.no_folder") })];
-  if (name === "shutdown" && poweroff) return [element("span", { className: "note", lang: "en", textContent: poweroff })];
+  if (name === "shutdown" && poweroff) {
+    return [element("span", { className: "note", lang: serverLanguage({ message }), textContent: serverText({ message }, poweroff) })];
+  }
   return [one(t(`landing.${name}`), {})];
 }
 
@@ -134,10 +136,14 @@ function nextSteps(feed) {
 }
 
 export function start(root, feed) {
+  let phase = null;
   const draw = () => {
     const { brief } = feed.flight;
     if (!brief) return;
     root.hidden = brief.phase !== "landed";
+    // The summary comes by itself, also on a phone, whose map covers it.
+    if (!root.hidden && phase !== "landed") feed.showTab("flight");
+    phase = brief.phase;
     if (root.hidden) return;
     const rows = summary(feed.flight);
     redraw(root, JSON.stringify([rows, [...kept.files.keys()], brief.landing, feed.isLinked]), () => [

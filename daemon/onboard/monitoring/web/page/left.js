@@ -10,16 +10,17 @@ const REFRESH_MS = 10000;
 const SOON_S = 1800;
 const SLOW_MPS = 3;
 const SHORT_DISK_S = 600;
+const MARKS = { caution: "▲ ", warning: "✖ " };
 
 let remaining = null;
 
-function disk(status) {
+function disk({ status = {}, faults = [] }) {
   const { exposures_left: left, exposures_planned: planned, disk_seconds: seconds, disk_free_bytes: free, is_disk_low: isLow } = status;
   if (left == null) return { value: "–" };
   const isShort = isLow || (planned != null && left < planned) || (seconds != null && seconds < SHORT_DISK_S);
   return { value: free == null ? t("left.exposures", { n: left, count: number(left) }) : bytes(free),
     detail: [seconds == null ? null : span(seconds), free == null ? null : t("left.exposures", { n: left, count: number(left) })].filter(Boolean).join(" · "),
-    state: left === 0 ? "warning" : isShort ? "caution" : "" };
+    state: left === 0 || faults.some((one) => one.stands && one.code === "disk" && one.severity === "warning") ? "warning" : isShort ? "caution" : "" };
 }
 
 function lines() {
@@ -51,10 +52,10 @@ function end(flight) {
 
 export function start(root, feed) {
   const draw = () => {
-    const cells = { disk: disk(feed.flight.brief?.status || {}), lines: lines(), light: light(), end: end(feed.flight) };
+    const cells = { disk: disk(feed.flight.brief || {}), lines: lines(), light: light(), end: end(feed.flight) };
     redraw(root, JSON.stringify(cells), () => Object.entries(cells).map(([name, { value, detail, state }]) =>
       element("div", { className: state || "", id: `left-${name}` }, element("dt", { textContent: t(`left.${name}`) }),
-        element("dd", {}, `${state ? "▲ " : ""}${value} `, element("small", { textContent: detail || "" })))));
+        element("dd", {}, `${MARKS[state] ?? ""}${value} `, element("small", { textContent: detail || "" })))));
   };
   const update = async () => {
     if (feed.flight.brief && feed.isLinked) remaining = await fetchJson("/api/v1/remaining") ?? remaining;

@@ -1,7 +1,7 @@
 // The phase, and the one large button that leads to the next phase.
 
 import { by, element } from "./dom.js";
-import { t } from "./i18n.js";
+import { serverTexts, t } from "./i18n.js";
 
 const PHASE_CLASS = { flying: "good", armed: "good", fault: "warning", idle: "caution" };
 const ALARMS = "alarms";
@@ -43,7 +43,7 @@ export function start(_root, feed) {
   feed.subscribe(() => {
     const { brief } = feed.flight;
     const chip = by("phase");
-    const missing = brief.status?.missing || [];
+    const missing = serverTexts(brief.status || {}, "missing");
     const isBlocked = brief.phase === "ready" && missing.length > 0;
     chip.textContent = t(`phase.${isBlocked ? "not_ready" : brief.phase}`);
     chip.className = `chip ${isBlocked ? "caution" : PHASE_CLASS[brief.phase] || ""}`;
@@ -54,7 +54,7 @@ export function start(_root, feed) {
     by("simulated").hidden = !brief.simulated;
     by("aircraft").textContent = brief.mission.rig || "";
     document.title = `${brief.simulated ? `${t("page.simulated")} · ` : ""}${brief.mission.rig || ""} · Syntopic`;
-    by("recovery").replaceChildren(...(brief.mission.recovery || []).map((one) =>
+    by("recovery").replaceChildren(...serverTexts(brief.mission, "recovery").map((one) =>
       element("li", { textContent: t("page.recovered", { what: one }) })));
     const shown = brief.phase === "ready" || brief.phase === "armed" ? missing : [];
     by("missing").replaceChildren(...shown.map((one) => element("li", { textContent: `▲ ${one}` })));
