@@ -16,9 +16,10 @@ from daemon.terminal.console import Console
 RINEX_HELP = """Export a receiver's observations as RINEX with the event marks of the exposures.
 
 Reads the recorded RXM-RAWX of u-blox, RANGE of NovAtel and MeasEpoch of Septentrio receivers. Each
-event mark is an epoch of flag 5, rounded to 100 ns; `marks.csv` keeps nanoseconds and standard
-deviations. Ephemerides of GPS are written as `<receiver>.nav` where RXM-SFRBX, RAWEPHEM or GPSRawCA
-was recorded. A position file of RTKLIB comes back with `syntopic orient --trajectory`.
+event mark is an epoch of flag 5, rounded to 100 ns (version 4.02: to the nanosecond); `marks.csv`
+keeps nanoseconds and standard deviations. Ephemerides are written as `<receiver>.nav` where
+RXM-SFRBX, RAWEPHEM (GPS), GPSRawCA, GALRawINAV, GLORawCA or BDSRaw was recorded. A position file of
+RTKLIB comes back with `syntopic orient --trajectory`.
 
 Examples: `syntopic export rinex MISSION`,
 `syntopic export rinex MISSION --version 4.00 --antenna "NOV703GGG.R2    NONE"`
@@ -27,7 +28,7 @@ Examples: `syntopic export rinex MISSION`,
 
 def rinex(
     mission: Annotated[Path, typer.Argument(help="Mission folder.")],
-    version: Annotated[str, typer.Option(help="RINEX version: 3.04 or 4.00.")] = "3.04",
+    version: Annotated[str, typer.Option(help="RINEX version: 3.04, 4.00 or 4.02.")] = "3.04",
     receiver: Annotated[str | None, typer.Option(help="Navigator, if there are several.")] = None,
     antenna: Annotated[str, typer.Option(help="Antenna type by IGS name.")] = "",
     rtklib: Annotated[
@@ -70,7 +71,7 @@ def rinex(
     console = Console()
     console.print(
         f"{done.written.epochs} epochs, {done.written.values} values, {done.written.marks} event "
-        f"marks in {done.folder / done.name}; {len(done.ephemerides)} ephemerides of GPS",
+        f"marks in {done.folder / done.name}; {len(done.ephemerides)} ephemerides",
         soft_wrap=True,
     )
     if not done.ephemerides:

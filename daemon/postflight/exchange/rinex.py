@@ -1,9 +1,10 @@
-"""RINEX observation files, 3.04 and 4.00, with event marks as events of flag 5.
+"""RINEX observation files, 3.04, 4.00 and 4.02, with event marks as events of flag 5.
 
-Observation epochs have 100 ns in both versions, so that a mark is rounded to 100 ns; a sidecar
-keeps nanoseconds and standard deviations.
+Epochs have 100 ns in the first two, so that a mark is rounded to 100 ns; 4.02 has five more digits
+of the second behind the clock offset. A sidecar keeps nanoseconds and standard deviations.
 
-Source: IGS and RTCM SC-104, RINEX 3.04 (2018), RINEX 4.00 (2021), tables A1 to A3.
+Source: IGS and RTCM SC-104, RINEX 3.04 (2018), RINEX 4.00 (2021), RINEX 4.02 (2024), tables A1 to
+A3.
 """
 
 from __future__ import annotations
@@ -14,7 +15,8 @@ from datetime import UTC, datetime, timedelta
 
 from drivers.receivers.observations import Observation, ObservationEpoch
 
-VERSIONS = ("3.04", "4.00")
+VERSIONS = ("3.04", "4.00", "4.02")
+FINE_VERSION = "4.02"
 SYSTEMS = "GRESCJI"
 KINDS = ("C", "L", "D", "S")
 TICK_NS = 100
@@ -66,33 +68,37 @@ def observation_text(
         header: names and places.
         epochs: observations; of two at one instant the first is written.
         marks_ns: event marks, GPS time.
-        version: "3.04" or "4.00".
+        version: one of `VERSIONS`.
 
     Raises:
         ValueError: no epochs, or another version.
     """
     if version not in VERSIONS or not epochs:
         raise ValueError(f"version {version}, {len(epochs)} epochs")
+    is_fine = version == FINE_VERSION
     ordered: dict[int, ObservationEpoch] = {}
     for epoch in epochs:
-        ordered.setdefault(_rounded(epoch.gps_ns), epoch)
+        ordered.setdefault(written_ns(epoch.gps_ns, version), epoch)
     instants = sorted(ordered)
     types = _types(ordered.values())
     lines = _header(header, ordered, types, version)
-    pending = sorted(_rounded(mark) for mark in marks_ns)
+    pending = sorted(written_ns(mark, version) for mark in marks_ns)
     lock: dict[tuple[str, str], tuple[float, int]] = {}
     values = left_out = 0
     for instant in instants:
         while pending and pending[0] <= instant:
-            lines.append(_event(pending.pop(0)))
+            lines.append(_event(pending.pop(0), is_fine=is_fine))
         body, written, lost = _epoch(ordered[instant], types, lock)
-        lines += [_time(instant, 0, len(body)), *body]
+        lines += [_time(instant, 0, len(body), is_fine=is_fine), *body]
         values, left_out = values + written, left_out + lost
-    lines += [_event(mark) for mark in pending]
+    lines += [_event(mark, is_fine=is_fine) for mark in pending]
     return RinexText("\n".join(lines) + "\n", len(instants), len(marks_ns), values, left_out)
 
 
-def _rounded(gps_ns: int) -> int:
+def written_ns(gps_ns: int, version: str) -> int:
+    """An instant as a version holds it: to the nanosecond, or rounded to 100 ns."""
+    if version == FINE_VERSION:
+        return gps_ns
     return (gps_ns + TICK_NS // 2) // TICK_NS * TICK_NS
 
 
@@ -246,10 +252,12 @@ def _instant(gps_ns: int, system: str) -> str:
     return f"{at.year:6d}{at.month:6d}{at.day:6d}{at.hour:6d}{at.minute:6d}{second}     {system}"
 
 
-def _time(gps_ns: int, flag: int, count: int) -> str:
+def _time(gps_ns: int, flag: int, count: int, *, is_fine: bool) -> str:
     at, ticks = _calendar(gps_ns)
-    return f"> {at:%Y %m %d %H %M} {at.second:02d}.{ticks:07d}  {flag}{count:3d}"
+    line = f"> {at:%Y %m %d %H %M} {at.second:02d}.{ticks:07d}  {flag}{count:3d}"
+    # 6X, the clock offset (F15.12) blank, 1X, I5.5: picoseconds beyond the 100 ns.
+    return f"{line}{'':22}{gps_ns % TICK_NS * 1000:05d}" if is_fine else line
 
 
-def _event(gps_ns: int) -> str:
-    return _time(gps_ns, EPOCH_FLAG_EVENT, 0)
+def _event(gps_ns: int, *, is_fine: bool) -> str:
+    return _time(gps_ns, EPOCH_FLAG_EVENT, 0, is_fine=is_fine)

@@ -1,6 +1,7 @@
-"""RINEX navigation files, 3.04 and 4.00, of GPS ephemerides (LNAV).
+"""RINEX navigation files, 3.04, 4.00 and 4.02, of GPS, Galileo, GLONASS and BeiDou ephemerides.
 
-Source: IGS and RTCM SC-104, RINEX 3.04 (2018), tables A5 and A6; RINEX 4.00 (2021), "EPH LNAV".
+Source: IGS and RTCM SC-104, RINEX 3.04 (2018), tables A5 to A14; RINEX 4.00 (2021), "EPH LNAV",
+"EPH INAV", "EPH FDMA", "EPH D1".
 """
 
 from __future__ import annotations
@@ -8,38 +9,51 @@ from __future__ import annotations
 from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
 
+from drivers.receivers.broadcast_ephemeris import BroadcastEphemeris
 from drivers.receivers.gps_ephemeris import GpsEphemeris
 
 _GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC)
 _WEEK_S = 604_800.0
+_SYSTEMS = {"G": "G: GPS", "E": "E: Galileo", "R": "R: GLONASS", "C": "C: BDS"}
 
 
 def navigation_text(
-    ephemerides: Sequence[GpsEphemeris], *, version: str, made: datetime, comments: Sequence[str]
+    ephemerides: Sequence[GpsEphemeris | BroadcastEphemeris],
+    *,
+    version: str,
+    made: datetime,
+    comments: Sequence[str],
 ) -> str:
     """A navigation file.
 
     Args:
         ephemerides: in any order; they are written by reference time of the clock.
-        version: "3.04" or "4.00".
+        version: "3.04", "4.00" or "4.02".
         made: when the file was made, UTC.
         comments: each at most 60 characters.
     """
-    ordered = sorted(ephemerides, key=lambda one: (_clock_time(one), one.satellite))
+    records = [_of_gps(one) if isinstance(one, GpsEphemeris) else one for one in ephemerides]
+    ordered = sorted(records, key=lambda one: (one.clock_time, one.satellite))
+    systems = {one.satellite[0] for one in ordered}
+    system = "M: Mixed" if len(systems) > 1 else _SYSTEMS[min(systems, default="G")]
     lines = [
-        _line(f"{version:>9}{'':11}{'N: GNSS NAV DATA':<20}{'G: GPS':<20}", "RINEX VERSION / TYPE"),
+        _line(f"{version:>9}{'':11}{'N: GNSS NAV DATA':<20}{system:<20}", "RINEX VERSION / TYPE"),
         _line(f"{'Syntopic':<20}{'':<20}{made:%Y%m%d %H%M%S} UTC", "PGM / RUN BY / DATE"),
         *(_line(comment, "COMMENT") for comment in comments),
         _line("", "END OF HEADER"),
     ]
     for one in ordered:
-        if version == "4.00":
-            lines.append(f"> EPH G{one.satellite:02d} LNAV")
-        clock, rest = one.values[:3], one.values[3:]
-        at = _clock_time(one)
-        lines.append(f"G{one.satellite:02d} {at:%Y %m %d %H %M %S}" + _numbers(clock))
+        if version.startswith("4."):
+            lines.append(f"> EPH {one.satellite} {one.message}")
+        values = (*one.values, *(one.status if version.startswith("4.") else ()))
+        clock, rest = values[:3], values[3:]
+        lines.append(f"{one.satellite} {one.clock_time:%Y %m %d %H %M %S}" + _numbers(clock))
         lines += ["    " + _numbers(rest[k : k + 4]) for k in range(0, len(rest), 4)]
     return "\n".join(lines) + "\n"
+
+
+def _of_gps(one: GpsEphemeris) -> BroadcastEphemeris:
+    return BroadcastEphemeris(f"G{one.satellite:02d}", "LNAV", _clock_time(one), one.values)
 
 
 def _clock_time(one: GpsEphemeris) -> datetime:

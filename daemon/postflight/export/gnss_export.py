@@ -24,21 +24,32 @@ from daemon.mission.store.level2 import write_folder
 from daemon.orientation.exterior_orientation import mount_of, sealed_exposures
 from daemon.orientation.geodesy import ECEF_FROM_GEODETIC
 from daemon.postflight.exchange.rinex import (
-    TICK_NS,
     VERSIONS,
     RinexHeader,
     RinexText,
     observation_text,
+    written_ns,
 )
 from daemon.postflight.exchange.rinex_navigation import navigation_text
+from drivers.receivers.broadcast_ephemeris import (
+    BroadcastEphemeris,
+    RawPage,
+    broadcast_ephemerides,
+)
 from drivers.receivers.gps_ephemeris import GpsEphemeris, Subframe, ephemerides_of
 from drivers.receivers.novatel.observations import novatel_observations, novatel_subframes
 from drivers.receivers.observations import WEEK_NS, ObservationCounts, ObservationEpoch
 from drivers.receivers.septentrio.observations import (
+    has_meas3,
     septentrio_observations,
+    septentrio_pages,
     septentrio_subframes,
 )
-from drivers.receivers.ublox.observations import ublox_observations, ublox_subframes
+from drivers.receivers.ublox.observations import (
+    ublox_observations,
+    ublox_pages,
+    ublox_subframes,
+)
 
 Decoder = Callable[[bytes, ObservationCounts], Iterator[ObservationEpoch]]
 
@@ -54,6 +65,11 @@ SUBFRAMES: Mapping[str, Callable[[bytes], Iterator[Subframe]]] = {
     "septentrio": septentrio_subframes,
 }
 """Decoders of the navigation message of GPS by driver."""
+PAGES: Mapping[str, Callable[[bytes], Iterator[RawPage]]] = {
+    "ublox": ublox_pages,
+    "septentrio": septentrio_pages,
+}
+"""Decoders of the navigation messages of Galileo, GLONASS and BeiDou by driver."""
 MESSAGES = {"ublox": "RXM-RAWX", "novatel": "RANGE", "septentrio": "MeasEpoch"}
 NAVIGATION_MESSAGES = {"ublox": "RXM-SFRBX", "novatel": "RAWEPHEM", "septentrio": "GPSRawCA"}
 MARK_SOURCE = "event-mark"
@@ -79,7 +95,7 @@ class GnssExport:
     without_mark: tuple[int, ...]
     crowded: int
     failures: tuple[ExposureFailure, ...]
-    ephemerides: tuple[GpsEphemeris, ...]
+    ephemerides: tuple[GpsEphemeris | BroadcastEphemeris, ...]
     navigation_message: str
     other_receivers: tuple[str, ...] = ()
 
@@ -94,7 +110,7 @@ def export_rinex(
 ) -> GnssExport:
     """Write `export/rinex/<receiver>/` with `<receiver>.obs` and `marks.csv`.
 
-    Where the receiver recorded the navigation message of GPS, `<receiver>.nav` is written, too.
+    Where the receiver recorded navigation messages, `<receiver>.nav` is written, too.
 
     Args:
         version: of RINEX.
@@ -107,11 +123,17 @@ def export_rinex(
         OSError: the disk refused.
     """
     if version not in VERSIONS:
-        raise GnssExportError(f"RINEX {version} is not written; {' and '.join(VERSIONS)} are")
+        raise GnssExportError(f"RINEX {version} is not written; {', '.join(VERSIONS)} are")
     name, driver, others = _receiver_of(mission, receiver)
     counts = ObservationCounts()
     recorded = _recorded(mission, name)
     epochs = list(DECODERS[driver](recorded, counts))
+    if not epochs and driver == "septentrio" and has_meas3(recorded):
+        raise GnssExportError(
+            f"{mission.log_dir}: receiver {name} recorded Meas3Ranges, whose compression is not "
+            "read, and no MeasEpoch; switch MeasEpoch on in the receiver before the flight, and "
+            "convert this recording with Septentrio's sbf2rin (`syntopic export raw`)"
+        )
     if not epochs:
         raise GnssExportError(
             f"{mission.log_dir}: receiver {name} recorded no {MESSAGES[driver]}; switch the "
@@ -131,11 +153,14 @@ def export_rinex(
         )
     header = _header(mission, name, antenna, exposures)
     written = observation_text(header, epochs, marks, version=version)
-    ephemerides = tuple(
-        ephemerides_of(SUBFRAMES[driver](recorded), near_week=instants[0] // WEEK_NS)
+    near_week = instants[0] // WEEK_NS
+    ephemerides: list[GpsEphemeris | BroadcastEphemeris] = list(
+        ephemerides_of(SUBFRAMES[driver](recorded), near_week=near_week)
     )
+    if driver in PAGES:
+        ephemerides += broadcast_ephemerides(PAGES[driver](recorded), near_week)
     folder = mission.export_dir / "rinex" / name
-    texts = {f"{name}.obs": written.text, "marks.csv": _marks_text(marked)}
+    texts = {f"{name}.obs": written.text, "marks.csv": _marks_text(marked, version)}
     if ephemerides:
         made = _GPS_EPOCH + timedelta(seconds=instants[0] // 1_000_000_000)
         texts[f"{name}.nav"] = navigation_text(
@@ -146,7 +171,7 @@ def export_rinex(
     without = tuple(e.number for e in exposures if e.number not in with_mark)
     return GnssExport(
         folder, f"{name}.obs", written, counts, without, crowded, tuple(sealed.failures),
-        ephemerides, NAVIGATION_MESSAGES[driver], others,
+        tuple(ephemerides), NAVIGATION_MESSAGES[driver], others,
     )  # fmt: skip
 
 
@@ -212,13 +237,13 @@ def _simulated(exposures: list[Exposure]) -> tuple[str, ...]:
     return ("SIMULATED: emulated hardware",) if any(e.simulated for e in exposures) else ()
 
 
-def _marks_text(marked: list[Exposure]) -> str:
+def _marks_text(marked: list[Exposure], version: str) -> str:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(("exposure", "gps_ns", "sigma_ns", "rinex_less_mark_ns", "count"))
     for exposure in marked:
         mark = exposure.mark_gps_ns or 0
-        rounded = (mark + TICK_NS // 2) // TICK_NS * TICK_NS
-        row = (exposure.number, mark, exposure.mark_sigma_ns, rounded - mark, exposure.mark_count)
+        off_ns = written_ns(mark, version) - mark
+        row = (exposure.number, mark, exposure.mark_sigma_ns, off_ns, exposure.mark_count)
         writer.writerow(row)
     return text.getvalue()

@@ -1,4 +1,4 @@
-"""Raw observations and navigation messages of Septentrio receivers: MeasEpoch, GPSRawCA.
+"""Raw observations and navigation messages of Septentrio receivers: MeasEpoch, GPSRawCA and others.
 
 The first signal of a satellite is a block of its own; the others follow it as differences: of the
 pseudorange, of the phase from the pseudorange in cycles, of the Doppler scaled by the frequencies.
@@ -14,6 +14,12 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Final
 
+from drivers.receivers.broadcast_ephemeris import (
+    RawPage,
+    beidou_page,
+    galileo_page,
+    glonass_page,
+)
 from drivers.receivers.gps_ephemeris import Subframe, subframe_of_words
 from drivers.receivers.observations import (
     WEEK_NS,
@@ -31,7 +37,14 @@ from drivers.receivers.septentrio.blocks import (
 
 MEAS_EPOCH: Final = 4027
 GPS_RAW_CA: Final = 4017
+GAL_RAW_INAV: Final = 4023
+GLO_RAW_CA: Final = 4026
+BDS_RAW: Final = 4047
+MEAS3_RANGES: Final = 4109
 _RAW_CA: Final = struct.Struct("<6xBB4x10I")
+_RAW_HEAD: Final = struct.Struct("<6xBBxBBx")
+_E1: Final = 17
+_RAW_WORDS: Final = {GAL_RAW_INAV: 8, GLO_RAW_CA: 3, BDS_RAW: 10}
 LIGHT_MPS: Final = 299_792_458.0
 _HEAD: Final = struct.Struct("<IHBBBB")
 _FIRST: Final = struct.Struct("<BBBBIiHbBHBB")
@@ -127,6 +140,62 @@ def septentrio_subframes(data: bytes) -> Iterator[Subframe]:
         subframe = subframe_of_words(satellite, words)
         if is_right and subframe is not None:
             yield subframe
+
+
+def septentrio_pages(data: bytes) -> Iterator[RawPage]:
+    """Pages of GALRawINAV, GLORawCA and BDSRaw in a recording.
+
+    Those with wrong checksums are left out.
+
+    Args:
+        data: bytes as received.
+
+    Yields:
+        Pages in the order received.
+
+    Source: Septentrio mosaic-X5 reference guide, firmware 4.14, chapter 4, "GALRawINAV",
+        "GLORawCA", "BDSRaw".
+    """
+    for frame in sbf_framer().feed(data):
+        block = int.from_bytes(frame[4:6], "little") & 0x1FFF
+        body = frame[HEADER.size :]
+        count = _RAW_WORDS.get(block, 0)
+        if not count or len(body) < _RAW_HEAD.size + 4 * count:
+            continue
+        number, is_right, source, channel = _RAW_HEAD.unpack_from(body)
+        name = _name(number)
+        if not is_right or name is None:
+            continue
+        bits = 0
+        for word in struct.unpack_from(f"<{count}I", body, _RAW_HEAD.size):
+            bits = bits << 32 | word
+        page = None
+        if block == GAL_RAW_INAV and name[0] == "E" and source & 31 == _E1:
+            # 114 bits of one part, 120 of the other, without the tail of the first.
+            parts = bits >> 142, bits >> 28 & ((1 << 114) - 1)
+            even, odd = parts if not parts[0] >> 113 else parts[::-1]
+            page = galileo_page(int(name[1:]), even, odd)
+        elif block == GLO_RAW_CA and name[0] == "R":
+            page = glonass_page(int(name[1:]), bits >> 11, channel - 8)
+        elif block == BDS_RAW and name[0] == "C":
+            page = beidou_page(int(name[1:]), bits >> 20)
+        if page is not None:
+            yield page
+
+
+def has_meas3(data: bytes) -> bool:
+    """Whether a recording has Meas3Ranges, whose compressed observations are not read.
+
+    Args:
+        data: bytes as received.
+
+    Returns:
+        True with the first such block.
+    """
+    return any(
+        int.from_bytes(frame[4:6], "little") & 0x1FFF == MEAS3_RANGES
+        for frame in sbf_framer().feed(data)
+    )
 
 
 def _epoch(body: bytes, counts: ObservationCounts) -> ObservationEpoch | None:

@@ -10,6 +10,12 @@ import struct
 from collections.abc import Iterator, Mapping
 from typing import Final
 
+from drivers.receivers.broadcast_ephemeris import (
+    RawPage,
+    beidou_page,
+    galileo_page,
+    glonass_page,
+)
 from drivers.receivers.gps_ephemeris import Subframe, subframe_of_words
 from drivers.receivers.observations import (
     WEEK_NS,
@@ -73,18 +79,53 @@ def ublox_subframes(data: bytes) -> Iterator[Subframe]:
     Yields:
         Subframes in the order received.
     """
+    for system, satellite, signal, words, _ in _sfrbx(data):
+        if (system, signal) == (0, 0):
+            subframe = subframe_of_words(satellite, words)
+            if subframe is not None:
+                yield subframe
+
+
+def ublox_pages(data: bytes) -> Iterator[RawPage]:
+    """Pages of Galileo, GLONASS and BeiDou, of RXM-SFRBX in a recording.
+
+    Args:
+        data: bytes as received; the receiver has checked parities.
+
+    Yields:
+        Pages in the order received; I/NAV of E1-B, strings, D1.
+    """
+    for system, satellite, signal, words, channel in _sfrbx(data):
+        bits = 0
+        for word in words:
+            bits = bits << 32 | word
+        page = None
+        if system == 2 and signal in (0, 1) and len(words) in (8, 9):
+            bits >>= 32 * (len(words) - 8)
+            # Two parts of 128 bits, of which the first 114 are data.
+            page = galileo_page(satellite, bits >> 142, bits >> 14 & ((1 << 114) - 1))
+        elif system == 6 and len(words) == 4:
+            page = glonass_page(satellite, bits >> 43, channel - 7)
+        elif system == 3 and signal in (0, 2) and len(words) == 10:
+            bits = 0
+            for word in words:
+                bits = bits << 30 | word & 0x3FFFFFFF
+            page = beidou_page(satellite, bits)
+        if page is not None:
+            yield page
+
+
+def _sfrbx(data: bytes) -> Iterator[tuple[int, int, int, tuple[int, ...], int]]:
+    """System, satellite, signal, words and frequency number of each RXM-SFRBX."""
     for frame in UbxFramer().feed(data):
         payload = frame[6:-2]
         if (frame[2], frame[3]) != SFRBX or len(payload) < _SFRBX_HEAD_NBYTES:
             continue
-        system, satellite, signal = payload[:3]
-        count = payload[4]
-        if (system, signal) != (0, 0) or len(payload) != _SFRBX_HEAD_NBYTES + 4 * count:
+        system, satellite, signal, channel, count = payload[:5]
+        if len(payload) != _SFRBX_HEAD_NBYTES + 4 * count:
             continue
         words = struct.unpack_from(f"<{count}I", payload, _SFRBX_HEAD_NBYTES)
-        subframe = subframe_of_words(satellite, words)
-        if subframe is not None:
-            yield subframe
+        yield system, satellite, signal, words, channel
 
 
 def _rawx(payload: bytes, counts: ObservationCounts) -> ObservationEpoch | None:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import binascii
 import csv
 import json
 import shutil
+import struct
 import subprocess
 import warnings
 from pathlib import Path
@@ -210,6 +212,47 @@ def test_marks_are_events_of_100_ns_and_the_sidecar_keeps_nanoseconds(flown) -> 
         ticks = round(float(line[19:29]) * 1e7)
         assert ticks == round((mark // 100) % 600_000_000)
     assert len(loaded(path).time) == EPOCHS
+
+
+def test_version_4_02_keeps_the_nanoseconds_of_marks(flown, tmp_path: Path) -> None:
+    """Five more digits of the second behind the columns of the clock offset."""
+    mission = Path(shutil.copytree(flown, tmp_path / "mission"))
+    record = mission / "L0/000002/exposure.json"
+    content = json.loads(record.read_text())
+    mark = START_NS + round(SECONDS[1] * 1e9) + 123_456_789
+    content["mark_gps_ns"] = str(mark)
+    record.write_text(json.dumps(content))
+    _, path = exported(mission, "--version", "4.02")
+    text = path.read_text()
+    assert text.startswith("     4.02           OBSERVATION DATA")
+    epochs = [line for line in text.splitlines() if line.startswith("> ")]
+    assert all(len(line) == 62 and line[35:57].strip() == "" for line in epochs)
+    events = [line for line in epochs if line[31] == "5"]
+    # Columns 19 to 29 and 58 to 62: 100 ns, and picoseconds beyond them.
+    found = [round(float(line[18:29]) * 1e7) * 100 + int(line[57:62]) / 1000 for line in events]
+    assert mark % 60_000_000_000 in found and mark % 100 == 89
+    rows = list(csv.DictReader((path.parent / "marks.csv").read_text().splitlines()))
+    assert [row["rinex_less_mark_ns"] for row in rows] == ["0"] * 4
+    _, coarse = exported(mission, "--version", "4.00")
+    rows = list(csv.DictReader((coarse.parent / "marks.csv").read_text().splitlines()))
+    assert rows[1]["rinex_less_mark_ns"] == "11"
+
+
+def test_meas3ranges_of_septentrio_are_refused_by_name(flown, tmp_path: Path) -> None:
+    mission = Path(shutil.copytree(flown, tmp_path / "mission"))
+    text = (mission / "service.toml").read_text().replace('"ublox"', '"septentrio"')
+    (mission / "service.toml").write_text(text)
+    shutil.rmtree(mission / "log")
+    (mission / "log").mkdir()
+    log = FlightLog.create(mission / "log")
+    body = struct.pack("<HHIH", 4109, 32, 1000, 2300) + bytes(18)
+    block = b"$@" + struct.pack("<H", binascii.crc_hqx(body, 0)) + body
+    log.write(Message("raw/gnss", 0, block))
+    log.close()
+    done = RUN.invoke(app, ["export", "rinex", str(mission)])
+    sentence = " ".join(str(done.exception).split())
+    assert done.exit_code != 0 and "recorded Meas3Ranges, whose compression is not read" in sentence
+    assert "switch MeasEpoch on" in sentence
 
 
 def test_two_marks_in_an_interval_are_refused_for_rtklib_only(flown, tmp_path: Path) -> None:
