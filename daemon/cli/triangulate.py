@@ -40,6 +40,8 @@ block (--head). Views of similar direction are matched, oblique ones by the plan
 
 With --live, the mission is triangulated as in flight: exposure by exposure, by the navigation of
 each record. Results are in export/triangulation/live: live.json, orientations.csv and report.html.
+Points then take no part in the adjustment, and the report has their residuals; without --measured
+only those of heights.
 
 A mission of photographs (`syntopic import photographs`) is oriented from features of its images
 without attitudes, and the interior orientation is estimated; control from an ODM `gcp_list.txt`
@@ -111,8 +113,9 @@ def triangulate(
         from daemon.cli.triangulate_live import triangulate_live
 
         triangulate_live(
-            mission, position_sigma or FLOWN_SIGMA_M, attitude_sigma, trajectory, as_json=as_json
-        )
+            mission, position_sigma or FLOWN_SIGMA_M, attitude_sigma, trajectory,
+            points=points, measured=measured, as_json=as_json,
+        )  # fmt: skip
         return
     from daemon.cli.adjust import _peak_mib
     from daemon.cli.triangulate_photographs import POSITION_SIGMA_M, triangulate_photographs

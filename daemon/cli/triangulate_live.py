@@ -21,6 +21,8 @@ def triangulate_live(
     attitude_sigma: tuple[float, float, float],
     trajectory: Path | None,
     *,
+    points: Path | None = None,
+    measured: Path | None = None,
     as_json: bool,
 ) -> None:
     """Replay the live triangulation of a mission and write its files."""
@@ -40,7 +42,7 @@ def triangulate_live(
     source = (
         None if trajectory is None else trajectory_of(folder, read.results.values(), trajectory)
     )
-    done = MissionTriangulation(folder, LiveSettings(), sigmas, source)
+    done = MissionTriangulation(folder, LiveSettings(), sigmas, source, points, measured)
     problems: list[str] = []
     growing = MissionMap(done, lambda _event: None, on_failure=problems.append)
     seconds: list[float] = []
@@ -93,6 +95,14 @@ def _print(found: dict[str, Any]) -> None:
             f"Expected accuracy without control, median: plan {accuracy['plan_m']:.3f} m, height "
             f"{accuracy['height_m']:.3f} m ({accuracy['points']} tie points), sigma0 "
             f"{found['sigma0']:.3f}",
+            highlight=False,
+        )
+    control = found["control"]
+    if control is not None:
+        shown = ["-" if value is None else f"{value:.3f} m" for value in control["rms_m"]]
+        console.print(
+            f"{control['points']} control and check points, not adjusted: RMS east {shown[0]}, "
+            f"north {shown[1]}, height {shown[2]}",
             highlight=False,
         )
     if found["drifts"]:

@@ -308,6 +308,8 @@ class TriangulationSection(ConfigurationSection):
     """Standard deviation of each coordinate of the lever arm."""
     exposures_max: int = Field(default=600, ge=20, le=2000)
     """Latest exposures that are adjusted as one block."""
+    control_points: FilePath | None = None
+    """Table of control and check points with which the block is compared; they take no part."""
     memory_max_mb: int = Field(default=1500, ge=500)
     """Private memory of the process."""
     landing_timeout_s: float = Field(default=10.0, gt=0, le=600)

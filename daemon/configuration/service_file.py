@@ -120,6 +120,10 @@ def _file_problems(content: Mapping[str, Any], folder: Path) -> list[Finding]:
     model = nested_value(content, "plan", "elevation")
     if isinstance(model, str) and not (folder / model).is_file():
         findings.append((("plan", "elevation"), f"is {shown(model)}, and there is no such file"))
+    points = nested_value(content, "triangulation", "control_points")
+    if isinstance(points, str) and not (folder / points).is_file():
+        text = f"is {shown(points)}, and there is no such file"
+        findings.append((("triangulation", "control_points"), text))
     return findings
 
 

@@ -30,6 +30,8 @@ Array = NDArray[np.float64]
 POSITION_M = np.array([0.05, 0.05, 0.08])
 ATTITUDE_DEG = np.array([0.005, 0.005, 0.008])
 BORESIGHT_DEG = 0.0057
+MARGIN_PX = 20
+"""Points nearer to the edge of an image are not measured in it."""
 
 
 @dataclass(frozen=True)
@@ -60,11 +62,24 @@ def flown_block(
     first = EPOCH_GPS_NS + FIRST_AFTER_S * 1_000_000_000
     flight = world.flight.beginning_first_line_at(world.flight.distance_flown_m(first))
     marks = marks_of_lines(world, flight, first, each, lines)
+    names = [f"line {k // each + 1}" for k in range(each * lines)]
+    return write_flown(folder, world, flight, marks, names)
+
+
+def write_flown(
+    folder: Path, world: World, flight: SimulatedFlight, marks: list[int], lines: list[str]
+) -> FlownBlock:
+    """Render an exposure at each mark, and write the mission below the folder.
+
+    Args:
+        lines: name of the line of each exposure.
+    """
+    seed = world.settings.seed
     scene = open_scene(world.scene_settings, folder / "scenes")
     mission, noise = folder / "mission", np.random.default_rng(seed)
     boresight_deg = noise.normal(0.0, BORESIGHT_DEG, 3)
     place, rotation = [], []
-    for number, mark in enumerate(marks, 1):
+    for number, (mark, line) in enumerate(zip(marks, lines, strict=True), 1):
         light = render_ideal(world, scene, flight, mark)
         pixels = np.clip(light / light.mean() * 8000.0, 2, 60000)
         pixels = (pixels + noise.normal(0.0, 40.0, pixels.shape)).clip(2, 65534).astype(np.uint16)
@@ -72,13 +87,73 @@ def flown_block(
         pose = flight.pose(mark)
         place.append(flight.geodetic(true_camera.image_centre_m(world.rig, pose)))
         rotation.append(pose.enu_from_body @ true_camera.BODY_FROM_CAMERA)
-        record = _record(world, flight, number, mark, f"line {(number - 1) // each + 1}")
+        record = _record(world, flight, number, mark, line)
         _add_errors(record["navigation"], noise, boresight_deg)
         write_record(mission, record)
-    (mission / "rig.toml").write_text(file.read_text())
+    (mission / "rig.toml").write_text(Path(world.settings.rig_file).read_text())
     plan = f"[plan]\nground_height_m = {world.plan.ground_height_m}\n"
     (mission / "service.toml").write_text(plan)
     return FlownBlock(mission, world, flight, marks, np.array(place), np.array(rotation))
+
+
+@dataclass(frozen=True)
+class GroundPoints:
+    """Points on the true terrain (p, 3) in the emulator's axes; where exposures (m,) show points
+    (m,), px (m, 2), with noise."""
+
+    enu_m: Array
+    exposure: NDArray[np.int64]
+    point: NDArray[np.int64]
+    px: Array
+
+
+def ground_points(
+    flown: FlownBlock, count: int, seed: int, *, sigma_px: float = 0.1, rays: int = 3
+) -> GroundPoints:
+    """Draw points that at least `rays` images show, and measure them."""
+    random = np.random.default_rng(seed)
+    world, image = flown.world, flown.world.image
+    poses = [flown.flight.pose(mark) for mark in flown.marks]
+    middle = np.array([pose.position_enu_m[:2] for pose in poses])
+    size = np.array([image.width_px, image.height_px])
+    half = 0.4 * size * world.plan.gsd_m
+    low, high = middle.min(axis=0) - half, middle.max(axis=0) + half
+    enu: list[Array] = []
+    seen: list[tuple[int, int, Array]] = []
+    while len(enu) < count:
+        xy = random.uniform(low, high)
+        ground = np.array([*xy, float(world.terrain.height_m(xy[0], xy[1]))])
+        own = []
+        for k, pose in enumerate(poses, 1):
+            at = np.array(true_camera.ideal_pixels(ground, world.rig, pose), dtype=float)
+            if ((at > MARGIN_PX) & (at < size - 1 - MARGIN_PX)).all():
+                own.append((k, len(enu), at + random.normal(0.0, sigma_px, 2)))
+        if len(own) >= rays:
+            seen += own
+            enu.append(ground)
+    return GroundPoints(
+        np.array(enu),
+        np.array([k for k, _, _ in seen]),
+        np.array([p for _, p, _ in seen]),
+        np.array([at for _, _, at in seen]),
+    )
+
+
+def write_points(folder: Path, flown: FlownBlock, points: GroundPoints) -> tuple[Path, Path]:
+    """Write the tables of points and of their image coordinates."""
+    surveyed, measured = folder / "points.csv", folder / "measured.csv"
+    places = [flown.flight.geodetic(one) for one in points.enu_m]
+    rows = [
+        f"P{k:03d},{'control' if k % 2 else 'check'},{a:.10f},{b:.10f},{c:.4f}"
+        for k, (a, b, c) in enumerate(places)
+    ]
+    surveyed.write_text("\n".join(["point,role,latitude_deg,longitude_deg,height_m", *rows]))
+    rows = [
+        f"{k:06d},P{p:03d},{at[0]:.3f},{at[1]:.3f},0.1"
+        for k, p, at in zip(points.exposure, points.point, points.px, strict=True)
+    ]
+    measured.write_text("\n".join(["image,point,column_px,row_px,sigma_px", *rows]))
+    return surveyed, measured
 
 
 def write_image(mission: Path, number: int, pixels: NDArray[np.uint16]) -> None:

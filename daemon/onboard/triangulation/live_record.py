@@ -14,6 +14,7 @@ import numpy as np
 
 from daemon.mission.canonical_json import canonical_bytes
 from daemon.mission.store.level2 import write_folder
+from daemon.onboard.triangulation.control_points import control_json
 from daemon.onboard.triangulation.findings import line_ties, untied_numbers, untied_pairs
 from daemon.onboard.triangulation.mission_triangulation import MissionTriangulation
 from daemon.onboard.triangulation.quality_page import quality_page
@@ -52,7 +53,7 @@ def exposure_json(one: LiveOrientation, frame: LocalFrame) -> dict[str, Any]:
 def summary_json(done: MissionTriangulation) -> dict[str, Any]:
     """Figures of the block, for the page, the record and `--json`."""
     live = done.live
-    accuracy = done.accuracy()
+    accuracy, control = done.accuracy(), control_json(done.residuals)
     last = None if live is None else live.last
     return {
         "format": FORMAT,
@@ -64,6 +65,7 @@ def summary_json(done: MissionTriangulation) -> dict[str, Any]:
         "sigma0": None if last is None else last.sigma0,
         "image_sigma_px": None if live is None else [float(v) for v in live.image_sigma_px],
         "accuracy": None if accuracy is None else accuracy.as_json(),
+        "control": None if control is None else {**control, "residuals": None},
         "drifts": [one.as_json() for one in done.drifts],
         "line_ties": [
             {"lines": list(pair), "tried": tried, "found": found}
@@ -113,6 +115,7 @@ def live_json(done: MissionTriangulation) -> dict[str, Any]:
     own = [] if live is None or frame is None else live.orientations
     return {
         **summary_json(done),
+        "control": control_json(done.residuals),
         "simulated": done.is_simulated,
         "places": PLACES,
         "angles": ANGLES,

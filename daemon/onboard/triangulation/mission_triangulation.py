@@ -20,6 +20,16 @@ from daemon.configuration.model import MountSection, PlanSection
 from daemon.mission.exposure import Exposure
 from daemon.mission.layout import Mission
 from daemon.mission.store.level0 import read_tiff
+from daemon.onboard.triangulation.control_points import (
+    ControlPointsError,
+    ImageMeasurements,
+    PointResidual,
+    SurveyedPoints,
+    control_findings,
+    read_measurements,
+    read_surveyed,
+    residuals_of,
+)
 from daemon.onboard.triangulation.drifts import Drift, drifts_of
 from daemon.onboard.triangulation.findings import (
     CUT_OFF,
@@ -92,6 +102,8 @@ class MissionTriangulation:
         settings: of the triangulation.
         sigmas: of navigation, where the receiver states none.
         trajectory: in place of the navigation in the records.
+        control: table of control and check points, with which the block is compared.
+        measured: table of their image coordinates.
         on_image: receives each image that was added with its orientation.
 
     Raises:
@@ -103,6 +115,8 @@ class MissionTriangulation:
     settings: LiveSettings = field(default_factory=LiveSettings)
     sigmas: SensorSigmas = field(default_factory=SensorSigmas)
     trajectory: NavigationSource | None = None
+    control: Path | None = None
+    measured: Path | None = None
     on_image: Callable[[LiveOrientation, NDArray[np.uint16]], None] | None = None
 
     def __post_init__(self) -> None:
@@ -121,11 +135,14 @@ class MissionTriangulation:
         self.drifts: tuple[Drift, ...] = ()
         self.findings: tuple[TriangulationFinding, ...] = ()
         self.heights: HeightModelCheck | None = None
+        self.residuals: tuple[PointResidual, ...] = ()
         self.block_seconds = 0.0
         self.block_count = 0
         self.has_landed = False
         self.is_simulated = False
         self.relief = self._read_relief()
+        self._control_problem = ""
+        self._surveyed, self._measurements = self._read_control()
         self._planned_lines = self._read_plan()
         self._lines = FlownLines(self._planned_lines)
 
@@ -258,7 +275,9 @@ class MissionTriangulation:
             return
         self.drifts = drifts_of(self.live)
         self.heights = self._check_heights()
-        self.findings = findings_of(
+        if self._surveyed is not None and self.frame is not None:
+            self.residuals = residuals_of(self.live, self.frame, self._surveyed, self._measurements)
+        found = findings_of(
             self.live,
             self.drifts,
             skipped=self.skipped,
@@ -266,6 +285,7 @@ class MissionTriangulation:
             heights=self.heights,
             has_landed=self.has_landed,
         )
+        self.findings = (*found, *control_findings(self.residuals, problem=self._control_problem))
 
     def _read_relief(self) -> TerrainRelief | None:
         try:
@@ -273,6 +293,19 @@ class MissionTriangulation:
         except (OSError, DaemonError, ValueError) as error:
             self.heights = HeightModelCheck(problem=str(error))
             return None
+
+    def _read_control(self) -> tuple[SurveyedPoints | None, ImageMeasurements | None]:
+        """Points with which the block is compared; what is wrong with a table is a finding."""
+        try:
+            if self.control is None:
+                return None, None
+            surveyed = read_surveyed(self.control)
+            if self.measured is None:
+                return surveyed, None
+            return surveyed, read_measurements(self.measured, surveyed.names)
+        except ControlPointsError as error:
+            self._control_problem = str(error)
+            return None, None
 
     def _read_plan(self) -> tuple[str, ...]:
         if self.mission.plan_path is None:

@@ -29,6 +29,7 @@ def quality_page(content: Mapping[str, Any]) -> str:
         f"{content['adjusted']} in the last adjustment{sigma0}."
         f"{' Simulated.' if content['simulated'] else ''}</p>",
         _accuracy(content),
+        _control(content.get("control")),
         "<h2>Findings</h2>",
         _list(f"<b>{escape(f['name'])}</b>: {escape(f['sentence'])}" for f in content["findings"]),
         "<h2>To fly again, by the tie points</h2>",
@@ -61,6 +62,37 @@ def _accuracy(content: Mapping[str, Any]) -> str:
         f"<p>{found['points']} tie points; image coordinates {px[0]:.3f} and {px[1]:.3f} px. "
         "Standard deviations by the adjustment; no point on the ground was measured.</p>"
     )
+
+
+def _control(control: Mapping[str, Any] | None) -> str:
+    """Residuals at control and check points; nothing where none were given."""
+    if control is None:
+        return ""
+    rows = "".join(_residual(one) for one in control["residuals"] or ())
+    total = [_length(value) for value in control["rms_m"]]
+    expected = [_length(value) for value in control["expected_m"]]
+    px = "" if control["rms_px"] is None else f" Image residuals {control['rms_px']:.2f} px RMS."
+    return (
+        "<h2>Control and check points, block minus survey</h2>"
+        f"<p>{control['points']} points, none of them in the adjustment. East, north, height RMS "
+        f"{', '.join(total)}; expected {', '.join(expected)}.{px} Without image coordinates only "
+        "heights are compared, with the surface of the tie points.</p>"
+        "<table><tr><th>Point</th><th>East</th><th>North</th><th>Height</th><th></th></tr>"
+        f"{rows}</table>"
+    )
+
+
+def _residual(one: Mapping[str, Any]) -> str:
+    cells = "".join(f'<td class="n">{_length(value)}</td>' for value in one["difference_m"])
+    note = one["reason"] or (
+        f"{one['rays']} images" if one["rays"] else f"{one['ties']} tie points"
+    )
+    name = f"{escape(one['name'])}, {escape(one['role'])}"
+    return f"<tr><td>{name}</td>{cells}<td>{escape(note)}</td></tr>"
+
+
+def _length(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f} m"
 
 
 def _drifts(drifts: Sequence[Mapping[str, Any]]) -> str:

@@ -127,7 +127,9 @@ class _Work:
         )
         self._map: MissionMap | None = None
         try:
-            self._done: MissionTriangulation | None = MissionTriangulation(folder, settings, sigmas)
+            self._done: MissionTriangulation | None = MissionTriangulation(
+                folder, settings, sigmas, control=section.control_points
+            )
         except (OSError, DaemonError) as error:
             self._done = None
             self._failed(str(error))

@@ -27,7 +27,7 @@ HOLD: Final = 1e-3
 """Weight of a gain of one at a node; an overlap has the weight 1."""
 STIFFNESS: Final = 0.02
 """Weight of equal gains at two neighbouring nodes."""
-HAZE_HOLD: Final = 0.1
+HAZE_HOLD: Final = 0.003
 """Weight of no haze at a node, haze in units of the mean signal."""
 HAZE_STIFFNESS: Final = 10.0
 """Weight of equal haze at two neighbouring nodes."""

@@ -33,20 +33,16 @@ from processing.geometry.rotation import vectors_from_rotations
 from processing.pipelines.live_triangulation import MeasuredImage
 from tests.daemon.flown_block import (
     FlownBlock,
-    flown_block,
+    ground_points,
     read_record,
     write_image,
+    write_points,
     write_record,
 )
+from tests.daemon.onboard.conftest import EACH, LINES
 
 RUN = CliRunner()
-EACH, LINES = 5, 2
 DRIFT_DEG_H = 5.0
-
-
-@pytest.fixture(scope="module")
-def flown(tmp_path_factory) -> FlownBlock:
-    return flown_block(tmp_path_factory.mktemp("live"), EACH, LINES)
 
 
 @pytest.fixture(scope="module")
@@ -130,10 +126,15 @@ def test_each_exposure_has_an_orientation_before_the_next_is_taken(flown) -> Non
     assert np.mean(squares) < 2.0
 
 
-def test_the_command_writes_the_record_and_a_page_and_repeats_to_the_byte(copied) -> None:
-    done = RUN.invoke(app, ["triangulate", str(copied), "--live", "--json"])
+def test_the_command_writes_the_record_and_a_page_and_repeats_to_the_byte(
+    copied, flown, tmp_path
+) -> None:
+    tables = write_points(tmp_path, flown, ground_points(flown, 8, 3))
+    options = ["--points", str(tables[0]), "--measured", str(tables[1]), "--json"]
+    done = RUN.invoke(app, ["triangulate", str(copied), "--live", *options])
     assert done.exit_code == 0, done.output + str(done.exception)
     found = json.loads(done.stdout)
+    assert found["control"]["in_plan"] == found["control"]["points"] == 8
     folder = Path(found["folder"])
     record = json.loads((folder / "live.json").read_text())
     assert len(record["orientations"]) == EACH * LINES and not record["is_preliminary"]
@@ -142,6 +143,8 @@ def test_the_command_writes_the_record_and_a_page_and_repeats_to_the_byte(copied
     assert len(rows) == EACH * LINES + 3
     page = (folder / "report.html").read_text()
     assert "Expected accuracy without control points" in page and "<script" not in page
+    assert "Control and check points" in page and page.count("<tr><td>P00") == 8
+    assert len(record["control"]["residuals"]) == 8
     first = {p.name: p.read_bytes() for p in folder.iterdir() if p.name == "orientations.csv"}
     again = RUN.invoke(app, ["triangulate", str(copied), "--live"])
     assert again.exit_code == 0 and "Expected accuracy" in again.output
