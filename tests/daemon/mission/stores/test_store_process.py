@@ -5,6 +5,9 @@ from __future__ import annotations
 import json
 import pickle
 import shutil
+import subprocess
+import sys
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -35,7 +38,8 @@ from daemon.mission.transfer.store_products import (
 )
 from daemon.mission.transfer.store_transfer import transfer_to_store
 from daemon.mission.transfer.store_verification import verify_in_store
-from tests.daemon.diverging_camera import copied, flown_mission
+from daemon.postflight.batch import software_identity
+from tests.daemon.diverging_camera import ROOT, copied, flown_mission
 from tests.daemon.mission.stores.faulty_s3 import BUCKET, REGION, Faults
 
 pytestmark = [pytest.mark.peer, pytest.mark.trust]
@@ -228,6 +232,47 @@ def test_a_catalog_of_a_bucket_has_the_verdicts_of_products_computed_there(
         report = json.loads((mission.level2(2) / "quality.json").read_bytes())
     flags = json.loads((processed.level2(2) / "quality.json").read_bytes())["flags"]
     assert report["flags"] == flags
+
+
+def test_a_worker_of_another_version_publishes_nothing(
+    flown: Mission, store: Callable[..., str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place = uploaded(flown, store())
+    process(place.url, "--only", "1")
+    before = set(list_products(place).committed())
+    older = {**software_identity.software_identity(), "software": "0.0.1"}
+    monkeypatch.setattr(software_identity, "software_identity", lambda: older)
+    assert process(place.url, "--dry-run")["pending"] == [1, 2, 3, 4]  # other code, another key
+    done = CliRunner().invoke(app, ["process", place.url, "--processes", "0"])
+    assert done.exit_code and "instead of 0.0.1" in f"{done.output} {done.exception}"
+    assert set(list_products(place).committed()) == before
+
+
+@pytest.mark.soak
+def test_two_runs_at_once_one_of_them_killed_leave_every_product_set_committed_once(
+    store: Callable[..., str], tmp_path: Path
+) -> None:
+    numbers = list(range(1, 41))
+    mission = flown_mission(tmp_path / "flown", numbers)
+    faults = Faults()
+    place = uploaded(mission, store(faults))
+    command = [sys.executable, "-m", "daemon", "process", place.url, "--json"]
+    runs = [
+        subprocess.Popen([*command, "--processes", count], cwd=ROOT, stdout=subprocess.PIPE)
+        for count in ("0", "2")
+    ]
+    limit = time.monotonic() + 300
+    while len(list(list_products(place).committed())) < 5:
+        assert time.monotonic() < limit and all(run.poll() is None for run in runs)
+        time.sleep(0.05)
+    runs[1].kill()
+    output = json.loads(runs[0].communicate(timeout=300)[0])
+    runs[1].communicate(timeout=60)
+    assert output["failures"] == [] and runs[0].returncode == 0
+    found = compared(place)
+    assert sorted(found) == numbers
+    process(str(mission.path))
+    assert found == compared_in_folder(mission)
 
 
 def test_of_two_writers_of_a_key_one_commits(store: Callable[..., str]) -> None:
