@@ -59,6 +59,7 @@ STEPS: Final = (
     "find_slips",
     "evaluate_master",
     "check_content",
+    "other_ground_regions",
     "check_platform",
     "check_layers",
     "estimate_dc",

@@ -19,6 +19,7 @@ from processing.quality.figures.circumstances import EstimatedDcFigures
 from processing.quality.figures.image import (
     BalanceFigures,
     ContentFigures,
+    OtherGroundFigures,
     RelativeSharpnessFigures,
     SignalStepFigures,
     WordFormatFigures,
@@ -34,6 +35,8 @@ from processing.quality.figures.stitching import (
 )
 from processing.quality.report import Flag, QualityReport, Verdict
 
+LATER: Final = ("frame-part",)
+"""Kinds that were added last: the first cases of a seed stay what they were."""
 EXPOSURES: Final = 2
 """Healthy exposures of a rig, over other ground and at other temperatures."""
 SMALLEST, LARGEST = 0.5, 4.0
@@ -76,8 +79,11 @@ def draw(
 ) -> list[Case]:
     """Cases by seed: every kind with every rig that has it in turn, all else by chance."""
     random = np.random.default_rng([seed, 23])
-    pairs = [(kind, rig) for kind, limit in LIMITS.items() for rig in limit.by_rig]
+    pairs = [
+        (kind, rig) for kind, limit in LIMITS.items() if kind not in LATER for rig in limit.by_rig
+    ]
     order = [pairs[i] for i in random.permutation(len(pairs))]
+    order += [(kind, rig) for kind in LATER for rig in LIMITS[kind].by_rig]
     every = itertools.islice(itertools.cycle(order), count)
     cases = [
         Case(
@@ -194,7 +200,9 @@ def named_causes(report: QualityReport) -> dict[str, frozenset[str]]:
     slip, platform = figures.of(SlipFigures), figures.of(PlatformFigures)
     other_ground = figures.of(ContentFigures).mismatched_sensors
     displacement, misread = figures.of(DisplacementFigures), figures.of(MisreadProbeFigures)
+    part = figures.of(OtherGroundFigures)
     found = {
+        "part": _names(_one(part.other_ground_sensor), part.other_ground_alternatives),
         "displaced": _names(_one(displaced), displacement.displaced_alternatives),
         "slip": _names(slip.slip_sensors, slip.slip_alternatives),
         "ground": _names(other_ground),

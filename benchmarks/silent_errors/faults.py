@@ -419,6 +419,21 @@ def _other_ground(
     return inject
 
 
+def _frame_part(emulated: EmulatedExposure, _: float, random: Random) -> Fault:
+    rig = emulated.rig
+    compared = [c for c in rig.cones if c.role == "pan" or "nir" not in c.bands]
+    name = _any(random, [s.name for c in compared for s in c.sensors])
+    part, where = _part(rig.sensor(name), 4, random)
+    other = emulated.other()[name]
+
+    def change(frame: Array) -> Array:
+        frame[part] = other[part]
+        return frame
+
+    fault = _of_frame(emulated, name, change, f"of the next exposure in {where}")
+    return replace(fault, emulated=replace(fault.emulated, elsewhere=frozenset({name})))
+
+
 def _words(emulated: EmulatedExposure, _: float, random: Random) -> Fault:
     name = _any(random, [s.name for s in emulated.rig.sensors])
     shift = 16 - emulated.rig.sensor(name).bits
@@ -466,6 +481,7 @@ FAULTS: Final[Mapping[str, FaultInjector]] = {
     "frame-other": _other_ground(lambda p, name: p.other()[name], "of the next exposure"),
     "frame-turned": _other_ground(lambda p, name: p.frames[name][::-1, ::-1].copy(), "turned"),
     "frame-mirrored": _other_ground(lambda p, name: p.frames[name][:, ::-1].copy(), "mirrored"),
+    "frame-part": _frame_part,
     "words": _words,
     "frame-lost": _frame_lost,
 }

@@ -84,6 +84,10 @@ LIMITS: Final[Mapping[str, Limit]] = {
     "frame-other": Limit("a frame of another exposure", "", _same_limit(STITCHED, 1.0)),
     "frame-turned": Limit("a frame turned by 180 degrees", "", _same_limit(STITCHED, 1.0)),
     "frame-mirrored": Limit("a frame mirrored", "", _same_limit(STITCHED, 1.0)),
+    "frame-part": Limit(
+        "a sixteenth of a frame other than near infrared of another exposure", "",
+        _same_limit(STITCHED, 1.0),
+    ),
     "words": Limit("words left-justified or byte-swapped", "", _same_limit(EVERY, 1.0)),
     "frame-lost": Limit("a frame lost", "", _same_limit(EVERY, 1.0)),
 }  # fmt: skip

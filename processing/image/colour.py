@@ -8,7 +8,7 @@ Source: Heier et al. (2002), 6.1; Ladstädter et al. (2010), steps 5 and 6 of th
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
@@ -97,7 +97,8 @@ class BandRegistration:
     Where too few points were found it is the identity: the band stays as calibrated, and
     `registered` is False; `textured` counts the positions that were tried there and where the band
     has texture well above noise, `matched` those that matched all the same. `rms_px` is the
-    residual length per point, colour pixels.
+    residual length per point, colour pixels. `matched_at` (n, 2) are the places of all matches in
+    the band's frame, `unmatched_at` (m, 2) the positions in green that did not match.
     """
 
     band: str
@@ -108,6 +109,10 @@ class BandRegistration:
     registered: bool
     textured: int = 0
     matched: int = 0
+    matched_at: Array = field(default_factory=lambda: np.zeros((0, 2)), compare=False, repr=False)
+    unmatched_at: Array = field(
+        default_factory=lambda: np.zeros((0, 2), np.int64), compare=False, repr=False
+    )
 
 
 def nominal_registration(
@@ -153,7 +158,9 @@ def register_band(
     Returns:
         The registration; `nominal_registration` where too few points match.
     """
-    raw_green, raw_band, sigma = _match(green, other, green_frame, band_frame, positions, settings)
+    raw_green, raw_band, sigma, unmatched = _match(
+        green, other, green_frame, band_frame, positions, settings
+    )
     if len(sigma) < settings.min_points:
         expected = raw_from_vip_mm(other, vip_mm_from_raw(green, positions.astype(np.float64)))
         at = np.rint(expected[np.isfinite(expected).all(axis=1)]).astype(np.int64)
@@ -175,6 +182,8 @@ def register_band(
         used,
         rms / unit_mm,
         registered=used >= settings.min_points,
+        matched_at=raw_band,
+        unmatched_at=unmatched,
     )
 
 
@@ -265,7 +274,7 @@ def _match(
     band_frame: Array,
     at_green: Array,
     settings: ColourSettings,
-) -> tuple[Array, Array, Array]:
+) -> tuple[Array, Array, Array, Array]:
     margin_px = _window_margin_px(settings)
     predicted = raw_from_vip_mm(other, vip_mm_from_raw(green, at_green.astype(np.float64)))
     first, last = exposed_rows(other.sensor, other.tdi_shifts)
@@ -289,13 +298,15 @@ def _match(
         True,
         INTERPOLATION,
     )
-    found = found[
+    matched = (
         (found[:, 7] > 0.0)
         & (found[:, 4] <= settings.max_sigma_px)
         & (found[:, 5] >= settings.min_correlation)
         & (found[:, 6] >= settings.min_peak_margin)
-    ]
-    return found[:, 0:2], found[:, 2:4], np.maximum(found[:, 4], 0.005)
+    )
+    unmatched = at_green[inside][~matched]
+    found = found[matched]
+    return found[:, 0:2], found[:, 2:4], np.maximum(found[:, 4], 0.005), unmatched
 
 
 def _window_margin_px(settings: ColourSettings) -> int:

@@ -8,7 +8,7 @@ the points are good for is in `processing.mosaic.free_mosaic`.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -25,7 +25,7 @@ from processing.matching.tie_point_search import (
     pan_searches,
     usable_pixels,
 )
-from processing.matching.two_stage import MatchLimits, Positions, match_positions
+from processing.matching.two_stage import MatchLimits, Positions, match_and_mark
 from processing.rig import Rig
 
 __all__ = ["PAN_TO_COLOUR", "PAN_TO_PAN", "TiePointSettings", "TiePoints", "match_tie_points"]
@@ -41,7 +41,8 @@ class TiePoints:
     `sensor_a`, `sensor_b` index `names`; `raw_a`, `raw_b` are (column, row) of the same ground.
     `sigma_px` is the predicted standard deviation of one coordinate of their difference, in PAN
     pixels. `kind` is PAN_TO_PAN or PAN_TO_COLOUR (then b is the colour master). `overlap` indexes
-    `pairs`, the searched pairs of sensors; `attempted` counts the positions tried.
+    `pairs`, the searched pairs of sensors; `attempted` counts the positions tried. Those of the
+    colour master that did not match are at `unmatched_b` (m, 2), of the pair `unmatched_overlap`.
     """
 
     names: tuple[str, ...]
@@ -55,6 +56,8 @@ class TiePoints:
     correlation: Array
     kind: NDArray[np.int64]
     overlap: NDArray[np.int64]
+    unmatched_b: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 2), np.int64))
+    unmatched_overlap: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
 
     def __len__(self) -> int:
         return len(self.sigma_px)
@@ -114,6 +117,7 @@ def match_tie_points(
     names = tuple(sensor.name for sensor in rig.sensors)
     index = {name: i for i, name in enumerate(names)}
     rows = []
+    unmatched, unmatched_overlap = [np.zeros((0, 2), np.int64)], [np.zeros(0, np.int64)]
     for number, search in enumerate(searches):
         a, b = search.pair
         to_pan = search.kind == PAN_TO_PAN
@@ -126,7 +130,7 @@ def match_tie_points(
                 placements[a], placements[b], frame_a, region=search.region, step=step
             )
             frame_a, at_a = seen.pixels, seen.at(search.at_b)
-        found = match_positions(
+        found, matched = match_and_mark(
             frame_a,
             frames[b],
             Positions(at_a, search.at_b, search.expected_b),
@@ -140,6 +144,10 @@ def match_tie_points(
                 settings.min_peak_margin,
             ),
         )
+        if not to_pan:
+            unmatched.append(search.at_b[~matched])
+            unmatched_overlap.append(np.full(len(unmatched[-1]), number))
+        found = found[matched]
         columns = np.empty((len(found), 10))
         columns[:, 0], columns[:, 1] = index[a], index[b]
         columns[:, 2:6] = found[:, :4]
@@ -163,6 +171,8 @@ def match_tie_points(
         correlation=table[:, 7].copy(),
         kind=table[:, 8].astype(np.int64),
         overlap=table[:, 9].astype(np.int64),
+        unmatched_b=np.concatenate(unmatched),
+        unmatched_overlap=np.concatenate(unmatched_overlap),
     )
 
 

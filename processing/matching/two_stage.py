@@ -84,6 +84,45 @@ def match_positions(
 
     Source: docs/explanation/mathematics/matching.md#two-stages.
     """
+    result, reached = match_and_mark(
+        frame_a,
+        frame_b,
+        positions,
+        limits_b,
+        ratio=ratio,
+        window_px=window_px,
+        search_px=search_px,
+        limits=limits,
+    )
+    return result[reached]
+
+
+def match_and_mark(
+    frame_a: Frame,
+    frame_b: Frame,
+    positions: Positions,
+    limits_b: Indices,
+    *,
+    ratio: int,
+    window_px: int,
+    search_px: int,
+    limits: MatchLimits,
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Match the positions of one pair of frames, and mark those that reach the limits.
+
+    Args:
+        frame_a: (h, w), uint16 Level-1 words or float32; the finer frame.
+        frame_b: (h, w), same type.
+        positions: where.
+        limits_b: first and last usable column, first and last usable row of frame b, (4,).
+        ratio: pixels of a per pixel of b.
+        window_px: side of the window, px of b, odd.
+        search_px: offsets tried around `at_b`, px of b.
+        limits: what a match must reach.
+
+    Returns:
+        A row of `match_patches` for each position, and whether it reaches the limits, (n,).
+    """
     half, is_uint16 = window_px // 2, frame_a.dtype == np.uint16
     result = np.zeros((len(positions.at_a), 8))
 
@@ -125,7 +164,7 @@ def match_positions(
         # A bad pixel in the window is in every search of it, too.
         rest = rest[~confirmed & (result[rest, 7] >= 0.0)]
     search(rest)
-    return result[_reached(result, limits)]
+    return result, _reached(result, limits)
 
 
 def spread_positions(count: int) -> NDArray[np.bool_]:

@@ -43,6 +43,7 @@ from processing.quality.frame_identity import identity_figures
 from processing.quality.frame_signal import sharpness_figures, signal_figures
 from processing.quality.ground_steps import GroundView, is_drawn_by_step
 from processing.quality.local_sharpness import local_blur_figures
+from processing.quality.other_ground import other_ground_figures, other_ground_regions
 from processing.quality.relative_sharpness import relative_sharpness_figures
 from processing.quality.signal_steps import signal_steps, step_figures
 from processing.quality.stitching_figures import poorest_overlap, stitching_figures
@@ -146,6 +147,18 @@ def figures_of(
     yield scale_figures(adjusted.held)
     yield projection_figures(rig, conditions, settings.relief_fraction)
     yield content_figures(adjusted.content)
+    yield other_ground_figures(
+        other_ground_regions(
+            rig,
+            start,
+            level1,
+            tie_points,
+            image.registrations,
+            settings=settings.tie_points,
+            colour=settings.colour,
+            explained=_explained_frames(adjusted),
+        )
+    )
     yield relative_sharpness_figures(rig, start, level1)
     yield step_figures(steps)
     yield block_figures(rig, limits, blocks)
@@ -168,6 +181,13 @@ def figures_of(
     )
     yield ValidFigures(float(np.count_nonzero(image.pan.source)) / image.pan.source.size)
     yield ParallaxFigures(parallax_px(rig, conditions, settings.relief_fraction))
+
+
+def _explained_frames(adjusted: AdjustedFrames) -> set[str]:
+    """Frames of which the report knows why points of theirs do not match."""
+    content = adjusted.content
+    slipped = {slip.sensor for slip in adjusted.stitching.slips}
+    return {*content.mismatched, *content.shifted_px, *slipped}
 
 
 def misplaced_px(rig: Rig, content: ContentCheck) -> float:

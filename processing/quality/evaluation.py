@@ -29,6 +29,7 @@ from processing.quality.image_findings import (
     content_findings,
     exposure_findings,
     identity_findings,
+    other_ground_findings,
     signal_findings,
     word_format_findings,
 )
@@ -167,6 +168,7 @@ def evaluate(
     findings += _frames(figures, capture_flags, missing_sensors, limits)
     findings += _time_and_temperature(figures, missing_probes, probes_out_of_range, limits)
     findings += content_findings(figures, mismatched_bands)
+    findings += other_ground_findings(figures)
     findings += stitching_findings(
         figures, [b for b in nominal_bands if b not in mismatched_bands], limits
     )

@@ -17,6 +17,7 @@ from processing.quality.figures.image import (
     ContentFigures,
     IdentityFigures,
     LocalBlurFigures,
+    OtherGroundFigures,
     RelativeSharpnessFigures,
     RepeatedLineFigures,
     SaturationFigures,
@@ -54,6 +55,34 @@ def content_findings(figures: QualityFigures, bands: Sequence[str]) -> list[Find
             "frames swapped, of another exposure, turned or mirrored, or the head has moved. "
             "Check cables and serial numbers of the heads. Fly this exposure again.",
             None if positions is None else float(positions),
+        )
+    ]
+
+
+def other_ground_findings(figures: QualityFigures) -> list[Finding]:
+    """A region of a frame that shows other ground.
+
+    Args:
+        figures: of one exposure.
+
+    Returns:
+        One finding or none.
+    """
+    region = figures.of(OtherGroundFigures)
+    name, positions = region.other_ground_sensor, region.other_ground_positions
+    if name is None or positions is None:
+        return []
+    others = ", ".join(region.other_ground_alternatives)
+    return [
+        Finding(
+            Flag.FRAME_CORRUPT,
+            Verdict.REFLY,
+            f"Columns {region.other_ground_first_column} to {region.other_ground_last_column}, "
+            f"rows {region.other_ground_first_row} to {region.other_ground_last_row} of {name} "
+            + (f"(or of {others} at the same place) " if others else "")
+            + "show other ground than the other heads although they have texture: a part of "
+            "another exposure. Check the head, cable and transfer. Fly this exposure again.",
+            float(positions),
         )
     ]
 

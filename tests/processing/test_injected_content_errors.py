@@ -111,6 +111,47 @@ def test_other_ground_in_a_colour_band_is_named(error_free: InjectedExposure, ba
     assert outcome.verdict == "refly" and "other ground" in outcome.sentences
 
 
+def _part_of(name: str) -> Callable[[Frames, Frames], Frames]:
+    """A sixteenth of one frame is of another exposure."""
+
+    def change(frames: Frames, other: Frames) -> Frames:
+        mixed = frames[name].copy()
+        part = slice(230, 438), slice(405, 717)
+        mixed[part] = other[name][part]
+        return {**frames, name: mixed}
+
+    return change
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "SU11",
+        pytest.param("SU30", marks=pytest.mark.soak),
+        "G",
+        pytest.param("R", marks=pytest.mark.soak),
+        pytest.param("B", marks=pytest.mark.soak),
+    ],
+)
+def test_a_part_of_a_frame_of_another_exposure_is_named_with_its_place(
+    error_free: InjectedExposure, elsewhere: InjectedExposure, name: str
+) -> None:
+    changed = _part_of(name)(error_free.frames, elsewhere.frames)
+    outcome = replace(error_free, frames=changed).outcome()
+    assert outcome.verdict == "refly" and "FRAME_CORRUPT" in outcome.flags
+    assert outcome.figure("other_ground_sensor") == name, outcome.sentences
+    assert outcome.figure("other_ground_alternatives") is None
+    assert "another exposure" in outcome.sentences
+    # A region is three cells wide, of 78 by 52 pixels.
+    for key, true, cell in (
+        ("first_column", 405, 78),
+        ("last_column", 716, 78),
+        ("first_row", 230, 52),
+        ("last_row", 437, 52),
+    ):
+        assert abs(outcome.figure(f"other_ground_{key}") - true) <= 1.5 * cell, key
+
+
 def test_frames_without_texture_are_not_called_other_ground(error_free: InjectedExposure) -> None:
     flat = {name: frame // 16 * 0 + 900 for name, frame in error_free.frames.items()}
     outcome = replace(error_free, frames={**error_free.frames, "SU30": flat["SU30"]}).outcome()

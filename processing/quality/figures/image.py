@@ -29,6 +29,25 @@ class ContentFigures(FigureGroup):
 
 
 @dataclass(frozen=True)
+class OtherGroundFigures(FigureGroup):
+    """A region of a frame that shows other ground than the other heads."""
+
+    other_ground_sensor: Annotated[
+        str | None, "frame of which a region with texture matches no other head"
+    ] = None
+    other_ground_alternatives: Annotated[
+        Names, "frames that may be wrong instead, or that have such a region too"
+    ] = ()
+    other_ground_first_column: Annotated[int | None, "first column of the region"] = None
+    other_ground_last_column: Annotated[int | None, "its last column"] = None
+    other_ground_first_row: Annotated[int | None, "first row of the region"] = None
+    other_ground_last_row: Annotated[int | None, "its last row"] = None
+    other_ground_positions: Annotated[int | None, "textured positions in it that match nothing"] = (
+        None
+    )
+
+
+@dataclass(frozen=True)
 class UnreadFigures(FigureGroup):
     """Pixels that were not read out."""
 
