@@ -5,10 +5,12 @@ from __future__ import annotations
 import asyncio
 import json
 import os
+import shutil
 import time
 from pathlib import Path
 from typing import Any, cast
 
+import numpy as np
 import pytest
 
 from daemon.configuration.model import TriangulationSection
@@ -189,3 +191,45 @@ def test_the_process_takes_in_a_mission_in_flight_and_one_started_again_all_of_i
     record = json.loads((flown.mission / "export/triangulation/live/live.json").read_text())
     assert [o["exposure"] for o in record["orientations"]] == [1, 2, 3]
     assert [s["exposure"] for s in record["skipped"]] == [77]
+
+
+def _landed(mission: Path, kills: list[float]) -> dict[str, bytes]:
+    """The products of a flight whose process is killed so many seconds after it began each time."""
+    section = TriangulationSection(enabled=True, landing_timeout_s=240.0, orthomosaic_gsd_m=0.8)
+    for seconds in [*kills, None]:
+        child = ChildProcess("triangulation", TARGET, (mission, section), thread_counts(1))
+        try:
+            child.send(FinishTriangulation())
+            if seconds is None:
+                _until_finished(child, 240.0)
+                continue
+            deadline = time.monotonic() + 240.0
+            while not list(mission.glob("export/live-orthomosaic/tiles/**/*.webp")):
+                assert time.monotonic() < deadline, "no tile in 240 s"
+                time.sleep(0.05)
+            time.sleep(seconds)
+            child.process.kill()
+            child.process.join(20.0)
+        finally:
+            child.end(1.0)
+    names = ("live-orthomosaic/orthomosaic.tif", "live-orthomosaic/orthomosaic.pmtiles",
+             "triangulation/live/orientations.csv")  # fmt: skip
+    return {name: (mission / "export" / name).read_bytes() for name in names}
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(1800)
+def test_a_process_killed_at_any_time_leaves_nothing_that_the_next_one_does_not_replace(
+    flown, tmp_path
+) -> None:
+    for name in ("whole", "killed"):
+        copy = tmp_path / name / "mission"
+        shutil.copytree(flown.mission, copy, ignore=shutil.ignore_patterns("export"))
+    expected = _landed(tmp_path / "whole/mission", [])
+    random = np.random.default_rng(1)
+    assert _landed(tmp_path / "killed/mission", random.uniform(0.0, 6.0, 6).tolist()) == expected
+    whole, killed = (
+        sorted(str(p.relative_to(tmp_path / n)) for p in (tmp_path / n).rglob("export/**/*"))
+        for n in ("whole", "killed")
+    )
+    assert killed == whole
