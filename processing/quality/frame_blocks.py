@@ -6,8 +6,9 @@ and fields now and then, but these are seen by other heads too.
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -99,16 +100,13 @@ def block_edges(
     """
     view = GroundView(rig, placements, frames)
     every = {n: _candidates(rig.sensor(n), lines, limits[n]) for n, lines in means.items()}
-    edges = {name: _cornered(of_frame) for name, of_frame in every.items()}
-    if sum(1 for of_frame in edges.values() if of_frame) > MAX_FRAMES:
-        edges = {
-            name: [e for e in of_frame if _is_isolated(e, every[name], view.reach_px(name))]
-            for name, of_frame in edges.items()
-        }
+    with_corners = sum(next(_cornered(of_frame), None) is not None for of_frame in every.values())
     found = []
-    for name, of_frame in edges.items():
-        sensor = rig.sensor(name)
-        for edge in of_frame[:CANDIDATES]:
+    for name, of_frame in every.items():
+        sensor, edges = rig.sensor(name), _cornered(of_frame)
+        if with_corners > MAX_FRAMES:
+            edges = _isolated(edges, of_frame, view.reach_px(name))
+        for edge in itertools.islice(edges, CANDIDATES):
             block = _unshared(view, edge, sensor, means)
             if block is not None:
                 found.append(block)
@@ -285,30 +283,37 @@ def _steps_there(sensor: Sensor, lines: LineMeans, edge: _Edge) -> bool:
     )
 
 
-def _cornered(edges: list[_Edge]) -> list[_Edge]:
+def _cornered(edges: Sequence[_Edge]) -> Iterator[_Edge]:
     """The edges that meet another one in a corner, or have one of the other sign opposite."""
-
-    def joined(a: _Edge, b: _Edge) -> bool:
-        if not 1.0 / MAX_RATIO < abs(a.step / b.step) < MAX_RATIO:
-            return False
-        if a.axis == b.axis:
-            shared = min(a.last, b.last) - max(a.first, b.first)
-            return a.step * b.step < 0.0 and 2 * shared > max(a.last - a.first, b.last - b.first)
-        return (
-            min(abs(a.at - b.first), abs(a.at - b.last)) < NEAR_PX
-            and min(abs(b.at - a.first), abs(b.at - a.last)) < NEAR_PX
-        )
-
-    return [a for a in edges if any(joined(a, b) for b in edges if b is not a)]
-
-
-def _is_isolated(edge: _Edge, every: list[_Edge], reach_px: float) -> bool:
-    """Whether no other edge of the frame runs next to it: rows of plants are many."""
-    return not any(
-        0 < abs(edge.at - other.at) < ISOLATED_REACH * reach_px
-        for other in every
-        if other.axis == edge.axis
+    is_row = np.array([edge.axis == "rows" for edge in edges], np.bool_)
+    at, first, last = (
+        np.array([getattr(edge, name) for edge in edges], np.int64)
+        for name in ("at", "first", "last")
     )
+    step = np.array([edge.step for edge in edges])
+    for k, edge in enumerate(edges):
+        # The edge itself has its own sign, and no corner with its own axis.
+        opposite = (is_row == is_row[k]) & (step * edge.step < 0.0)
+        shared = np.minimum(last, edge.last) - np.maximum(first, edge.first)
+        opposite &= 2 * shared > np.maximum(last - first, edge.last - edge.first)
+        corner = is_row != is_row[k]
+        corner &= np.minimum(np.abs(edge.at - first), np.abs(edge.at - last)) < NEAR_PX
+        corner &= np.minimum(np.abs(at - edge.first), np.abs(at - edge.last)) < NEAR_PX
+        ratio = np.abs(edge.step / step)
+        if np.any((opposite | corner) & (ratio > 1.0 / MAX_RATIO) & (ratio < MAX_RATIO)):
+            yield edge
+
+
+def _isolated(edges: Iterable[_Edge], every: Sequence[_Edge], reach_px: float) -> Iterator[_Edge]:
+    """Those to which no other edge of the frame runs next: rows of plants are many."""
+    places = {
+        axis: np.array([other.at for other in every if other.axis == axis], np.int64)
+        for axis in ("rows", "columns")
+    }
+    for edge in edges:
+        away = np.abs(places[edge.axis] - edge.at)
+        if not np.any((away > 0) & (away < ISOLATED_REACH * reach_px)):
+            yield edge
 
 
 def _unshared(
