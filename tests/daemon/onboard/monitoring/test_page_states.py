@@ -145,6 +145,50 @@ def test_a_measured_rate_excludes_the_work_of_the_service(browser: Browser) -> N
     assert found == [False, True]
 
 
+def test_thumbnails_are_fetched_a_few_at_a_time_the_newest_first_and_none_in_vain(
+    browser: Browser,
+) -> None:
+    found = browser.evaluate(
+        """(async () => {
+          const real = window.fetch;
+          const asked = [];
+          const open = new Map();
+          window.fetch = (address) => new Promise((resolve) => {
+            const number = Number(/exposures\\/(\\d+)/.exec(address)[1]);
+            asked.push(number);
+            open.set(number, () => { open.delete(number); resolve(new Response('x')); });
+          });
+          const turn = async () => { for (let k = 0; k < 20; k += 1) await Promise.resolve();
+            await new Promise((resolve) => setTimeout(resolve, 0)); };
+          const { clearThumbnails, thumbnailOf } = await import('/thumbnails.js');
+          clearThumbnails();
+          const results = new Map();
+          for (let k = 1; k <= 100; k += 1) thumbnailOf(k).then((one) => results.set(k, one));
+          await turn();
+          const atOnce = [...open.keys()];
+          // Of 100 the newest 80 are kept; those before them are given up at once.
+          const given = [...results].filter(([, one]) => one === null).map(([k]) => k);
+          open.get(1)();
+          await turn();
+          const second = asked.at(-1);
+          thumbnailOf(101);
+          open.get(2)();
+          await turn();
+          const third = asked.at(-1);
+          clearThumbnails();
+          for (const done of [...open.values()]) done();
+          await turn();
+          window.fetch = real;
+          return [atOnce, given, second, third, asked.length];
+        })()"""
+    )
+    at_once, given, second, third, asked = found
+    assert at_once == [1, 2, 3]
+    assert given == list(range(4, 21))
+    assert (second, third) == (100, 101)
+    assert asked <= 6, "cleared ones are not asked for"
+
+
 def test_the_suggested_exposure_of_pan_ignores_a_saturated_colour(browser: Browser) -> None:
     half, full = [0] * 31 + [900] + [0] * 32, [0] * 63 + [500]
     script = (

@@ -21,10 +21,10 @@ export async function isRefused() {
   }
 }
 
-// The response; null if the request fails or is refused.
-export async function fetchOk(address) {
+// The response; null if the request fails, is refused, or is given up by `signal`.
+export async function fetchOk(address, signal = null) {
   try {
-    const response = await fetch(address, { headers: headers() });
+    const response = await fetch(address, { headers: headers(), signal });
     if (response.ok) return response;
     discard(response);
     return null;
@@ -33,8 +33,13 @@ export async function fetchOk(address) {
   }
 }
 
-export async function fetchJson(address) {
-  return (await fetchOk(address))?.json() ?? null;
+export async function fetchJson(address, signal = null) {
+  try {
+    return await (await fetchOk(address, signal))?.json() ?? null;
+  } catch {
+    // The link was lost, or it was given up, within the answer.
+    return null;
+  }
 }
 
 // A browser follows a link without a token. A file that requires one is fetched here.

@@ -49,10 +49,10 @@ const LiveTiles = L.GridLayer.extend({
     picture.close();
     tile.dataset.filled = "";
   },
-  // Draw a tile again, if it is seen.
+  // Draw a tile again, if it is seen. One that waits already will be drawn as it is then.
   renew(z, x, y) {
     const shown = Object.values(this._tiles).find(({ coords }) => coords.z === z && coords.x === x && coords.y === y);
-    if (shown) this.fill(shown.el, shown.coords);
+    if (shown && !waiting.some(({ at }) => at === shown.coords)) this.fill(shown.el, shown.coords);
   },
 });
 

@@ -19,9 +19,12 @@ const residuals = document.getElementById("show-residuals");
 const vectorsNote = document.getElementById("vectors-note");
 const drawing = document.getElementById("vectors");
 const RETRY_MS = 5000;
+const LOAD_TIMEOUT_MS = 30000;
 const view = { scale: 1, x: 0, y: 0 };
 let shownAddress = null;
 let ownAddress = null;
+// Ends the loading of an image; null if none is loaded.
+let loading = null;
 
 function place() {
   image.style.transform = `translate(${view.x}px, ${view.y}px) scale(${view.scale})`;
@@ -101,13 +104,31 @@ async function showImage(number, isFollowing = false) {
   vectorsNote.hidden = drawing.hasAttribute("hidden");
   const address = `/api/v1/exposures/${number}/quicklook.jpg`;
   if (shownAddress === address || (isFollowing && shownAddress === `thumbnail ${number}`)) return;
+  // What is seen is of another exposure until this one is loaded.
+  image.classList.add("stale");
+  // Exposures may come faster than their images: the next record asks for the newest.
+  if (isFollowing && loading) return;
+  loading?.abort();
+  const control = new AbortController();
+  loading = control;
+  const signal = AbortSignal.any([control.signal, AbortSignal.timeout(LOAD_TIMEOUT_MS)]);
   shownAddress = address;
+  try {
+    await loadImage(one, address, isFollowing, signal);
+  } finally {
+    if (loading === control) loading = null;
+  }
+}
+
+async function loadImage(one, address, isFollowing, signal) {
+  const { number } = one;
   const [isHidden, width] = [image.hidden, image.naturalWidth];
   const products = isFollowing && isSlow() ? Promise.resolve([null, null])
-    : Promise.all(["histogram.json", "residuals.json"].map((name) => fetchJson(`/api/v1/exposures/${number}/${name}`)));
+    : Promise.all(["histogram.json", "residuals.json"].map((name) => fetchJson(`/api/v1/exposures/${number}/${name}`, signal)));
   image.onload = async () => {
     image.hidden = false;
     placeholder.hidden = true;
+    image.classList.toggle("stale", numberLabel.textContent !== `${number}`);
     // A thumbnail has another size than the quick look.
     if (isHidden || image.naturalWidth !== width) fit();
     const [raw, vectors] = await products;
@@ -127,7 +148,7 @@ async function showImage(number, isFollowing = false) {
     if (thumbnail) image.src = thumbnail;
     return;
   }
-  const picture = await (await fetchOk(address))?.blob();
+  const picture = await (await fetchOk(address, signal))?.blob().catch(() => null);
   if (shownAddress !== address) return;
   if (!picture) {
     showPlaceholder(t("image.no_quicklook", { number }));

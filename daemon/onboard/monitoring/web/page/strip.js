@@ -2,7 +2,7 @@
 
 import { t } from "./i18n.js";
 import { element } from "./dom.js";
-import { clearThumbnails, thumbnailOf } from "./thumbnails.js";
+import { thumbnailOf } from "./thumbnails.js";
 import { retakeExposures } from "./retakes.js";
 
 const SHOWN = 24;
@@ -96,7 +96,6 @@ export function start(root, feed) {
       shown.clear();
       marked.clear();
       root.replaceChildren();
-      clearThumbnails();
     }
     root.setAttribute("aria-label", t("strip.title"));
     const newest = [...feed.flight.exposures.values()].sort((a, b) => b.number - a.number).slice(0, SHOWN);

@@ -2,6 +2,7 @@
 
 import { fetchJson, isRefused } from "./http.js";
 import { OlderExposures } from "./older_exposures.js";
+import { clearThumbnails } from "./thumbnails.js";
 
 export const flight = {
   brief: null,
@@ -35,6 +36,8 @@ function clear() {
   flight.track.length = 0;
   flight.history.length = 0;
   flight.settings = null;
+  // Before any listener asks for those of the new state.
+  clearThumbnails();
 }
 
 // Drop every second item of the older half, so that the length stays bounded and the end detailed.

@@ -1,4 +1,4 @@
-// Thumbnails as addresses of blobs, each fetched once; the oldest are released.
+// Thumbnails as addresses of blobs, each fetched once, a few at a time; the oldest are released.
 
 import { fetchOk } from "./http.js";
 
@@ -7,10 +7,39 @@ const CACHED_MAX = 80;
 const RETRY_MS = 5000;
 const known = new Map();
 
+const AT_ONCE = 3;
+// Thumbnails to be fetched, by number. Over a thin link more are made than it carries: the newest come first.
+const waiting = new Map();
+let running = 0;
+
+function inTurn(number) {
+  return new Promise((resolve) => {
+    waiting.set(number, resolve);
+    next();
+  });
+}
+
+async function next() {
+  if (running >= AT_ONCE || !waiting.size) return;
+  const number = Math.max(...waiting.keys());
+  const resolve = waiting.get(number);
+  waiting.delete(number);
+  running += 1;
+  resolve(await load(number).catch(() => null));
+  running -= 1;
+  next();
+}
+
+// What is no longer wanted is not fetched.
+function drop(number) {
+  waiting.get(number)?.(null);
+  waiting.delete(number);
+}
+
 // Address of the thumbnail of an exposure; null if there is none.
 export function thumbnailOf(number) {
   if (!known.has(number)) {
-    const loaded = load(number);
+    const loaded = inTurn(number);
     known.set(number, loaded);
     loaded.then((address) => {
       if (!address) setTimeout(() => { if (known.get(number) === loaded) known.delete(number); }, RETRY_MS);
@@ -18,6 +47,7 @@ export function thumbnailOf(number) {
     while (known.size > CACHED_MAX) {
       const [oldest, address] = known.entries().next().value;
       known.delete(oldest);
+      drop(oldest);
       address.then((one) => one && URL.revokeObjectURL(one));
     }
   }
@@ -50,6 +80,7 @@ async function load(number) {
 }
 
 export function clearThumbnails() {
+  for (const number of [...waiting.keys()]) drop(number);
   for (const address of known.values()) address.then((one) => one && URL.revokeObjectURL(one));
   known.clear();
 }
