@@ -26,6 +26,7 @@ from daemon.postflight.exchange.bundler import read_bal, read_bundler
 from daemon.postflight.exchange.colmap import read_colmap
 from daemon.postflight.exchange.metashape_reader import read_metashape
 from daemon.postflight.exchange.opensfm import read_opensfm
+from daemon.postflight.exchange.orientation_reader import read_inpho, read_pix4d
 from daemon.postflight.exchange.photogrammetry_reader import read_bingo, read_patb
 from processing.bundle.network import (
     INTERIOR,
@@ -53,6 +54,8 @@ READERS: Mapping[str, Callable[[Path], Block]] = {
     "bal": read_bal,
     "bingo": read_bingo,
     "patb": read_patb,
+    "pix4d": read_pix4d,
+    "inpho": read_inpho,
 }
 NOMINAL_PITCH_MM = 1e-3
 """Of cameras whose file states no pixel size: a residual in um is one in px."""

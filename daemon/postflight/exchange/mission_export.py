@@ -36,6 +36,7 @@ from daemon.postflight.exchange.photogrammetry import (
     Angles,
     Unit,
     photogrammetry_texts,
+    table_texts,
 )
 from daemon.postflight.exchange.pix4d import pix4d_texts
 from daemon.postflight.export.level2_export import Level2Image, jpeg_with_metadata, metadata_of
@@ -199,7 +200,8 @@ def _texts(
     if program == "metashape":
         return metashape_texts(block, rig, SUFFIX)
     if program == "pix4d":
-        return pix4d_texts(block, SUFFIX)
+        texts, residuals = pix4d_texts(block, SUFFIX)
+        return texts | table_texts(block, SUFFIX), residuals
     return nerfstudio_texts(block, "images", SUFFIX)
 
 

@@ -78,13 +78,7 @@ def photogrammetry_texts(
         rows.append((number, image, image.eo))
     if block.georeference is None:
         raise BlockError("the coordinate system of the orientations is not known")
-    texts = {
-        "photos.txt": "".join(
-            f"{n} {image.name}{suffix} {block.cameras[image.camera].name}\n" for n, image, _ in rows
-        ),
-        CAMERAS_FILE: "# name f_mm x0_mm y0_mm pixel_um columns rows\n"
-        + "".join(_camera_row(camera) for camera in block.cameras),
-    }
+    texts = table_texts(block, suffix)
     if program == "inpho":
         texts[f"{block.name}.prj"] = _inpho(block, suffix)
     elif program == "patb":
@@ -103,6 +97,21 @@ def photogrammetry_texts(
         + "camera axes: x right, y up (flight direction), z back\n"
     )
     return texts
+
+
+def table_texts(block: Block, suffix: str) -> dict[str, str]:
+    """`photos.txt`, number, file and camera of each image, and `cameras.txt`.
+
+    Raises:
+        BlockError: a camera without a pixel size.
+    """
+    photos = (
+        f"{n} {image.name}{suffix} {block.cameras[image.camera].name}\n"
+        for n, image in enumerate(block.images, 1)
+    )
+    cameras = "".join(_camera_row(camera) for camera in block.cameras)
+    header = "# name f_mm x0_mm y0_mm pixel_um columns rows\n"
+    return {"photos.txt": "".join(photos), CAMERAS_FILE: header + cameras}
 
 
 def angles_of(eo: ExteriorOrientation, order: Angles, unit: Unit) -> tuple[float, float, float]:

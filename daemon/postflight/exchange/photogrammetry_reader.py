@@ -14,13 +14,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.mission.foreign_files import ForeignFileError, read_regular_file
 from daemon.postflight.exchange.block import (
     VISION_FROM_CAMERA,
     Block,
@@ -30,12 +29,16 @@ from daemon.postflight.exchange.block import (
     BlockPoints,
 )
 from daemon.postflight.exchange.photogrammetry import ANGLES, CAMERAS_FILE, UNITS, Unit
-from processing.geometry.forward_distortion import ForwardDistortion
+from daemon.postflight.exchange.text_lines import lines_of, numbers_of, only_file
+from processing.geometry.forward_distortion import (
+    ForwardDistortion,
+    measured_px_from_rays,
+    rays_from_measured_px,
+)
 from processing.geometry.rotation import rotation_from_angles
 
 Array = NDArray[np.float64]
 
-TEXT_MAX_BYTES: Final = 1_000_000_000
 MISFIT_SHARE: Final = 0.01
 """Median misfit of the intersected points above which orientations and measurements disagree, as
 a share of the longer side."""
@@ -43,11 +46,11 @@ _FOCAL_WITHIN: Final = 1e-3
 _END: Final = "-99"
 _ORTHOGONAL_TO: Final = 1e-5
 _ORDERS: Final = {"omega-phi-kappa": "XYZ", "phi-omega-kappa": "YXZ"}
-_PIX4D: Final = ("imageName", "X", "Y", "Z", "Omega", "Phi", "Kappa")
+BINGO_PATTERNS: Final = ("*bingo*.txt", "*.dat")
 
 
 @dataclass(frozen=True)
-class _Oriented:
+class Oriented:
     """Place and rotation, grid from camera, of an image by its name or number."""
 
     centre_m: Array
@@ -55,33 +58,38 @@ class _Oriented:
 
 
 @dataclass(frozen=True)
-class _Measured:
+class Measured:
     """One image: what names its camera (a name, or a focal length), and its points in mm."""
 
     camera: str
     points: Mapping[str, tuple[float, float]]
 
 
+@dataclass(frozen=True)
+class _Ray:
+    """One measurement: its image, its pixel, and x / z, y / z of its ray, y down."""
+
+    image: int
+    px: Array
+    xy: Array
+
+
 def read_bingo(folder: Path) -> Block:
     """Read `*bingo*.txt` or `*.dat` with measurements, the orientation, and `cameras.txt`.
 
-    The orientation is `orientation.bingo` with `angles.txt`, as `export block` writes them, or
-    Pix4D's `*calibrated_external_camera_parameters.txt`.
+    The orientation is `orientation.bingo` with `angles.txt`, as `export block` writes them.
 
     Raises:
         BlockError: a file that is missing or not understood, or files that contradict each other.
     """
-    cameras = _cameras(folder)
-    path = folder / "orientation.bingo"
-    if path.exists():
-        order, unit, system = _stated(folder)
-        oriented = _named(path, order, unit)
-    else:
-        path = _one(folder, ("*calibrated_external_camera_parameters.txt",), "orientation.bingo")
-        oriented = _named(path, "XYZ", "deg", header=_PIX4D)
-        system = "not stated: that of the Pix4D project"
-    measured = _bingo(_one(folder, ("*bingo*.txt", "*.dat"), "<name>_bingo.txt"), cameras)
-    return _block(folder, cameras, oriented, measured, system, {})
+    cameras = cameras_of(folder)
+    order, unit, system = _stated(folder)
+    oriented = named_orientations(
+        only_file(folder, ("orientation.bingo",), "that of `export block`"), order, unit
+    )
+    measurements = only_file(folder, BINGO_PATTERNS, "<name>_bingo.txt")
+    measured = bingo_measurements(measurements, cameras)
+    return measured_block(folder, cameras, oriented, measured, system, {})
 
 
 def read_patb(folder: Path) -> Block:
@@ -90,46 +98,16 @@ def read_patb(folder: Path) -> Block:
     Raises:
         BlockError: a file that is missing or not understood, or files that contradict each other.
     """
-    cameras = _cameras(folder)
-    oriented = _three_records(_one(folder, ("*.ori",), "orientation.ori"))
-    photos = _photos(folder, cameras)
-    measured = _patb(_one(folder, ("*.im",), "<name>.im"), cameras, photos)
+    cameras = cameras_of(folder)
+    oriented = _three_records(only_file(folder, ("*.ori",), "orientation.ori"))
+    photos = photos_of(folder, cameras)
+    measured = _patb(only_file(folder, ("*.im",), "<name>.im"), cameras, photos)
     system = _stated(folder)[2] if (folder / "angles.txt").exists() else "not stated in the files"
     names = {number: name for number, (name, _) in photos.items()}
-    return _block(folder, cameras, oriented, measured, system, names)
+    return measured_block(folder, cameras, oriented, measured, system, names)
 
 
-def _one(folder: Path, patterns: Sequence[str], example: str) -> Path:
-    found = sorted({path for pattern in patterns for path in folder.glob(pattern)})
-    if len(found) != 1:
-        raise BlockError(
-            f"{folder}: {len(found)} files {' or '.join(patterns)}; one is needed, such as "
-            f"{example}"
-        )
-    return found[0]
-
-
-def _lines(path: Path) -> list[tuple[int, list[str]]]:
-    """Numbers and words of all lines that are not empty."""
-    try:
-        text = read_regular_file(path, TEXT_MAX_BYTES).decode("utf-8-sig", "replace")
-    except ForeignFileError as error:
-        raise BlockError(str(error)) from error
-    rows = ((number, line.split()) for number, line in enumerate(text.splitlines(), 1))
-    return [(number, words) for number, words in rows if words]
-
-
-def _floats(path: Path, number: int, words: Sequence[str]) -> list[float]:
-    try:
-        values = [float(word) for word in words]
-    except ValueError as error:
-        raise BlockError(f"{path}: line {number}: {error}") from error
-    if not all(math.isfinite(value) for value in values):
-        raise BlockError(f"{path}: line {number}: a finite number is needed")
-    return values
-
-
-def _cameras(folder: Path) -> dict[str, BlockCamera]:
+def cameras_of(folder: Path) -> dict[str, BlockCamera]:
     """`cameras.txt`: name, f, principal point, mm, pixel size, um, columns, rows."""
     path = folder / CAMERAS_FILE
     if not path.exists():
@@ -139,12 +117,12 @@ def _cameras(folder: Path) -> dict[str, BlockCamera]:
             "in um, columns, rows"
         )
     cameras: dict[str, BlockCamera] = {}
-    for number, words in _lines(path):
+    for number, words in lines_of(path):
         if words[0].startswith("#"):
             continue
         if len(words) != 7:
             raise BlockError(f"{path}: line {number}: {len(words)} columns; 7 are right")
-        f_mm, x0, y0, pitch_um, width, height = _floats(path, number, words[1:])
+        f_mm, x0, y0, pitch_um, width, height = numbers_of(path, number, words[1:])
         sides = (round(width), round(height))
         if not (f_mm > 0.0 and pitch_um > 0.0 and sides == (width, height) and min(sides) > 0):
             raise BlockError(f"{path}: line {number}: f, pixel size and sides are positive")
@@ -159,16 +137,16 @@ def _cameras(folder: Path) -> dict[str, BlockCamera]:
     return cameras
 
 
-def _photos(folder: Path, cameras: Mapping[str, BlockCamera]) -> dict[str, tuple[str, str]]:
+def photos_of(folder: Path, cameras: Mapping[str, BlockCamera]) -> dict[str, tuple[str, str]]:
     """File and camera of each photo's number, of `photos.txt` where there is one."""
     path = folder / "photos.txt"
     photos: dict[str, tuple[str, str]] = {}
-    for number, words in _lines(path) if path.exists() else []:
+    for number, words in lines_of(path) if path.exists() else []:
         if len(words) != 3:
             raise BlockError(
                 f"{path}: line {number}: {len(words)} columns; number, file and camera are right"
             )
-        photos[words[0]] = (words[1], _camera_named(path, number, words[2], cameras))
+        photos[words[0]] = (words[1], _known_camera(path, number, words[2], cameras))
     return photos
 
 
@@ -180,7 +158,7 @@ def _stated(folder: Path) -> tuple[str, Unit, str]:
             f"{folder}: has no angles.txt, and orientation.bingo does not state the order and unit "
             "of its angles; write it as `syntopic export block --to bingo` does"
         )
-    text = "\n".join(" ".join(words) for _, words in _lines(path))
+    text = "\n".join(" ".join(words) for _, words in lines_of(path))
     rows = dict(row.split(": ", 1) for row in text.split("\n") if ": " in row)
     order = next((k for k, stated in ANGLES.items() if rows.get("angles") == stated), None)
     unit: Unit = "gon" if rows.get("unit") == "gon" else "deg"
@@ -194,31 +172,31 @@ def _stated(folder: Path) -> tuple[str, Unit, str]:
     return _ORDERS[order], unit, rows.get("coordinate system", "")
 
 
-def _named(
+def named_orientations(
     path: Path, axes: str, unit: Unit, *, header: Sequence[str] = ()
-) -> dict[str, _Oriented]:
+) -> dict[str, Oriented]:
     """Name, place and three angles in each line, the first one the header where there is one."""
-    rows = _lines(path)
+    rows = lines_of(path)
     if header and (not rows or tuple(rows.pop(0)[1]) != tuple(header)):
         raise BlockError(f"{path}: does not begin with {' '.join(header)}")
     if axes not in _ORDERS.values():
         raise BlockError(f"{path}: angles.txt states a matrix, and this file has angles")
-    found: dict[str, _Oriented] = {}
+    found: dict[str, Oriented] = {}
     for number, words in rows:
         if len(words) != 7:
             raise BlockError(f"{path}: line {number}: {len(words)} columns; 7 are right")
-        values = _floats(path, number, words[1:])
+        values = numbers_of(path, number, words[1:])
         angles = np.radians(np.array(values[3:]) / UNITS[unit])
         rotation = rotation_from_angles(axes, angles.tolist())
         _add(found, path, number, words[0], np.array(values[:3]), np.asarray(rotation))
     return found
 
 
-def _three_records(path: Path) -> dict[str, _Oriented]:
-    rows = _lines(path)
+def _three_records(path: Path) -> dict[str, Oriented]:
+    rows = lines_of(path)
     if len(rows) % 3:
         raise BlockError(f"{path}: {len(rows)} lines; PATB has three records a photo")
-    found: dict[str, _Oriented] = {}
+    found: dict[str, Oriented] = {}
     for first, second, third in zip(rows[::3], rows[1::3], rows[2::3], strict=True):
         number, words = first
         if (len(words), len(second[1]), len(third[1])) != (4, 5, 4):
@@ -226,37 +204,37 @@ def _three_records(path: Path) -> dict[str, _Oriented]:
                 f"{path}: line {number}: records of {len(words)}, {len(second[1])} and "
                 f"{len(third[1])} numbers; photo, X, Y, Z, then 5 and 4 of the matrix are right"
             )
-        turn = np.array(_floats(path, second[0], second[1]) + _floats(path, third[0], third[1]))
-        rotation = turn.reshape(3, 3)
+        turn = numbers_of(path, *second) + numbers_of(path, *third)
+        rotation = np.array(turn).reshape(3, 3)
         off = np.abs(rotation @ rotation.T - np.eye(3)).max()
         if off > _ORTHOGONAL_TO or np.linalg.det(rotation) < 0.0:
             raise BlockError(f"{path}: line {number}: photo {words[0]}: no rotation matrix")
-        place = np.array(_floats(path, number, words[1:]))
+        place = np.array(numbers_of(path, number, words[1:]))
         _add(found, path, number, words[0], place, rotation)
     return found
 
 
 def _add(
-    found: dict[str, _Oriented], path: Path, number: int, name: str, place: Array, turn: Array
+    found: dict[str, Oriented], path: Path, number: int, name: str, place: Array, turn: Array
 ) -> None:
     if name in found:
         raise BlockError(f"{path}: line {number}: image {name} is there twice")
-    found[name] = _Oriented(place, turn)
+    found[name] = Oriented(place, turn)
 
 
-def _bingo(path: Path, cameras: Mapping[str, BlockCamera]) -> dict[str, _Measured]:
+def bingo_measurements(path: Path, cameras: Mapping[str, BlockCamera]) -> dict[str, Measured]:
     """Image and camera in a line, then its points; -99 or an empty line may end an image."""
     found: dict[str, dict[str, tuple[float, float]]] = {}
     camera_of: dict[str, str] = {}
     current = ""
-    for number, words in _lines(path):
+    for number, words in lines_of(path):
         if words[0] == _END:
             continue
         if len(words) == 2:
             current, camera = words
             if current in found:
                 raise BlockError(f"{path}: line {number}: image {current} is there twice")
-            camera_of[current] = _camera_named(path, number, camera, cameras)
+            camera_of[current] = _known_camera(path, number, camera, cameras)
             found[current] = {}
         elif len(words) == 3 and current:
             _measure(path, number, words, found[current], 1.0)
@@ -265,10 +243,10 @@ def _bingo(path: Path, cameras: Mapping[str, BlockCamera]) -> dict[str, _Measure
                 f"{path}: line {number}: {len(words)} columns; image and camera, or point, x, y in "
                 "mm are read, and further columns are not carried"
             )
-    return {name: _Measured(camera_of[name], points) for name, points in found.items()}
+    return {name: Measured(camera_of[name], points) for name, points in found.items()}
 
 
-def _camera_named(path: Path, number: int, name: str, cameras: Mapping[str, BlockCamera]) -> str:
+def _known_camera(path: Path, number: int, name: str, cameras: Mapping[str, BlockCamera]) -> str:
     if name not in cameras:
         raise BlockError(
             f"{path}: line {number}: camera {name} is not in {CAMERAS_FILE}, which has "
@@ -279,12 +257,12 @@ def _camera_named(path: Path, number: int, name: str, cameras: Mapping[str, Bloc
 
 def _patb(
     path: Path, cameras: Mapping[str, BlockCamera], photos: Mapping[str, tuple[str, str]]
-) -> dict[str, _Measured]:
+) -> dict[str, Measured]:
     """Photo and focal length, then its points, ended by -99; both in mm, or both in um."""
     found: dict[str, dict[str, tuple[float, float]]] = {}
     camera_of: dict[str, str] = {}
     current, mm = "", 1.0
-    for number, words in _lines(path):
+    for number, words in lines_of(path):
         if words[0] == _END:
             current = ""
         elif not current:
@@ -296,7 +274,7 @@ def _patb(
             current = words[0]
             if current in found:
                 raise BlockError(f"{path}: line {number}: photo {current} is there twice")
-            (focal,) = _floats(path, number, words[1:])
+            (focal,) = numbers_of(path, number, words[1:])
             own = photos[current][1] if current in photos else None
             known = cameras if own is None else {own: cameras[own]}
             camera_of[current], mm = _camera_of_focal(path, number, focal, known)
@@ -311,7 +289,7 @@ def _patb(
             )
     if current:
         raise BlockError(f"{path}: photo {current} does not end with {_END}; copy it again")
-    return {name: _Measured(camera_of[name], points) for name, points in found.items()}
+    return {name: Measured(camera_of[name], points) for name, points in found.items()}
 
 
 def _camera_of_focal(
@@ -346,18 +324,19 @@ def _measure(
 ) -> None:
     if words[0] in points:
         raise BlockError(f"{path}: line {number}: point {words[0]} is twice in this image")
-    x, y = _floats(path, number, words[1:])
+    x, y = numbers_of(path, number, words[1:])
     points[words[0]] = (x * mm, y * mm)
 
 
-def _block(
+def measured_block(
     folder: Path,
     cameras: Mapping[str, BlockCamera],
-    oriented: Mapping[str, _Oriented],
-    measured: Mapping[str, _Measured],
+    oriented: Mapping[str, Oriented],
+    measured: Mapping[str, Measured],
     system: str,
     names: Mapping[str, str],
 ) -> Block:
+    oriented = _by_names_of(measured, oriented)
     without = sorted(set(measured) - set(oriented))
     if without:
         raise BlockError(
@@ -391,35 +370,49 @@ def _block(
     )
 
 
+def _by_names_of(
+    measured: Mapping[str, Measured], oriented: Mapping[str, Oriented]
+) -> Mapping[str, Oriented]:
+    """Orientations by the names of the measurements, which may have no suffix of a file."""
+    if set(measured) <= set(oriented):
+        return oriented
+    by_stem = {PurePath(name).stem: one for name, one in oriented.items()}
+    return by_stem if len(by_stem) == len(oriented) else oriented
+
+
 def _intersected(
     folder: Path,
     cameras: Sequence[BlockCamera],
     images: Sequence[BlockImage],
-    measured: Mapping[str, _Measured],
+    measured: Mapping[str, Measured],
 ) -> tuple[BlockPoints, float]:
     """Points seen in two images or more, from the rays of all, and the median misfit in px.
 
     Raises:
         BlockError: rays that do not meet, or meet behind the cameras.
     """
-    seen: dict[str, list[tuple[int, Array]]] = {}
+    seen: dict[str, list[_Ray]] = {}
     for k, one in enumerate(measured.values()):
         camera = cameras[images[k].camera]
         pitch = camera.pitch_mm or 1.0
         middle = np.array([(camera.width_px - 1) / 2.0, (camera.height_px - 1) / 2.0])
-        for point, (x_mm, y_mm) in one.points.items():
-            px = middle + np.array([x_mm, -y_mm]) / pitch
-            if not (np.abs(px - middle) <= middle + 1.0).all():
+        xy_mm = np.array(list(one.points.values())).reshape(-1, 2)
+        pixels = middle + xy_mm * [1.0, -1.0] / pitch
+        directions = rays_from_measured_px(camera.model, pixels)
+        is_outside = (np.abs(pixels - middle) > middle + 1.0).any(axis=1)
+        for row, point in enumerate(one.points):
+            if is_outside[row] or not np.isfinite(directions[row]).all():
                 raise BlockError(
                     f"{folder}: point {point} of image {images[k].name} lies outside of the image "
-                    f"({x_mm:g}, {y_mm:g} mm); are coordinates in mm, and {CAMERAS_FILE} right?"
+                    f"({xy_mm[row, 0]:g}, {xy_mm[row, 1]:g} mm); are coordinates in mm, and "
+                    f"{CAMERAS_FILE} right?"
                 )
-            seen.setdefault(point, []).append((k, px))
+            seen.setdefault(point, []).append(_Ray(k, pixels[row], directions[row]))
     names: list[str] = []
     xyz: list[Array] = []
     image: list[int] = []
     of: list[int] = []
-    pixels: list[Array] = []
+    px: list[Array] = []
     misfits: list[float] = []
     behind = 0
     for point, rays in seen.items():
@@ -428,10 +421,9 @@ def _intersected(
         place, misfit_px, in_front = _meeting(cameras, images, rays)
         behind += not in_front
         misfits += misfit_px
-        for k, px in rays:
-            image.append(k)
-            of.append(len(names))
-            pixels.append(px)
+        image += [ray.image for ray in rays]
+        of += [len(names)] * len(rays)
+        px += [ray.px for ray in rays]
         names.append(point)
         xyz.append(place)
     if not names:
@@ -449,34 +441,31 @@ def _intersected(
         tuple(names),
         np.array(image, dtype=np.int64),
         np.array(of, dtype=np.int64),
-        np.array(pixels),
+        np.array(px),
     ), median_px
 
 
 def _meeting(
-    cameras: Sequence[BlockCamera],
-    images: Sequence[BlockImage],
-    rays: Sequence[tuple[int, Array]],
+    cameras: Sequence[BlockCamera], images: Sequence[BlockImage], rays: Sequence[_Ray]
 ) -> tuple[Array, list[float], bool]:
     """Where rays meet best, how far in px each measurement is from it, and whether in front."""
     normal, right = np.zeros((3, 3)), np.zeros(3)
-    for k, px in rays:
-        model = cameras[images[k].camera].model
-        x, y = (px - [model.cx_px, model.cy_px]) / model.fx_px
-        ray = images[k].rotation @ VISION_FROM_CAMERA @ np.array([x, y, 1.0])
-        ray /= np.linalg.norm(ray)
-        across = np.eye(3) - np.outer(ray, ray)
+    for ray in rays:
+        image = images[ray.image]
+        along = image.rotation @ VISION_FROM_CAMERA @ np.append(ray.xy, 1.0)
+        along /= np.linalg.norm(along)
+        across = np.eye(3) - np.outer(along, along)
         normal += across
-        right += across @ images[k].centre_m
+        right += across @ image.centre_m
     try:
         place = np.linalg.solve(normal, right)
     except np.linalg.LinAlgError:
-        return images[rays[0][0]].centre_m, [math.inf], False
+        return images[rays[0].image].centre_m, [math.inf], False
     misfits, in_front = [], True
-    for k, px in rays:
-        model = cameras[images[k].camera].model
-        x, y, z = VISION_FROM_CAMERA @ images[k].rotation.T @ (place - images[k].centre_m)
+    for ray in rays:
+        image = images[ray.image]
+        x, y, z = VISION_FROM_CAMERA @ image.rotation.T @ (place - image.centre_m)
         in_front = in_front and z > 0.0
-        back = np.array([model.cx_px, model.cy_px]) + model.fx_px * np.array([x, y]) / z
-        misfits.append(float(np.linalg.norm(back - px)))
+        back = measured_px_from_rays(cameras[image.camera].model, np.array([[x / z, y / z]]))
+        misfits.append(float(np.linalg.norm(back[0] - ray.px)))
     return np.asarray(place), misfits, bool(in_front)

@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 from daemon.cli import app
 from daemon.postflight.adjustment.project import read_project
 from daemon.postflight.exchange.block import BlockError
+from daemon.postflight.exchange.orientation_reader import read_inpho, read_pix4d
 from daemon.postflight.exchange.photogrammetry_reader import read_bingo, read_patb
 from tests.daemon.postflight.exchange.flown_block import fly
 from tests.daemon.postflight.exchange.test_colmap import SECONDS, export
@@ -62,14 +63,14 @@ def bingo(scene, folder: Path) -> Path:
 
 
 def pix4d(scene, folder: Path) -> Path:
-    """With the external parameters of Pix4D in place of our orientation."""
+    """With the external parameters of Pix4D, whose names have the suffix of the files."""
     bingo(scene, folder)
     (folder / "orientation.bingo").unlink()
     (folder / "angles.txt").unlink()
     lines = ["imageName X Y Z Omega Phi Kappa"]
     for k, (centre, turn) in enumerate(zip(scene[1], scene[2], strict=True)):
         angles = Rotation.from_matrix(turn @ FLIP).as_euler("XYZ", degrees=True)
-        lines.append(" ".join([f"P{k}", *(f"{v:.7f}" for v in (*centre, *angles))]))
+        lines.append(" ".join([f"P{k}.JPG", *(f"{v:.7f}" for v in (*centre, *angles))]))
     path = folder / "block_calibrated_external_camera_parameters.txt"
     path.write_text("\n".join(lines) + "\n")
     return folder
@@ -93,7 +94,7 @@ def patb(scene, folder: Path, unit: float = 1e3) -> Path:
 
 @pytest.mark.parametrize(
     ("program", "write"),
-    [("bingo", bingo), ("bingo", pix4d), ("patb", patb)],
+    [("bingo", bingo), ("pix4d", pix4d), ("patb", patb)],
 )
 def test_an_imported_block_adjusts_to_the_truth(scene, tmp_path, program, write) -> None:
     path, out = write(scene, tmp_path / "in"), tmp_path / "project"
@@ -245,3 +246,101 @@ def test_our_own_export_comes_back(tmp_path, program, read) -> None:
     truth = points[[int(point) for point in block.points.names]]
     assert len(truth) > 15 and np.abs(block.points.xyz_m - truth).max() < 0.05
     assert "EPSG:32633" in block.notes[0]
+
+
+def cam_file(folder: Path, k1: float, k2: float, width: int = SIZE[0]) -> None:
+    """Pix4D's camera file: the principal point from the corner of the first pixel."""
+    px, py = SIZE[0] / 2 * PITCH_MM, SIZE[1] / 2 * PITCH_MM
+    (folder / "X20.cam").write_text(
+        "Pix4D camera calibration file 0\n"
+        f"#Focal Length mm assuming a sensor width of {width * PITCH_MM:g}x{SIZE[1] * PITCH_MM:g}mm"
+        f"\nF {F * PITCH_MM}\n#Principal Point mm\nPx {px}\nPy {py}\n#Symmetrical Lens Distortion "
+        f"Coeffs\nK1 {k1}\nK2 {k2}\nK3 0.0\n#Tangential Lens Distortion Coeffs\nT1 0.0\nT2 0.0\n"
+    )
+
+
+def test_the_distortion_of_pix4d_s_camera_file_is_carried(tmp_path) -> None:
+    folder = pix4d(made_scene(-0.28, 0.12), tmp_path / "in")
+    cam_file(folder, -0.28, 0.12)
+    block = read_pix4d(folder)
+    assert float(block.notes[-1].split()[-2]) < 0.5, block.notes[-1]
+    # With the other sign the rays miss each other by pixels, which the note states.
+    cam_file(folder, 0.28, -0.12)
+    assert float(read_pix4d(folder).notes[-1].split()[-2]) > 3.0
+    cam_file(folder, -0.28, 0.12, width=2 * SIZE[0])
+    with pytest.raises(BlockError, match=r"a sensor of 12.8 x 4.8 mm; cameras.txt has 6.4 x 4.8"):
+        read_pix4d(folder)
+    cam_file(folder, -0.28, 0.12)
+    text = (folder / "X20.cam").read_text()
+    (folder / "X20.cam").write_text(text + "K4 0.1\n")
+    with pytest.raises(BlockError, match=r"'K4 0\.1' is not carried"):
+        read_pix4d(folder)
+
+
+@pytest.mark.parametrize(("program", "read"), [("pix4d", read_pix4d), ("inpho", read_inpho)])
+def test_files_of_pix4d_and_inpho_come_back_as_they_went(tmp_path, program, read) -> None:
+    flown = fly(tmp_path / "mission", "midas-mini", seconds=SECONDS)
+    _, other = export(flown, "--crs", "EPSG:32633", to="patb")
+    matrices = np.array(
+        [" ".join(rows).split() for rows in grouped((other / "orientation.ori").read_text())],
+        float,
+    )
+    names = [line.split()[1] for line in (other / "photos.txt").read_text().splitlines()]
+    _, folder = export(flown, "--crs", "EPSG:32633", to=program)
+    block = read(folder)
+    found = {one.name.removesuffix(".jpg"): one for one in block.images}
+    for name, row in zip(names, matrices, strict=True):
+        one = found[name.removesuffix(".jpg")]
+        assert np.abs(one.centre_m - row[1:4]).max() < 1e-4
+        assert np.abs(one.rotation - row[4:].reshape(3, 3)).max() < 3e-9
+        assert name.endswith(f"_{block.cameras[one.camera].name}.jpg")
+    rig = {cone.name: cone for cone in flown.rig.cones}
+    for camera in block.cameras:
+        sensor, model = rig[camera.name].sensors[0], camera.model
+        middle = ((camera.width_px - 1) / 2, (camera.height_px - 1) / 2)
+        assert (camera.width_px, camera.height_px) == (sensor.width_px, sensor.height_px)
+        assert model.is_pinhole and np.allclose((model.cx_px, model.cy_px), middle, atol=1e-5)
+        assert model.fx_px * camera.pitch_mm == pytest.approx(rig[camera.name].lens.f_mm, rel=1e-6)
+    done = RUN.invoke(
+        app,
+        ["import", "block", str(folder), "--from", program, "--out", str(tmp_path / "p"), "--json"],
+    )
+    assert done.exit_code == 0 and json.loads(done.stdout)["images"] == 20
+    assert "no image measurements" in json.loads(done.stdout)["notes"][-1]
+
+
+def grouped(text: str) -> list[list[str]]:
+    rows = text.splitlines()
+    return [rows[k : k + 3] for k in range(0, len(rows), 3)]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [
+        ("$PIXEL_REFERENCE : CenterTopLeft", "$PIXEL_REFERENCE : OriginTopLeft", "CenterTopLeft"),
+        ("  $FOCAL_LENGTH", "  $DISTORTION_TYPE : 2\n  $FOCAL_LENGTH", "without distortion"),
+        ("  $ORI_STAT", "  $PHOTO_POINTS :\n  $ORI_STAT", "measurements are not carried"),
+        ("$PROJECT 5.0.0", "$POINTS\n$END\n$PROJECT 5.0.0", "section .POINTS is not carried"),
+        ("$CAMERA_ID : nadir", "$CAMERA_ID : other", "camera 'other' is not in the file"),
+        ("$EXT_ORI :", "$EXT_ORI_OLD :", "has no .EXT_ORI"),
+        ("$TYPE : nadir", "$TYPE : nadir\n  $CCD_ROWS : many", "is not understood|CenterTopLeft"),
+    ],
+)
+def test_inpho_projects_that_cannot_be_carried_are_refused(
+    inpho_text, tmp_path, old, new, sentence
+) -> None:
+    assert old in inpho_text
+    (tmp_path / "a.prj").write_text(inpho_text.replace(old, new, 1))
+    if "many" in new:
+        text = inpho_text.replace("$CCD_ROWS : ", "$CCD_ROWS : many", 1)
+        (tmp_path / "a.prj").write_text(text)
+    with pytest.raises(BlockError, match=sentence):
+        read_inpho(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def inpho_text(tmp_path_factory) -> str:
+    flown = fly(tmp_path_factory.mktemp("inpho") / "mission", "midas-mini", seconds=SECONDS[:1])
+    _, folder = export(flown, "--crs", "EPSG:32633", to="inpho")
+    (path,) = folder.glob("*.prj")
+    return path.read_text()
