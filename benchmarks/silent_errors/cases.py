@@ -214,6 +214,7 @@ def named_causes(report: QualityReport) -> dict[str, frozenset[str]]:
     if not other_ground:
         found["gain"] = _names(_one(figures.of(BalanceFigures).gain_outlier))
         found["blur"] = _names(_one(figures.of(RelativeSharpnessFigures).blurred_sensor))
+        found["noise"] = _names(_one(figures.of(RelativeSharpnessFigures).noisy_sensor))
         found["step"] = _names(_one(figures.of(SignalStepFigures).signal_step_sensor))
     if Flag.CALIBRATION_EXPIRED in report.flags:
         causes, other = figures.of(LayerFigures).platform_causes, platform.platform_alternatives

@@ -253,6 +253,17 @@ def _blur(
 ) -> list[Finding]:
     """A PAN head, or a region of any frame, that is less sharp than others of the same ground."""
     findings = []
+    if relative.noisy_sensor is not None and relative.noisy_share is not None:
+        findings.append(
+            Finding(
+                Flag.FRAME_CORRUPT,
+                Verdict.USABLE,
+                f"Head {relative.noisy_sensor} has noise that its neighbour does not show: "
+                f"{relative.noisy_share:.0%} of its detail is between single pixels, more than a "
+                "lens leaves. Check the head, its cable and power supply.",
+                relative.noisy_share,
+            )
+        )
     blurred, ratio = relative.blurred_sensor, relative.blurred_ratio
     if blurred and ratio is not None:
         findings.append(

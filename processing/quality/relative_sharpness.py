@@ -7,7 +7,7 @@ ground, so that a head out of focus, with dew or with smear of its own shows les
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -21,11 +21,15 @@ from processing.quality.figures.image import RelativeSharpnessFigures
 from processing.rig import Rig
 
 Array = NDArray[Any]
+Shares = tuple[float | None, float | None]
+"""Of the finest detail along and across track."""
 
 SMOOTH: Final = 0.25
 """The share of the finest detail of a surface without any (`processing.image.sharpness`)."""
 MIN_RATIO: Final = 0.6
 """Of its neighbours' fine detail. Lenses differ by a tenth from axis to corner."""
+MAX_SHARE: Final = 0.55
+"""Of the finest detail, along both directions: lenses leave 0.48 at most in healthy exposures."""
 MIN_DETAIL: Final = 0.05
 """Beyond a smooth surface, that the sharper head shows: below, there is nothing to compare."""
 
@@ -41,8 +45,8 @@ def relative_sharpness_figures(
         frames: Level-1 words by sensor name, (h, w) uint16.
 
     Returns:
-        Sensor and its detail over that of its neighbours; empty where no head is clearly less
-        sharp, None where none can be compared.
+        Sensor and its detail over that of its neighbours, and the noisiest head; empty where no
+        head is clearly less sharp or noisy, None where none can be compared.
 
     Source: docs/explanation/mathematics/quality.md#sharpness.
     """
@@ -55,9 +59,12 @@ def relative_sharpness_figures(
             shares[name, overlap] = sharpness(
                 rig.sensor(name), frames[name], (top, low), (left, right)
             )
+    noisy = _noisiest(common, shares)
     ratios: dict[str, list[float]] = {}
     for overlap in common:
         a, b = overlap.sensor_a, overlap.sensor_b
+        if noisy is not None and noisy[0] in (a, b):
+            continue
         for of_a, of_b in zip(shares[a, overlap], shares[b, overlap], strict=True):
             if of_a is None or of_b is None:
                 continue
@@ -67,12 +74,38 @@ def relative_sharpness_figures(
                 ratios.setdefault(b, []).append(detail_b / detail_a)
     # Blurred is who is so against most neighbours; along one direction is enough.
     worst = {name: _typical(found) for name, found in ratios.items()}
-    if not worst:
+    noisy_sensor, noisy_share = noisy or (None, None)
+    if not worst and noisy is None:
         return None
-    name = min(worst, key=lambda n: worst[n])
-    if worst[name] >= MIN_RATIO:
-        return RelativeSharpnessFigures()
-    return RelativeSharpnessFigures(name, worst[name])
+    name = min(worst, key=lambda n: worst[n], default=None)
+    if name is None or worst[name] >= MIN_RATIO:
+        return RelativeSharpnessFigures(noisy_sensor=noisy_sensor, noisy_share=noisy_share)
+    return RelativeSharpnessFigures(name, worst[name], noisy_sensor, noisy_share)
+
+
+def _noisiest(
+    common: Sequence[Overlap], shares: Mapping[tuple[str, Overlap], Shares]
+) -> tuple[str, float] | None:
+    """The head with more of the finest detail than a lens leaves, where a neighbour has far less.
+
+    Noise of single pixels or lines is such detail; next to it a healthy neighbour seems blurred.
+    """
+    found = []
+    for overlap in common:
+        for own, other in (
+            (overlap.sensor_a, overlap.sensor_b),
+            (overlap.sensor_b, overlap.sensor_a),
+        ):
+            pairs = list(zip(shares[own, overlap], shares[other, overlap], strict=True))
+            if all(
+                mine is not None
+                and its is not None
+                and mine > MAX_SHARE
+                and its - SMOOTH < MIN_RATIO * (mine - SMOOTH)
+                for mine, its in pairs
+            ):
+                found.append((own, min(mine for mine, _ in pairs if mine is not None)))
+    return max(found, key=lambda head: head[1], default=None)
 
 
 def _typical(found: list[float]) -> float:

@@ -371,6 +371,22 @@ def test_a_head_that_clips_below_full_scale_is_named_with_its_level(
     assert outcome.figure("clipped_fraction") == pytest.approx(share, rel=0.2)
 
 
+def test_noise_in_rows_of_a_frame_is_named_and_no_neighbour_is_blurred(
+    error_free: InjectedExposure,
+) -> None:
+    random = np.random.default_rng(5)
+
+    def noisy(frame: Any) -> Any:
+        rows = frame.astype(np.float64)
+        rows[400:420] += random.normal(0.0, 300.0, rows[400:420].shape)
+        return np.clip(np.rint(rows), 0, 4095).astype(np.uint16)
+
+    outcome = error_free.with_frame("SU01", noisy).outcome()
+    assert outcome.verdict == "usable" and "FRAME_CORRUPT" in outcome.flags
+    assert outcome.figure("noisy_sensor") == "SU01" and outcome.figure("noisy_share") > 0.55
+    assert outcome.figure("blurred_sensor") is None, outcome.sentences
+
+
 EVERYTHING = slice(None)
 
 

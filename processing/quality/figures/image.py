@@ -183,6 +183,10 @@ class RelativeSharpnessFigures(FigureGroup):
         "PAN sensor that is less sharp than its neighbours in their overlaps",
     ] = None
     blurred_ratio: Annotated[float | None, "its fine detail over theirs"] = None
+    noisy_sensor: Annotated[
+        str | None, "PAN sensor with more of the finest detail than a lens leaves: noise"
+    ] = None
+    noisy_share: Annotated[float | None, "its share of the finest detail; noise alone has 1"] = None
 
 
 @dataclass(frozen=True)

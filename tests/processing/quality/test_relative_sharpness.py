@@ -32,7 +32,8 @@ def figures(
         s.name: np.zeros((s.height_px, s.width_px), np.uint16) for s in PAN if s.name not in without
     }
     found = relative_sharpness_figures(MINI, PLACEMENTS, frames)
-    return {} if found is None else found.as_json()
+    content = {} if found is None else found.as_json()
+    return {n: value for n, value in content.items() if not (n.startswith("noisy") and not value)}
 
 
 @pytest.mark.parametrize("share", [(0.37, 0.37), (0.37, 0.45), (0.45, 0.37)])
@@ -44,6 +45,34 @@ def test_a_head_with_three_fifths_of_the_detail_is_in_order(
     less = tuple(0.366 if value == 0.37 else value for value in share)
     found = figures(monkeypatch, {"SU10": (less[0], less[1])})
     assert found == {"blurred_sensor": "SU10", "blurred_ratio": pytest.approx(0.58)}
+
+
+@pytest.mark.parametrize(
+    ("share", "noisy"),
+    [((0.6, 0.56), True), ((0.6, 0.54), False), ((0.54, 0.6), False), ((0.9, 0.95), True)],
+)
+def test_a_noisy_head_is_named_and_no_neighbour_of_it(
+    monkeypatch: pytest.MonkeyPatch, share: tuple[float, float], noisy: bool
+) -> None:
+    """Its neighbours have 0.35: a third of the detail that it seems to have."""
+    shares: Shares = {s.name: (0.35, 0.35) for s in PAN} | {"SU10": share}
+    found = figures(monkeypatch, shares)
+    assert found.get("noisy_sensor") == ("SU10" if noisy else None)
+    assert (found["blurred_sensor"] is None) is noisy
+    if noisy:
+        assert found["noisy_share"] == pytest.approx(min(share))
+
+
+def test_detail_that_the_neighbours_show_too_is_no_noise(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert "noisy_sensor" not in figures(monkeypatch, {s.name: (0.6, 0.6) for s in PAN})
+    nearly: Shares = {s.name: (0.47, 0.47) for s in PAN} | {"SU10": (0.6, 0.6)}
+    assert "noisy_sensor" not in figures(monkeypatch, nearly)
+
+
+def test_blur_of_another_head_is_named_next_to_noise(monkeypatch: pytest.MonkeyPatch) -> None:
+    shares: Shares = {"SU10": (0.9, 0.9), "SU21": (0.27, 0.27)}
+    found = figures(monkeypatch, shares)
+    assert found["noisy_sensor"] == "SU10" and found["blurred_sensor"] == "SU21"
 
 
 def test_a_head_at_the_limit_is_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
