@@ -65,8 +65,10 @@ def write_image(
     per_mm: float | None = None,
     iso: int = 100,
     time_s: float | None = 0.002,
+    gps: tuple[float, float, float] | None = None,
 ) -> None:
-    height, width = pixels.shape
+    height, width = pixels.shape[:2]
+    planes = 1 if pixels.ndim == 2 else pixels.shape[2]
     exif = [entry(36867, "ascii", taken)] if taken else []
     for code, kind, value in (
         (33434, "rational", time_s), (33437, "rational", 2.2), (34855, "short", iso),
@@ -77,17 +79,40 @@ def write_image(
         if value is not None:
             exif.append(entry(code, kind, value))
     image = [
-        entry(256, "long", width), entry(257, "long", height), entry(258, "short", 16),
-        entry(259, "short", 1), entry(262, "short", 1), entry(271, "ascii", make),
-        entry(272, "ascii", model), entry(277, "short", 1), entry(278, "long", height),
-        entry(279, "long", pixels.nbytes), entry(700, "byte", packet),
+        entry(256, "long", width), entry(257, "long", height), entry(258, "short", (16,) * planes),
+        entry(259, "short", 1), entry(262, "short", 1 if planes == 1 else 2),
+        entry(271, "ascii", make),
+        entry(272, "ascii", model), entry(277, "short", planes), entry(278, "long", height),
+        entry(279, "long", pixels.nbytes),
     ]  # fmt: skip
+    if packet:
+        image.append(entry(700, "byte", packet))
     if black is not None:
         image.append(entry(50714, "short", black))
     start = 8 + pixels.nbytes
-    exif_at = start + len(directory([*image, entry(273, "long", 8), entry(34665, "long", 0)], 0))
-    exif_at += exif_at % 2
-    first = directory([*image, entry(273, "long", 8), entry(34665, "long", exif_at)], start)
+    links = [entry(34665, "long", 0), *([entry(34853, "long", 0)] if gps else [])]
+    exif_at = even(start + len(directory([*image, entry(273, "long", 8), *links], 0)))
+    gps_at = even(exif_at + len(directory(exif, exif_at)))
+    links = [entry(34665, "long", exif_at), *([entry(34853, "long", gps_at)] if gps else [])]
+    first = directory([*image, entry(273, "long", 8), *links], start)
     body = struct.pack("<2sHI", b"II", 42, start) + pixels.astype("<u2").tobytes() + first
+    body = body.ljust(exif_at, b"\0") + directory(exif, exif_at)
+    if gps:
+        body = body.ljust(gps_at, b"\0") + directory(position(*gps), gps_at)
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(body.ljust(exif_at, b"\0") + directory(exif, exif_at))
+    path.write_bytes(body)
+
+
+def even(place: int) -> int:
+    return place + place % 2
+
+
+def position(latitude_deg: float, longitude_deg: float, height_m: float) -> list:
+    """Entries of GPS north and east; whole degrees, the rest as minutes (EXIF 2.32, 4.6.6)."""
+    found = [entry(1, "ascii", "N"), entry(3, "ascii", "E"), entry(5, "byte", b"\0")]
+    for code, value in ((2, latitude_deg), (4, longitude_deg)):
+        whole, minutes = int(value), (value % 1) * 60.0
+        raw = struct.pack("<6I", whole, 1, round(minutes * 1e6), 1_000_000, 0, 1)
+        found.append((code, 5, 3, raw))
+    found.append(entry(6, "rational", height_m))
+    return found

@@ -169,9 +169,10 @@ def _rig_and_fit(camera: _Camera) -> tuple[Rig, dict[str, float]]:
     pattern = nominal.cones[0]
     cones = []
     for name in names:
-        image = first.get(name)
-        if image is None and not is_micasense:
-            image = replace(next(iter(first.values())), sensor=name, band=_BAND_OF[name])
+        # A head without images takes the size and lens of another, and has no wavelength.
+        image = first.get(name) or replace(
+            next(iter(first.values())), sensor=name, band=_BAND_OF[name], wavelength_nm=0.0
+        )
         cone = next((c for c in nominal.cones if c.name == name), None) or replace(
             pattern, name=name, bands=(_BAND_OF[name],), lens=pattern.lens,
             sensors=(replace(pattern.sensors[0], name=name),),
@@ -322,10 +323,8 @@ def _head(image: BandImage) -> tuple[Any, ...]:
     return (image.serial, *size, image.lens, image.calibration)
 
 
-def _cone_of(cone: Cone, image: BandImage | None, bits: int, fit: dict[str, float]) -> Cone:
+def _cone_of(cone: Cone, image: BandImage, bits: int, fit: dict[str, float]) -> Cone:
     """A cone with the lens, the principal point and the serial number of an image."""
-    if image is None:
-        return cone
     lens, worst_px = _lens_of(image)
     fit[image.sensor] = worst_px
     column, row = image.lens.principal_point_px

@@ -160,6 +160,8 @@ def test_images_of_dji_are_placed_as_opencv_does(scene, tmp_path, model, bands) 
     missing = ["exposure 1 has no frame of E"] if model == "M3M" else []
     assert camera["missing"] == missing, "a Mavic 3 M has a red edge band, this folder has none"
     rig = load_rig(tmp_path / "out/rig.toml")
+    known = {c.bands[0]: c.wavelengths_nm for c in rig.cones}
+    assert known["green"] == (560.0,) and known["red_edge"] == (() if missing else (560.0,))
     sensor = rig.sensor("N")
     assert (sensor.black_dn, sensor.bits, sensor.pitch_um) == (4096.0, 16, pytest.approx(3.0))
     matrix = np.array([[1913.333, 0, 170.5], [0, 1913.333, 112.75], [0, 0, 1.0]])
@@ -227,6 +229,8 @@ def test_a_group_without_one_of_five_bands_stays_usable(scene, tmp_path) -> None
         micasense(tmp_path / "in", scene, band, f"IMG_0000_{number}.tif", "RedEdge-M", "R1")
     imported(tmp_path / "in", tmp_path / "out")
     assert processed(tmp_path / "out", 1).report.verdict is Verdict.USABLE
+    near_infrared = load_rig(tmp_path / "out/rig.toml").cone("N")
+    assert near_infrared.wavelengths_nm == () and near_infrared.sensors[0].width_px == SIZE[0]
 
 
 def test_captures_without_a_name_are_grouped_by_time(scene, tmp_path) -> None:
@@ -314,3 +318,33 @@ def test_the_words_are_those_of_the_file(scene, tmp_path) -> None:
     dji(tmp_path / "in", scene, "NIR", "b.tif")
     imported(tmp_path / "in", tmp_path / "out")
     assert np.array_equal(tifffile.imread(tmp_path / "out/L0/000001/N.tif"), scene)
+
+
+def test_sixteen_bit_photographs_of_phase_one_are_a_block(tmp_path) -> None:
+    """TIFF with the focal length and pixel pitch in EXIF, as Capture One exports IIQ."""
+    random = np.random.default_rng(1)
+    for k in range(3):
+        pixels = random.integers(0, 65536, (96, 128, 3), dtype=np.uint16)
+        write_image(
+            tmp_path / f"in/P{k:04d}.tif", pixels, b"", make="Phase One", model="iXM-100",
+            serial="MM01", focal_mm=4.0, per_mm=1 / 0.00376, gps=(47.0 + k * 1e-4, 15.5, 900.0),
+        )  # fmt: skip
+    done = RUN.invoke(
+        app,
+        ["import", "photographs", str(tmp_path / "in"), "--out", str(tmp_path / "out"), "--json"],
+    )
+    assert done.exit_code == 0, done.output + str(done.exception)
+    content = json.loads(done.stdout)
+    assert (content["camera"], content["photographs"]) == ("Phase One iXM-100", 3)
+    assert content["f_px"] == pytest.approx(4.0 / 0.00376, rel=1e-5)
+    assert content["pixel_um"] == pytest.approx(3.76, rel=1e-5)
+    # Another camera in the folder is refused with both named.
+    write_image(
+        tmp_path / "in/Q.tif", pixels, b"", make="Phase One", model="iXM-100", serial="MM02",
+        focal_mm=4.0, per_mm=1 / 0.00376, gps=(47.0, 15.5, 900.0),
+    )  # fmt: skip
+    done = RUN.invoke(
+        app, ["import", "photographs", str(tmp_path / "in"), "--out", str(tmp_path / "two")]
+    )
+    sentence = str(done.exception)
+    assert done.exit_code != 0 and "MM01" in sentence and "MM02" in sentence
