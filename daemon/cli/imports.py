@@ -83,6 +83,16 @@ def multispectral(
         console.print(f"Next: syntopic process {one.mission.path}", soft_wrap=True)
 
 
+@app.command(
+    hidden=True,
+    add_help_option=False,
+    context_settings={"ignore_unknown_options": True, "allow_extra_args": True},
+)
+def rededge(context: typer.Context) -> None:
+    """Refuse the former name of `multispectral`."""
+    context.fail("No such command 'rededge'. Use 'multispectral'.")
+
+
 @app.command()
 def photographs(
     folder: Annotated[Path, typer.Argument(help="Folder with JPEG or TIFF files of one camera.")],

@@ -348,3 +348,9 @@ def test_sixteen_bit_photographs_of_phase_one_are_a_block(tmp_path) -> None:
     )
     sentence = str(done.exception)
     assert done.exit_code != 0 and "MM01" in sentence and "MM02" in sentence
+
+
+def test_the_former_name_is_refused_with_the_present_one(tmp_path) -> None:
+    done = RUN.invoke(app, ["import", "rededge", str(tmp_path), "--out", str(tmp_path / "out")])
+    assert done.exit_code == 2 and "Use 'multispectral'" in " ".join(done.output.split())
+    assert "rededge" not in RUN.invoke(app, ["import", "--help"]).output.replace("RedEdge", "")
