@@ -4,15 +4,29 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.progress import Progress
+from typer.core import TyperGroup
 
 from daemon.cli.options import AsJson
 from daemon.terminal.console import Console
 
+
+class _Commands(TyperGroup):
+    """The commands; former names are refused with the present one."""
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        if cmd_name in RENAMED:
+            ctx.fail(f"No such command '{cmd_name}'. Use '{RENAMED[cmd_name]}'.")
+        return super().get_command(ctx, cmd_name)
+
+
+RENAMED = {"rededge": "multispectral"}
+
 app = typer.Typer(
+    cls=_Commands,
     help="""Import exposures of other cameras as a mission folder for `syntopic process`.
 
 Example: `syntopic import multispectral 0000SET --out field-7`
@@ -81,16 +95,6 @@ def multispectral(
             console.print(sentence, markup=False, style="yellow", soft_wrap=True)
     for one in imported:
         console.print(f"Next: syntopic process {one.mission.path}", soft_wrap=True)
-
-
-@app.command(
-    hidden=True,
-    add_help_option=False,
-    context_settings={"ignore_unknown_options": True, "allow_extra_args": True},
-)
-def rededge(context: typer.Context) -> None:
-    """Refuse the former name of `multispectral`."""
-    context.fail("No such command 'rededge'. Use 'multispectral'.")
 
 
 @app.command()
