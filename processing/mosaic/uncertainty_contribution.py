@@ -51,6 +51,9 @@ HEAD_SCALE_PPM: Final = 50.0
 """Of a converging head; healthy ones reach half of it."""
 RELATIVE_SHIFT: Final = 3.0
 """The largest of a few shifts between frames, over the sigma of a coordinate of one."""
+MIN_SLIP_PX: Final = 0.1
+"""Component of a slip; a smaller one is the error of its measurement: lines shift by whole pixels,
+of which a quarter is left."""
 MIN_DISPLACEMENT_PX: Final = 0.02
 """Displacements with a smaller difference count as equal."""
 
@@ -116,6 +119,7 @@ def uncertainty_contribution_of(
     frames: dict[str, Array] = {}
     for slip in slips:
         shift = np.array([slip.dx_px, slip.dy_px])
+        shift[np.abs(shift) < MIN_SLIP_PX] = 0.0
         for name in (slip.sensor, *slip.alternatives):
             frames[name] = frames.get(name, np.zeros(2)) + slip.share * shift**2
     unplaced, apart = _unplaced(rig, mosaic, shifted_px, weak)

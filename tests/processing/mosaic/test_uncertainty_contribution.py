@@ -84,6 +84,15 @@ def test_a_slip_adds_the_variance_of_its_share_of_the_frame() -> None:
     assert frames["SU20"] == pytest.approx([2.0, 0.0])
 
 
+@pytest.mark.parametrize(("dy_px", "added"), [(0.09, 0.0), (-0.09, 0.0), (-0.11, 0.00363)])
+def test_of_a_slip_along_one_axis_the_error_of_the_other_adds_nothing(
+    dy_px: float, added: float
+) -> None:
+    rig, mosaic = mosaic_of("ultracam-x-mini")
+    slips = (Slip("SU10", "columns", 0, 83, -2.0, dy_px, 0.3, 30.0, 50),)
+    assert found(rig, mosaic, slips=slips).frames["SU10"] == pytest.approx([1.2, added])
+
+
 def test_a_wrong_probe_of_the_master_moves_the_datum_by_its_error() -> None:
     rig, mosaic = mosaic_of("ultracam-x-mini")
     per_k = datum_per_kelvin_px(rig, mosaic)
