@@ -17,11 +17,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from benchmarks.rendered import process, radiometry_of, take, world_settings
 from daemon.cli.benchmark.measurement import machine
-from processing.bundle.adjust import AdjustmentSettings, adjust
+from processing.bundle.adjust import Adjustment, AdjustmentSettings, adjust
 from processing.bundle.adjustment_results import check_point_differences, image_residuals_mm
+from processing.bundle.frame_patterns import FramePatterns
 from processing.bundle.initial_values import intersect
 from processing.bundle.network import (
     Attitudes,
@@ -37,6 +39,7 @@ from processing.bundle.network import (
 from processing.bundle.self_calibration import SETS, SetName, parts_of, with_self_calibration
 from processing.geometry.rotation import rotations_from_vectors
 from processing.matching.patches import INTERPOLATION, match_patches, select_features
+from processing.mosaic.stitching_patterns import stitching_patterns
 from processing.pipelines.stitched import Pipeline, PipelineSettings
 from processing.rig import VirtualImage
 from sim_hw.world import true_camera
@@ -56,16 +59,20 @@ GNSS_M = 0.05
 INERTIAL_RAD = 8e-5
 SURVEY_M = 0.02
 CONTROL = 12
+JOINT_EVERY = 5
+"""Of the check points, one in so many enters the joint covariance."""
 
 
 @dataclass(frozen=True)
 class RenderedStrip:
-    """Stitched images (H, W) float32, NaN without data; where the ideal camera truly stood."""
+    """Stitched images (H, W) float32, NaN without data; where the ideal camera truly stood; the
+    patterns that stitching may have left in each image."""
 
     world: World
     images: list[NDArray[np.float32]]
     station: Array
     rotation: Array
+    patterns: tuple[FramePatterns, ...]
 
 
 @dataclass(frozen=True)
@@ -85,16 +92,18 @@ def rendered_strip(rig: str, frames: int, seed: int, scenes: Path) -> RenderedSt
     scene = open_scene(world.scene_settings, scenes)
     heads = RigElectronics(world, seed=seed)
     pipeline = Pipeline(world.rig, radiometry_of(heads), PipelineSettings(geometry=False))
-    images, station, rotation = [], [], []
+    images, station, rotation, patterns = [], [], [], []
     master = world.rig.cone(world.rig.master_cone)
     for k in range(frames):
         exposure = take(world, scenes, place=k, scene=scene)
-        pan = process(pipeline, heads, exposure, seed=seed * 1000 + k).pan
+        product = process(pipeline, heads, exposure, seed=seed * 1000 + k)
+        pan = product.pan
         images.append(np.where(pan == 0, np.nan, pan).astype(np.float32))
+        patterns.append(stitching_patterns(world.rig, product.mosaic))
         pose = exposure.flight.pose(exposure.snapshot.mark_gps_ns)
         station.append(true_camera.projection_centre_m(master, pose))
         rotation.append(pose.enu_from_body @ true_camera.BODY_FROM_CAMERA)
-    return RenderedStrip(world, images, np.array(station), np.array(rotation))
+    return RenderedStrip(world, images, np.array(station), np.array(rotation), tuple(patterns))
 
 
 def match_strip(strip: RenderedStrip, start_station: Array, start_rotation: Array) -> Matched:
@@ -187,8 +196,11 @@ def simulate_navigation(strip: RenderedStrip, seed: int) -> tuple[Array, Array]:
     )
 
 
-def evaluate(strip: RenderedStrip, seed: int, found: Matched, name: SetName) -> dict[str, Any]:
-    """Adjust with a set of additional parameters and hold against the truth."""
+def evaluate(
+    strip: RenderedStrip, seed: int, found: Matched, name: SetName, *, patterns: bool = False
+) -> dict[str, Any]:
+    """Adjust with a set of additional parameters, or patterns of stitching, and hold against the
+    truth."""
     random = np.random.default_rng([seed, 4])
     image, n = strip.world.image, len(strip.station)
     rig = strip.world.rig
@@ -240,17 +252,26 @@ def evaluate(strip: RenderedStrip, seed: int, found: Matched, name: SetName) -> 
             time_s=np.zeros(n),
         ),
         measured_attitudes=MeasuredAttitudes(index, inertial, np.full((n, 3), INERTIAL_RAD)),
+        patterns=strip.patterns if patterns else (),
     )
+    checks = np.setdiff1d(np.flatnonzero(rays >= 3), control)
+    retained = checks[::JOINT_EVERY]
     begun = time.perf_counter()
     result = adjust(
-        network, AdjustmentSettings(robust=True, reject_beyond=4.0, variance_components=True)
+        network,
+        AdjustmentSettings(
+            robust=True,
+            reject_beyond=4.0,
+            variance_components=True,
+            retained=tuple(network.points.names[k] for k in retained),
+        ),
     )
     adjusting_s = time.perf_counter() - begun
     residual = image_residuals_mm(result)
     good = np.isfinite(residual).all(axis=1)
     rms_um = np.sqrt(np.mean(residual[good] ** 2, axis=0)) * 1e3
     table = {g.name: g for g in result.groups}
-    checks = np.setdiff1d(np.flatnonzero(rays >= 3), control)
+    joint = joint_heights(result, retained[~result.left_out[retained]], truth)
     against = check_point_differences(
         result,
         [network.points.names[k] for k in checks],
@@ -278,7 +299,20 @@ def evaluate(strip: RenderedStrip, seed: int, found: Matched, name: SetName) -> 
         "check_rms_m": [float(v) for v in against.rms_m],
         "check_predicted_m": [float(v) for v in against.predicted_m],
         "check_squares": against.squares,
+        "joint_height_squares": joint[0],
+        "joint_heights": joint[1],
     }
+
+
+def joint_heights(result: Adjustment, points: NDArray[np.int64], truth: Array) -> tuple[float, int]:
+    """Squares of errors in height in their joint covariance, and their number.
+
+    In plan a point is where its first image shows it, which has noise of its own: heights only.
+    """
+    columns = result.layout.retained_points[points, 2]
+    error = (result.state.points - truth)[points, 2]
+    covariance = result.sigma0**2 * result.cofactor[np.ix_(columns, columns)]
+    return float(error @ np.linalg.solve(covariance, error)), len(points)
 
 
 def _mm(image: VirtualImage, px: Array) -> Array:
@@ -314,6 +348,34 @@ def _pixels(image: VirtualImage, station: Array, rotation: Array, ground: Array)
     )
 
 
+def compare_patterns(rig: str, frames: int, first: int, strips: int) -> None:
+    """Print heights of several strips without and with the patterns of stitching."""
+    total = {False: [0.0, 0], True: [0.0, 0]}
+    for seed in range(first, first + strips):
+        with tempfile.TemporaryDirectory(prefix="syntopic-bench-") as folder:
+            strip = rendered_strip(rig, frames, seed, Path(folder))
+            found = match_strip(strip, *simulate_navigation(strip, seed))
+        for patterns in (False, True):
+            f = evaluate(strip, seed, found, "none", patterns=patterns)
+            total[patterns][0] += f["joint_height_squares"]
+            total[patterns][1] += f["joint_heights"]
+            rms = " ".join(f"{v * 100:.2f}" for v in f["check_rms_m"])
+            predicted = " ".join(f"{v * 100:.2f}" for v in f["check_predicted_m"])
+            ratio = f["joint_height_squares"] / f["joint_heights"]
+            print(
+                f"strip {seed} {'with' if patterns else 'without'} patterns: against truth {rms} "
+                f"cm, predicted {predicted} cm, squares {f['check_squares']:.2f}, joint heights "
+                f"{ratio:.2f}; {f['adjusting_s']:.1f} s",
+                flush=True,
+            )
+    for patterns, (squares, count) in total.items():
+        low, high = (float(chi2.ppf(q, count)) / count for q in (0.0005, 0.9995))
+        print(
+            f"{'with' if patterns else 'without'} patterns: joint heights {squares / count:.2f} "
+            f"({low:.2f} to {high:.2f} holds 99.9 %)"
+        )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.rendered_block", description=__doc__
@@ -321,9 +383,13 @@ def main() -> None:
     parser.add_argument("--rig", default="ultracam-l-mini")
     parser.add_argument("--frames", type=int, default=20)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--strips", type=int, help="strips with and without patterns of stitching")
     parser.add_argument("--scenes", type=Path, default=None, help="folder where scenes are kept")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args()
+    if options.strips is not None:
+        compare_patterns(options.rig, options.frames, options.seed, options.strips)
+        return
     with tempfile.TemporaryDirectory(prefix="syntopic-bench-") as folder:
         strip = rendered_strip(
             options.rig, options.frames, options.seed, options.scenes or Path(folder)

@@ -75,6 +75,7 @@ GROUPS = (
     "distance",
     "prior",
     "jitter",
+    "pattern",
 )
 
 
@@ -220,6 +221,9 @@ def _image_rows(
         projected = -c * seen[:, :2] / seen[:, 2:]
         measured_mm = measured.xy_mm[rows]
         misclosure = ideal_mm(camera, interior, state.terms[index], measured_mm) - projected
+        patterns = _pattern_design(network, image, measured_mm) if network.patterns else None
+        if patterns is not None:
+            misclosure = misclosure - np.einsum("nak,nk->na", patterns, state.pattern[image])
         entries: list[tuple[Indices, Array]] = []
         by_point = np.zeros((len(rows), 2, 3))
         if build.derivatives:
@@ -247,6 +251,8 @@ def _image_rows(
                 columns = np.broadcast_to(layout.terms[index], (len(rows), len(camera.terms)))
                 by_term = -term_derivatives(camera, interior, state.terms[index], measured_mm)
                 blocks += _active(columns, by_term)
+            if patterns is not None:
+                blocks.append((layout.pattern[image], patterns))
             if mounted.any():
                 blocks += [
                     (_where(layout.head_rotation, head), by_seen @ skew(seen)),
@@ -271,6 +277,18 @@ def _image_rows(
             )
     if behind:
         raise BehindCameraError(np.concatenate(behind))
+
+
+def _pattern_design(network: Network, image: Indices, xy_mm: Array) -> Array:
+    """Displacements of image points by amplitudes of one, (n, 2, k)."""
+    most = max((own.count for own in network.patterns if own is not None), default=0)
+    result = np.zeros((len(image), 2, most))
+    for k in np.unique(image):
+        own = network.patterns[k]
+        if own is not None and own.count:
+            rows = image == k
+            result[rows, :, : own.count] = own.at(xy_mm[rows])
+    return result
 
 
 def _by_time(motion: RowMotion, in_rig: Array, by_rig: Array, by_station: Array) -> Array:
@@ -449,6 +467,7 @@ def _prior_rows(
                 at_head = column[index : index + 1, None]
                 _add_prior(build, np.array([difference]), np.array([spread]), at_head, None)
     _jitter_rows(build, network, layout, state)
+    _pattern_rows(build, layout, state)
 
 
 def _jitter_rows(
@@ -462,6 +481,15 @@ def _jitter_rows(
     n = len(rows)
     entry = [(layout.jitter[rows][:, None], np.ones((n, 1)))]
     build.add(-state.jitter[rows], sigma, np.full(n, 9), rows, entry)
+
+
+def _pattern_rows(build: _Builder, layout: ParameterLayout, state: ParameterValues) -> None:
+    """Pseudo-observations of the amplitudes of patterns of stitching: zero, of variance one."""
+    rows, which = np.nonzero(layout.pattern >= 0)
+    if not rows.size:
+        return
+    entry = [(layout.pattern[rows, which][:, None], np.ones((len(rows), 1)))]
+    build.add(-state.pattern[rows, which], np.ones(len(rows)), np.full(len(rows), 10), rows, entry)
 
 
 def _add_prior(

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from processing import ProcessingError
 from processing.bundle.curvature_refraction import RayModel
+from processing.bundle.frame_patterns import FramePatterns
 from processing.bundle.terms import Term
 
 Array = NDArray[np.float64]
@@ -255,7 +256,10 @@ def no_measured_attitudes() -> MeasuredAttitudes:
 
 @dataclass(frozen=True)
 class Network:
-    """All tables. `problems` names inconsistencies."""
+    """All tables. `problems` names inconsistencies.
+
+    `patterns` are those of stitching, one entry for each image or none at all.
+    """
 
     cameras: tuple[CameraModel, ...]
     stations: Stations
@@ -270,6 +274,7 @@ class Network:
     constraints: tuple[LinearConstraint, ...] = ()
     rays: RayModel = field(default_factory=RayModel)
     motion: Motion | None = None
+    patterns: tuple[FramePatterns | None, ...] = ()
 
     def problems(self) -> tuple[str, ...]:
         """Check shapes, indices and numbers.
@@ -353,6 +358,11 @@ def _problems(n: Network) -> list[str]:
             twice = next(name for name in names if list(names).count(name) > 1)
             found.append(f"{what} {twice} is given twice")
     found += _motion_problems(n)
+    if n.patterns and len(n.patterns) != len(n.images.names):
+        found.append(
+            f"{len(n.patterns)} patterns of stitching; one for each of {len(n.images.names)} "
+            "images, or none, is right"
+        )
     if not n.rays.is_straight and n.points.at_infinity.any():
         found.append("directions of a collimator have neither earth curvature nor refraction")
     return found

@@ -104,7 +104,7 @@ def _bare_equations(
             name: np.full_like(getattr(layout, name), -1)
             for name in (
                 *("station", "attitude", "head_rotation", "head_offset"),
-                *("head_delay", "readout", "jitter", "interior"),
+                *("head_delay", "readout", "jitter", "pattern", "interior"),
             )
         },
         terms=tuple(np.full_like(t, -1) for t in layout.terms),

@@ -42,6 +42,7 @@ class ParameterLayout:
         head_rotation, head_offset: (heads, 3).
         head_delay, readout: (heads,).
         jitter: (images,).
+        pattern: (images, k) amplitudes of patterns of stitching, k that of the image with most.
         interior: (cameras, 10).
         terms: (t,) per camera.
         shift, drift: (lines, 3).
@@ -59,6 +60,7 @@ class ParameterLayout:
     head_delay: Indices
     readout: Indices
     jitter: Indices
+    pattern: Indices
     interior: Indices
     terms: tuple[Indices, ...]
     shift: Indices
@@ -91,6 +93,7 @@ class ParameterValues:
     head_delay: Array
     readout: Array
     jitter: Array
+    pattern: Array
     interior: Array
     terms: tuple[Array, ...]
     shift: Array
@@ -105,7 +108,8 @@ def initial_values(network: Network) -> ParameterValues:
         network: starting values.
 
     Returns:
-        Copies of them; shifts and drifts of lines and jitter are zero.
+        Copies of them; shifts and drifts of lines, jitter and amplitudes of patterns are
+        zero.
     """
     heads = network.heads
     lines = len(network.gnss.lines)
@@ -117,6 +121,7 @@ def initial_values(network: Network) -> ParameterValues:
         head_delay=np.array([h.timing.delay_s for h in heads], dtype=np.float64),
         readout=np.array([h.timing.readout_s for h in heads], dtype=np.float64),
         jitter=np.zeros(len(network.images.names)),
+        pattern=np.zeros((len(network.images.names), _pattern_count(network))),
         interior=np.array([c.interior for c in network.cameras], dtype=np.float64),
         terms=tuple(np.array([t.value for t in c.terms]) for c in network.cameras),
         shift=np.zeros((lines, 3)),
@@ -186,6 +191,13 @@ def layout_of(
             network.images.names, network.images.head, has_points, strict=True
         )
     ]
+    most = _pattern_count(network)
+    pattern = []
+    for k, name in enumerate(network.images.names):
+        own = network.patterns[k] if network.patterns and has_points[k] else None
+        count = 0 if own is None else own.count
+        named = tuple(f"pattern {number + 1}" for number in range(count))
+        pattern.append(take(True, "image", name, named) + [-1] * (most - count))
     interior, terms = [], []
     for camera in network.cameras:
         interior.append(
@@ -221,6 +233,7 @@ def layout_of(
         head_delay=_table(delay, 1)[:, 0],
         readout=_table(readout, 1)[:, 0],
         jitter=_table(jitter, 1)[:, 0],
+        pattern=np.array(pattern, dtype=np.int64).reshape(len(network.images.names), most),
         interior=_table(interior, 10),
         terms=tuple(terms),
         shift=_table(shift, 3),
@@ -267,6 +280,7 @@ def apply_corrections(
         head_delay=state.head_delay + part(layout.head_delay),
         readout=state.readout + part(layout.readout),
         jitter=state.jitter + part(layout.jitter),
+        pattern=state.pattern + part(layout.pattern),
         interior=state.interior + part(layout.interior),
         terms=tuple(v + part(c) for v, c in zip(state.terms, layout.terms, strict=True)),
         shift=state.shift + part(layout.shift),
@@ -285,6 +299,10 @@ def _used(network: Network) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     station[network.gnss.station] = True
     attitude[network.measured_attitudes.attitude] = True
     return station, attitude
+
+
+def _pattern_count(network: Network) -> int:
+    return max((own.count for own in network.patterns if own is not None), default=0)
 
 
 def _retained(network: Network, left_out: NDArray[np.bool_], names: Sequence[str]) -> Indices:

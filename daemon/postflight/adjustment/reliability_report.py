@@ -20,6 +20,7 @@ UNIT_OF_GROUP: Final = {
     "attitude": ("mrad", 1e3),
     "prior": ("", 1.0),
     "jitter": ("ms", 1e3),
+    "pattern": ("sigma", 1.0),
 }
 
 OBSERVATION_COLUMNS: Final = (
