@@ -84,7 +84,9 @@ def forward(first: int, second: int, delay_s: float, loss: float, counts: str) -
             os.write(target, packet)
         if now_s - saved_s > 0.5:
             saved_s = now_s
-            Path(counts).write_text(json.dumps([carried[first], carried[second]]))
+            written = Path(f"{counts}.part")
+            written.write_text(json.dumps([carried[first], carried[second]]))
+            written.replace(counts)
         pause_s = min(waiting[0][0] - now_s, 0.2) if waiting else 0.2
         for source in select.select([first, second], [], [], max(pause_s, 0.0))[0]:
             packet = os.read(source, 2048)
@@ -102,8 +104,8 @@ def quantile(values: list[float], share: float) -> float | None:
     return round(ordered[min(len(ordered) - 1, int(share * len(ordered)))], 2) if ordered else None
 
 
-def measure(delay_s: float, loss: float, exposures: int) -> dict[str, Any]:
-    """Fly over the link and read what the page noted."""
+def measure(delay_s: float, loss: float, exposures: int, before: int) -> dict[str, Any]:
+    """Fly over the link and read what the page noted; it is opened after `before` exposures."""
     from daemon.configuration.model import WatchSection
     from daemon.onboard.service.messages import ServiceEvent
     from daemon.onboard.service.processes import ChildProcess
@@ -122,7 +124,7 @@ def measure(delay_s: float, loss: float, exposures: int) -> dict[str, Any]:
     mission = folder / "mission"
     (mission / "L0").mkdir(parents=True)
     scene.write_products(mission)
-    for number in range(7, exposures + 1):
+    for number in range(max(7, before - 40), before + exposures + 1):
         copied, ignored = mission / f"L2/{number:06d}", shutil.ignore_patterns("pan.tif")
         shutil.copytree(mission / "L2/000001", copied, ignore=ignored)
     rig = scene.shipped_rigs()["ultracam-x-mini"].read_bytes()
@@ -148,12 +150,16 @@ def measure(delay_s: float, loss: float, exposures: int) -> dict[str, Any]:
             time.sleep(0.01)
 
     emit(flight_events.mission(str(mission)))
-    emit(scene.status(0))
+    for number in range(1, before + 1):
+        for event in flight_events.exposure(number, line="A0", north_m=-60.0 * (number % 500 + 1)):
+            emit(event)
+    emit(scene.status(before))
     time.sleep(3.0)
-    began_s, emitted = time.time(), dict[int, float]()
+    emitted = dict[int, float]()
     try:
         with browser_of(folder / "profile") as browser:
             browser.call("Page.addScriptToEvaluateOnNewDocument", source=PROBE)
+            began_s = time.time()
             browser.open(f"http://{SERVER}:8470/")
             connected = "document.body?.dataset.ready !== undefined && "
             connected += "document.querySelector('#link')?.className.includes('good')"
@@ -161,9 +167,11 @@ def measure(delay_s: float, loss: float, exposures: int) -> dict[str, Any]:
             loaded_s = time.time() - began_s
             time.sleep(5.0)
             begin, begin_s = json.loads(counts.read_text()), time.time()
-            for number in range(1, exposures + 1):
+            for number in range(before + 1, before + exposures + 1):
                 emitted[number] = time.time()
-                for event in flight_events.exposure(number, line="A1", north_m=68.0 * number):
+                for event in flight_events.exposure(
+                    number, line="A1", north_m=68.0 * (number - before)
+                ):
                     emit(event)
                 emit(scene.status(number))
                 until_s = emitted[number] + INTERVAL_S
@@ -174,6 +182,7 @@ def measure(delay_s: float, loss: float, exposures: int) -> dict[str, Any]:
             end = json.loads(counts.read_text())
             time.sleep(8.0)
             log = browser.evaluate("window.log")
+            footprints = browser.evaluate("import('/map.js').then((map) => map.footprintCount())")
     finally:
         forwarder.kill()
         child.end(1.0)
@@ -186,6 +195,8 @@ def measure(delay_s: float, loss: float, exposures: int) -> dict[str, Any]:
     frames = [one for one in log["guidance"] if begin_s <= one[0] <= begin_s + flown_s]
     ages = [age + (rtt or 0.0) / 2 for _, age, rtt in frames]
     result: dict[str, Any] = {"exposures": exposures, "page_loaded_s": round(loaded_s, 1)}
+    if before:
+        result["before"] = {"exposures": before, "footprints": footprints}
     for part, values in (("verdict", delays("verdict")), ("thumbnail", delays("thumbnail")),
                          ("coverage", coverage)):  # fmt: skip
         result[part] = {
@@ -215,8 +226,12 @@ def main() -> int:
     parser.add_argument("--delay-ms", type=float, default=150.0, help="each way (default: 150)")
     parser.add_argument("--loss", type=float, default=0.05, help="each way (default: 0.05)")
     parser.add_argument("--exposures", type=int, default=30, help="one every 2 s (default: 30)")
+    parser.add_argument(
+        "--before", type=int, default=0, help="exposures before the page is opened (default: 0)"
+    )
     given = parser.parse_args()
-    print(json.dumps(measure(given.delay_ms / 1000, given.loss, given.exposures), indent=1))
+    found = measure(given.delay_ms / 1000, given.loss, given.exposures, given.before)
+    print(json.dumps(found, indent=1))
     return 0
 
 

@@ -12,7 +12,6 @@ from typing import Any
 
 from fastapi import FastAPI
 from fastapi.responses import FileResponse
-from fastapi.staticfiles import StaticFiles
 
 from daemon.onboard.monitoring.client.telemetry_client import (
     AccessOptions,
@@ -21,7 +20,7 @@ from daemon.onboard.monitoring.client.telemetry_client import (
     telemetry_records,
 )
 from daemon.onboard.monitoring.server_messages import with_messages
-from daemon.onboard.monitoring.web.page_files import PAGE, add_security_headers
+from daemon.onboard.monitoring.web.page_files import PAGE, PageFiles, add_security_headers
 
 BYTES_PER_S = 4000.0
 """Budget of each link: the brief state each second, and little besides."""
@@ -143,7 +142,7 @@ def create_fleet_app(members: Sequence[FleetMember]) -> FastAPI:
     async def page() -> FileResponse:
         return FileResponse(PAGE / "fleet.html")
 
-    app.mount("/", StaticFiles(directory=PAGE), name="page")
+    app.mount("/", PageFiles(PAGE), name="page")
     return app
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -76,6 +77,21 @@ def test_all_files_of_the_first_load_are_small(client: TestClient) -> None:
     names += [f"messages/en/{one}.json" for one in ("page", "map", "alarm", "landing")]
     sizes = [int(client.get(f"/{one}", headers=GZIP).headers["Content-Length"]) for one in names]
     assert sum(sizes) < FIRST_LOAD_MAX_BYTES
+
+
+def test_the_page_names_every_module_that_it_imports(client: TestClient) -> None:
+    """Each level of imports that the browser has to find by itself costs a round trip."""
+    found, frontier = set[str](), ["page.js"]
+    while frontier:
+        text = client.get(f"/{frontier.pop()}").text
+        imported = set(
+            re.findall(r'^import (?:[^;]*? from )?"\./([\w/]+\.js)";', text, re.MULTILINE)
+        )
+        frontier += imported - found
+        found |= imported
+    page = client.get("/").text
+    assert sorted(re.findall(r'rel="modulepreload" href="([^"]+)"', page)) == sorted(found)
+    assert len(found) > 40
 
 
 def test_state_is_compressed_and_pictures_are_not(client: TestClient) -> None:
