@@ -82,6 +82,7 @@ def test_each_figure_beyond_its_threshold_raises_its_flag(
     assert len(finding.sentence) > 20 and finding.sentence.endswith(".")
 
 
+@pytest.mark.trust
 @pytest.mark.parametrize(
     ("snr", "verdict"),
     [(39.9, Verdict.USABLE), (40.0, Verdict.GOOD), (None, Verdict.USABLE)],
