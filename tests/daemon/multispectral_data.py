@@ -66,6 +66,7 @@ def write_image(
     iso: int = 100,
     time_s: float | None = 0.002,
     gps: tuple[float, float, float] | None = None,
+    offset: str | None = None,
 ) -> None:
     height, width = pixels.shape[:2]
     planes = 1 if pixels.ndim == 2 else pixels.shape[2]
@@ -74,7 +75,7 @@ def write_image(
         (33434, "rational", time_s), (33437, "rational", 2.2), (34855, "short", iso),
         (37386, "rational", focal_mm), (41486, "rational", per_mm),
         (41488, "short", 4 if per_mm else None), (37520, "ascii", subsec),
-        (42033, "ascii", serial),
+        (42033, "ascii", serial), (36881, "ascii", offset),
     ):  # fmt: skip
         if value is not None:
             exif.append(entry(code, kind, value))

@@ -181,7 +181,7 @@ def _rig_and_fit(camera: _Camera) -> tuple[Rig, dict[str, float]]:
         is_own = name in first
         cones.append(_cone_of(cone, image, bits, fit if is_own else {}))
     reference = "G" if "G" in names else names[0]
-    days = [image.utc.date().isoformat() for image in first.values() if image.utc is not None]
+    days = [image.taken.date().isoformat() for image in first.values() if image.taken is not None]
     rig = replace(
         nominal,
         name="rededge" if is_micasense and set(names) == set(_REDEDGE) else "multispectral",
@@ -267,6 +267,11 @@ def _camera_of(
         )
     if any(image.black is None for image in first.values()):
         own.append(f"{name}: no BlackLevel is stated; it is taken as 0")
+    if all(image.utc is None for image in images):
+        own.append(
+            f"{name}: its clock is not stated to be UTC (UTCAtExposure, OffsetTimeOriginal); "
+            "exposures have no time"
+        )
     if not name.startswith(MICASENSE) and not any(re.match(key, name) for key, _ in _KNOWN):
         own.append(
             f"{name} is not a known camera: bands that are not in the folder cannot be noticed. "
@@ -293,7 +298,7 @@ def _captures(images: Sequence[BandImage], problems: list[str]) -> list[list[Ban
         if any(other.sensor == image.sensor for other in capture):
             problems.append(f"{image.path.name}: its capture has another image of that band")
         capture.append(image)
-    without = [image.path.name for image in timed if image.utc is None]
+    without = [image.path.name for image in timed if image.taken is None]
     if without:
         problems.append(
             f"{', '.join(without[:5])}: neither CaptureId, CaptureUUID nor DateTimeOriginal; which "
@@ -310,7 +315,7 @@ def _captures(images: Sequence[BandImage], problems: list[str]) -> list[list[Ban
 
 
 def _instant(image: BandImage) -> datetime:
-    return image.utc or _GPS_EPOCH
+    return image.taken or _GPS_EPOCH
 
 
 def _belongs(image: BandImage, group: Sequence[BandImage]) -> bool:

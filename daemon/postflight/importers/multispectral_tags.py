@@ -55,6 +55,8 @@ _PER_MM: Final = {2: 1.0 / 25.4, 3: 0.1, 4: 1.0, 5: 1000.0}
 _F_IN_MM_BELOW: Final = 100.0
 """A focal length without a unit is in mm, as Pix4D specifies; older RedEdge wrote pixels."""
 _SAME_SCALE: Final = 0.01
+_F_SHARE: Final = (0.2, 50.0)
+"""Focal lengths that are possible, in longer sides of the image."""
 
 
 class ImagesError(DaemonError):
@@ -74,8 +76,9 @@ class BandImage:
     """One head's image file: what its tags state.
 
     `lens` and `calibration` are the head's; the rest is of this exposure. `black` is in words of
-    16 bits, None where the file does not state it. `utc` is the camera's own clock. `capture_id`
-    is empty where the file has none. `ones` has each bit that is set in any word.
+    16 bits, None where the file does not state it. `taken` is the camera's own clock, `utc` the
+    same in UTC where this is known. `capture_id` is empty where the file has none. `ones` has each
+    bit that is set in any word.
     """
 
     path: Path
@@ -94,6 +97,7 @@ class BandImage:
     exposure_time_s: float
     gain: float
     black: float | None
+    taken: datetime | None
     utc: datetime | None
     place: Mapping[str, float]
     ones: int
@@ -174,6 +178,9 @@ def _image(path: Path, tags: Mapping[int, Any], xmp: Xmp, pixels: NDArray[np.uin
     height_px, width_px = pixels.shape
     pitch_mm = _pitch_mm(path, xmp, exif)
     wavelength_nm = _leading_number(xmp, "CentralWavelength")
+    taken = _taken(exif)
+    lens = _lens(xmp, 1.0 / pitch_mm)
+    _check_lens(path, lens, (width_px, height_px))
     time_s, gain = _ratio(exif["ExposureTime"]), _gain(exif)
     if not (0.0 < time_s < 10.0 and 0.0 < gain < 1000.0):
         raise ImagesError([f"{path.name}: exposure time {time_s:g} s at gain {gain:g}; no image"])
@@ -187,14 +194,15 @@ def _image(path: Path, tags: Mapping[int, Any], xmp: Xmp, pixels: NDArray[np.uin
         width_px=width_px,
         height_px=height_px,
         pitch_mm=pitch_mm,
-        lens=_lens(xmp, 1.0 / pitch_mm),
+        lens=lens,
         calibration=_calibration(xmp, wavelength_nm) if is_micasense else None,
         wavelength_nm=wavelength_nm,
         f_number=_ratio(exif["FNumber"]) if "FNumber" in exif else 5.6,
         exposure_time_s=time_s,
         gain=gain,
         black=_black(path, tags),
-        utc=_utc(exif),
+        taken=taken,
+        utc=_utc(xmp, exif, taken, is_micasense=is_micasense),
         place=_place(tags.get(_GPS, {})),
         ones=int(np.bitwise_or.reduce(pixels, axis=None)),
     )
@@ -272,6 +280,21 @@ def _lens(xmp: Xmp, per_mm: float) -> Brown | Fisheye:
     return Brown(focal, place, k1, k2, k3, p1, p2)
 
 
+def _check_lens(path: Path, lens: Brown | Fisheye, size_px: tuple[int, int]) -> None:
+    """Refuse a lens in other units: of no image, or with its axis outside of the image."""
+    share = lens.f_px / max(size_px)
+    inside = all(0.0 < at < side for at, side in zip(lens.principal_point_px, size_px, strict=True))
+    if not (_F_SHARE[0] < share < _F_SHARE[1] and inside):
+        column, row = lens.principal_point_px
+        raise ImagesError(
+            [
+                f"{path.name}: focal length of {lens.f_px:.0f} px and principal point at "
+                f"({column:.0f}, {row:.0f}) px for {size_px[0]} x {size_px[1]} px; its tags are in "
+                "units that are not known"
+            ]
+        )
+
+
 def _dewarp(xmp: Xmp) -> tuple[float, ...]:
     """fx, fy, cx, cy, k1, k2, p1, p2, k3 in pixels, behind the date of the calibration."""
     text = xmp.text("DewarpData")
@@ -327,12 +350,34 @@ def _black(path: Path, tags: Mapping[int, Any]) -> float | None:
     return float(black.mean())
 
 
-def _utc(exif: Mapping[str, Any]) -> datetime | None:
+def _utc(
+    xmp: Xmp, exif: Mapping[str, Any], taken: datetime | None, *, is_micasense: bool
+) -> datetime | None:
+    """UTC of the exposure: of DJI's tag, by EXIF's offset, or the clock that MicaSense keeps in it.
+
+    Other makers write local time: without an offset, UTC is not known.
+    """
+    try:
+        if "UTCAtExposure" in xmp:
+            stated = datetime.fromisoformat(xmp.text("UTCAtExposure").strip())
+            return stated.replace(tzinfo=UTC) if stated.tzinfo is None else stated.astimezone(UTC)
+        offset = str(exif.get("OffsetTimeOriginal", exif.get("OffsetTime", ""))).strip("\0 ")
+        if taken is not None and offset:
+            zone = datetime.strptime(offset.replace("Z", "+00:00"), "%z").tzinfo
+            return taken.replace(tzinfo=zone).astimezone(UTC)
+    except (ValueError, OverflowError):
+        return None
+    return taken if is_micasense else None
+
+
+def _taken(exif: Mapping[str, Any]) -> datetime | None:
+    """The camera's clock, whichever zone it is in."""
     try:
         seconds_utc = datetime.strptime(
             str(exif["DateTimeOriginal"]).strip("\0 "), "%Y:%m:%d %H:%M:%S"
         )
-        part = str(exif.get("SubsecTime", "0")).strip("\0 ")
+        part = exif.get("SubsecTimeOriginal", exif.get("SubsecTime", "0"))
+        part = str(part).strip("\0 ")
         # The camera writes a sign where its clock ran before the second.
         microseconds = int(part.lstrip("-")[:6].ljust(6, "0"))
     except (KeyError, ValueError):

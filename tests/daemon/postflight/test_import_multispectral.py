@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from datetime import UTC, datetime
 from pathlib import Path
 
 import cv2
@@ -15,7 +16,7 @@ from daemon.cli import app
 from daemon.configuration.model import PlanSection
 from daemon.mission.layout import Mission
 from daemon.mission.store.store import load_level0
-from daemon.postflight.importers.multispectral import import_multispectral
+from daemon.postflight.importers.multispectral import gps_ns_from_utc, import_multispectral
 from daemon.postflight.importers.multispectral_tags import ImagesError
 from daemon.products.band_images import radiance_of
 from daemon.products.exposure_conditions import conditions_of
@@ -174,6 +175,43 @@ def test_images_of_dji_are_placed_as_opencv_does(scene, tmp_path, model, bands) 
     assert state == ("degraded" if missing else "complete")
 
 
+@pytest.mark.parametrize(
+    ("tags", "offset", "hour"),
+    [
+        ({"UTCAtExposure": "2024-05-06T05:08:09.250000"}, None, 5),
+        ({}, "+02:00", 5),
+        ({}, None, None),
+        ({"UTCAtExposure": "yesterday"}, None, None),
+    ],
+)
+def test_local_time_is_not_taken_for_utc(scene, tmp_path, tags, offset, hour) -> None:
+    for band in ("Green", "NIR"):
+        dji(tmp_path / "in", scene, band, f"{band}.tif", tags=tags, offset=offset)
+    (camera,) = imported(tmp_path / "in", tmp_path / "out")
+    exposure = json.loads((tmp_path / "out/L0/000001/exposure.json").read_text())
+    noted = any("clock is not stated to be UTC" in note for note in camera["notes"])
+    if hour is None:
+        assert noted and exposure["mark_gps_ns"] is None and exposure["mark_source"] == "none"
+    else:
+        at = datetime(2024, 5, 6, hour, 8, 9, 250_000, tzinfo=UTC)
+        assert not noted and int(exposure["mark_gps_ns"]) == gps_ns_from_utc(at)
+
+
+@pytest.mark.parametrize(
+    "tags",
+    [
+        {"PrincipalPoint": "160,120"},
+        {"PrincipalPoint": "-0.6,0.44"},
+        {"FisheyeAffineMatrix": "0.463,0,0,0.463"},
+        {"FisheyeAffineMatrix": "463000,0,0,463000"},
+    ],
+    ids=["pixels", "left of the image", "f too short", "f too long"],
+)
+def test_a_lens_in_other_units_is_refused(scene, tmp_path, tags) -> None:
+    sequoia(tmp_path / "in", scene, "Green", "a.tif", tags=tags)
+    assert "its tags are in units that are not known" in refused(tmp_path / "in", tmp_path / "out")
+
+
 def test_two_cameras_in_one_folder_are_two_missions(scene, tmp_path) -> None:
     """A Dual: both cameras write the same capture into one folder."""
     red = ("Blue", "Green", "Red", "NIR", "Red edge")
@@ -286,7 +324,8 @@ def test_a_camera_that_is_not_known_by_name_is_taken_and_this_is_stated(scene, t
 @pytest.mark.parametrize(
     ("tags", "sentence"),
     [
-        ({"FisheyePolynomial": "0,-1,0,0"}, "begins with 0 and a positive number"),
+        ({"FisheyePolynomial": "0.1,1,0,0"}, "begins with 0 and a positive number"),
+        ({"FisheyePolynomial": "0,-1,0,0"}, "focal length of -295 px"),
         ({"FisheyePolynomial": "0,1,0,-9"}, "folds the frame over"),
         ({"FisheyePolynomial": "0,1,nan"}, "finite number"),
         ({"FisheyePolynomial": ",".join(["0"] * 50)}, "50 values"),
