@@ -151,8 +151,8 @@ class Pipeline(
     def warm_up(self) -> None:
         """Compile every kernel a flight will need, from the cache where there is one.
 
-        A rehearsal exposure goes through all steps, twice where the steps can see the pixels in
-        read-only memory.
+        A rehearsal exposure goes through all steps. Frames in memory may be read-only to the
+        kernels: that is another variant of those that correct.
         """
         frames = synthetic_frames(self.rig)
         conditions = Conditions(
@@ -166,8 +166,7 @@ class Pipeline(
             self.process(frames, conditions)
             for frame in frames.values():
                 frame.flags.writeable = False
-            self.settings = settings
-            self.process(frames, conditions)
+            self._correct(self._read(frames, conditions))
         finally:
             self.settings = settings
 
