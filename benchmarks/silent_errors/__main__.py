@@ -3,8 +3,9 @@
 Plants wrong inputs of sizes from 0.5 to 4 times their published detection limit, by seed, processes
 them as `syntopic process` does and holds image and report against the emulator's truth. With
 `--clean` it renders healthy exposures over hard scenes instead and counts false alarms, with
-`--drawn` it draws their adjustments without rendering. It exits with 1 where an error is silent or
-misdescribed, or the stated sigmas are not those of the errors.
+`--drawn` it draws their adjustments without rendering, with `--toned` their signals, fifty of each
+rendered light. It exits with 1 where an error is silent or misdescribed, or the stated sigmas are
+not those of the errors.
 """
 
 from __future__ import annotations
@@ -46,20 +47,25 @@ def main() -> None:
     add("--results", type=Path, help="File of results, one JSON object a line; it is continued.")
     add("--clean", type=int, default=0, help="Healthy exposures to render instead.")
     add("--drawn", type=int, default=0, help="Healthy exposures to draw without rendering instead.")
+    add("--toned", type=int, default=0, help="Healthy exposures of drawn signals instead.")
     add("--json", action="store_true", help="Print one JSON object.")
     add("--limits", action="store_true", help="Print the published detection limits.")
     given = parser.parse_args()
     if given.limits:
         print(table())
         return
-    if given.clean:
-        found = list(clean_rows(given.clean, given.seed, given.results))
+    if given.clean or given.toned:
+        count, toned = given.toned or given.clean, bool(given.toned)
+        found = list(clean_rows(count, given.seed, given.results, toned=toned))
         print(
             json.dumps({"machine": machine(), "clean": found})
             if given.json
             else clean_summary(found)
         )
-        sys.exit(_reported([*_alarms(found), *interval_failures(found, "healthy")]))
+        alarms = _alarms(found)
+        if toned and len(alarms) <= count * MAX_ALARMS:
+            alarms = []
+        sys.exit(_reported([*alarms, *interval_failures(found, "healthy")]))
     if given.drawn:
         alarms = false_alarms(given.drawn, given.seed, given.results)
         print(json.dumps({"machine": machine(), "drawn": given.drawn, "alarms": alarms}))

@@ -19,7 +19,7 @@ from scipy.stats import chi2
 
 from benchmarks.flags import MAX_TRUE_SMEAR_PX, true_smear_px
 from benchmarks.silent_errors.cases import named_causes
-from benchmarks.silent_errors.exposures import remeasured, world_of
+from benchmarks.silent_errors.exposures import remeasured, retoned, world_of
 from benchmarks.silent_errors.limits import DMC, MIDAS, L, X
 from benchmarks.silent_errors.scenes import SCENES
 from benchmarks.silent_errors.truth import CleanImage, compare
@@ -29,6 +29,8 @@ Row = dict[str, Any]
 
 DRAWS: Final = 10
 """Exposures of one light."""
+TONED_DRAWS: Final = 50
+"""Drawn signals of one light."""
 FIRST: Final = 100
 RIGS: Final = (X, X, X, L, DMC)
 """Each light's rig in turn."""
@@ -36,8 +38,15 @@ STITCHED_LIGHTS: Final = 2 * len(RIGS) * len(SCENES)
 """Lights from this number on are of `midas-mini`, whose heads share no image."""
 
 
-def clean_rows(count: int, seed: int, file: Path | None) -> Iterator[Row]:
-    """Healthy exposures by seed; those that are in the file already are not rendered again."""
+def clean_rows(count: int, seed: int, file: Path | None, *, toned: bool = False) -> Iterator[Row]:
+    """Healthy exposures by seed; those that are in the file already are not rendered again.
+
+    Args:
+        count: exposures.
+        seed: for all random generators.
+        file: of rows, one JSON object a line.
+        toned: many drawn signals of one light instead of a few read-outs of it as it is.
+    """
     known = {}
     if file is not None and file.exists():
         known = {row["number"]: row for row in map(json.loads, file.read_text().splitlines())}
@@ -45,7 +54,7 @@ def clean_rows(count: int, seed: int, file: Path | None) -> Iterator[Row]:
         if number in known:
             yield known[number]
             continue
-        row = clean_row(number, seed)
+        row = clean_row(number, seed, toned=toned)
         if file is not None:
             with file.open("a") as out:
                 out.write(json.dumps(row) + "\n")
@@ -53,14 +62,15 @@ def clean_rows(count: int, seed: int, file: Path | None) -> Iterator[Row]:
         yield row
 
 
-def clean_row(number: int, seed: int) -> Row:
+def clean_row(number: int, seed: int, *, toned: bool = False) -> Row:
     """One healthy exposure by number and seed: its flags, false alarms and normalised errors."""
-    light = number // DRAWS
+    light = number // (TONED_DRAWS if toned else DRAWS)
     rig, scene = rig_and_scene(light)
     place = FIRST + 10 * light
     if rig != MIDAS:
         place = first_without_smear(rig, scene, place)
-    emulated = remeasured(rig, place, seed * 1_000_000 + number, scene=scene)
+    draw = retoned if toned else remeasured
+    emulated = draw(rig, place, seed * 1_000_000 + number, scene=scene)
     product = emulated.process()
     report = product.report
     found = compare(emulated, product, CleanImage())

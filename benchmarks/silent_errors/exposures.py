@@ -39,6 +39,8 @@ from sim_hw.world.world import World
 RIGS = ("ultracam-x-mini", "ultracam-l-mini", "dmc-mini", "midas-mini")
 PLACES = 2
 LARGEST_DC_K = 15.0
+DRAWN_TONE = 0.5
+"""Probability of fields, and of a cloud's shadow, in a drawn exposure."""
 
 Array = NDArray[Any]
 Frames = Mapping[str, Array]
@@ -108,6 +110,37 @@ def remeasured(rig: str, number: int, seed: int, *, scene: str = "landscape") ->
     """The same light with other noise and with places as another laboratory would state them."""
     emulated = _read_out(rig, number, scene, seed=seed)
     return replace(emulated, rig=recalibrated(emulated.world, seed))
+
+
+def retoned(rig: str, number: int, seed: int, *, scene: str = "landscape") -> EmulatedExposure:
+    """The same ground in other light, with other noise and another laboratory's places.
+
+    Brightness, and by chance fields of even tone or the shadow of a cloud, are drawn by seed: a new
+    exposure of signals without rendering one.
+    """
+    lit = _lit(rig, number, scene, 0)
+    random = np.random.default_rng([seed, 43])
+    brightness = float(np.exp(np.clip(random.normal(0.0, 0.2), -0.4, 0.4)))
+    light = {name: seen * np.float32(brightness) for name, seen in lit.snapshot.light.items()}
+    snapshot = replace(lit.snapshot, light=light)
+    tones = [SCENES[name].tone for name in ("fields", "shadow") if random.uniform() < DRAWN_TONE]
+    for k, tone in enumerate(tone for tone in tones if tone is not None):
+        snapshot = replace(snapshot, light=_toned(snapshot, tone, 2 * seed + k))
+    exposure = replace(lit, snapshot=snapshot)
+    heads = _heads(rig)
+
+    def before() -> Frames:
+        raise ValueError("a drawn exposure has no other of its flight")
+
+    return EmulatedExposure(
+        rig=recalibrated(exposure.world, seed),
+        frames=heads.frames(exposure.world, snapshot, seed=seed),
+        conditions=conditions_of(exposure, seed=seed),
+        radiometry=radiometry_of(heads),
+        world=exposure.world,
+        snapshot=snapshot,
+        other=before,
+    )
 
 
 def world_of(rig: str, number: int, scene: str = "landscape") -> World:

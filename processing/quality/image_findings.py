@@ -315,11 +315,16 @@ def _dark(signal: SignalFigures, thresholds: Thresholds) -> list[Finding]:
                 thresholds.bright_refly_fraction,
             )
         ]
-    sentence, verdict = "The image is dark", Verdict.USABLE
+    sentence, verdict = (
+        "The image is dark; lengthen the exposure or open the aperture.",
+        Verdict.USABLE,
+    )
     if snr is not None:
-        sentence += f": its bright parts have {snr:.0f} times their noise"
+        sentence = (
+            f"The image is dark: its bright parts have {snr:.0f} times their noise; lengthen the "
+            "exposure or open the aperture."
+        )
         verdict = Verdict.GOOD if snr >= thresholds.bright_snr else Verdict.USABLE
-    sentence += "; lengthen the exposure or open the aperture."
     return [Finding(Flag.UNDEREXPOSED, verdict, sentence, bright, thresholds.bright_fraction)]
 
 

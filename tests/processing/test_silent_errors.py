@@ -14,6 +14,7 @@ import pytest
 from benchmarks.silent_errors.__main__ import failures
 from benchmarks.silent_errors.cases import Case, _result, draw, run
 from benchmarks.silent_errors.clean import clean_row, clean_rows
+from benchmarks.silent_errors.exposures import retoned
 from benchmarks.silent_errors.faults import FAULTS
 from benchmarks.silent_errors.limits import DMC, LIMITS, MIDAS, L, X, table
 from benchmarks.silent_errors.truth import Found, _least_share, head_limit
@@ -82,6 +83,19 @@ def test_a_healthy_exposure_that_once_raised_a_false_alarm_raises_none(
 ) -> None:
     row = clean_row(number, seed=33)
     assert row["rig"] == rig and not row["alarm"], row
+
+
+@pytest.mark.trust
+@pytest.mark.soak
+@pytest.mark.timeout(300)
+def test_drawn_signals_of_one_light_differ_and_raise_no_false_alarm() -> None:
+    rows = [clean_row(number, seed=51, toned=True) for number in (150, 151, 152)]
+    assert [(row["rig"], row["alarm"]) for row in rows] == [(L, "")] * 3
+    first, again, other = (
+        retoned(L, rows[0]["light"], seed).frames["N"] for seed in (51_000_150, 51_000_150, 5)
+    )
+    np.testing.assert_array_equal(first, again)
+    assert abs(np.median(first) / np.median(other) - 1.0) > 0.01
 
 
 @pytest.mark.trust
