@@ -62,10 +62,10 @@ def main() -> None:
             if given.json
             else clean_summary(found)
         )
-        alarms = _alarms(found)
-        if toned and len(alarms) <= count * MAX_ALARMS:
-            alarms = []
-        sys.exit(_reported([*alarms, *interval_failures(found, "healthy")]))
+        failed = _alarms(found)
+        if toned and len(failed) <= count * MAX_ALARMS:
+            failed = []
+        sys.exit(_reported([*failed, *interval_failures(found, "healthy")]))
     if given.drawn:
         alarms = false_alarms(given.drawn, given.seed, given.results)
         print(json.dumps({"machine": machine(), "drawn": given.drawn, "alarms": alarms}))

@@ -75,11 +75,12 @@ def relative_sharpness_figures(
     # Blurred is who is so against most neighbours; along one direction is enough.
     worst = {name: _typical(found) for name, found in ratios.items()}
     noisy_sensor, noisy_share = noisy or (None, None)
-    if not worst and noisy is None:
-        return None
-    name = min(worst, key=lambda n: worst[n], default=None)
-    if name is None or worst[name] >= MIN_RATIO:
-        return RelativeSharpnessFigures(noisy_sensor=noisy_sensor, noisy_share=noisy_share)
+    of_noise = RelativeSharpnessFigures(noisy_sensor=noisy_sensor, noisy_share=noisy_share)
+    if not worst:
+        return None if noisy is None else of_noise
+    name = min(worst, key=lambda n: worst[n])
+    if worst[name] >= MIN_RATIO:
+        return of_noise
     return RelativeSharpnessFigures(name, worst[name], noisy_sensor, noisy_share)
 
 
