@@ -5,6 +5,7 @@ The worker in flight, `syntopic process` after landing and the replay all come t
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -25,6 +26,7 @@ from daemon.products.stitched_image import build_stitched
 from processing.pipelines.bands import BAND_THRESHOLDS, BandPipeline, BandPipelineSettings
 from processing.pipelines.exposure_pipeline import ExposurePipeline
 from processing.pipelines.kernel_compilation import compile_missing
+from processing.pipelines.parallel_compilation import KernelCompilationError
 from processing.pipelines.perspective import HeadPipeline, HeadSettings, has_head_images
 from processing.pipelines.stitched import Conditions, Pipeline, PipelineSettings
 from processing.quality.report import Thresholds
@@ -32,6 +34,7 @@ from processing.quality.requirements import QualityRequirements
 from processing.radiometry.calibration import RadiometryFolder
 from processing.rig import Rig
 
+log = logging.getLogger(__name__)
 Frames: TypeAlias = Mapping[str, NDArray[np.uint16]]
 
 
@@ -52,7 +55,10 @@ class Processor:
 
     def warm_up(self) -> None:
         """Load every kernel; another process compiles those that are not in the cache."""
-        compile_missing()
+        try:
+            compile_missing()
+        except KernelCompilationError as error:
+            log.warning("kernels are compiled by this process: %s", error)
         self.pipeline.warm_up()
 
     def clone(self) -> Processor:

@@ -52,7 +52,7 @@ from processing.radiometry.level1 import (
     LEVEL1_CEILING,
     LEVEL1_FLOOR,
     FrameStatistics,
-    corrector_for,
+    correctors_for,
 )
 from processing.rig import Cone, Rig, VirtualImage
 
@@ -201,10 +201,7 @@ class HeadPipeline(
                 "there is no [virtual_image]"
             )
         super().__init__(rig, settings or HeadSettings())
-        self._correctors = {
-            sensor.name: corrector_for(sensor, (radiometry or {}).get(sensor.name))
-            for sensor in rig.sensors
-        }
+        self._correctors = correctors_for(rig.sensors, radiometry or {})
         self._lattices: dict[str, tuple[tuple[float | None, float | None], Array]] = {}
 
     def clone(self) -> HeadPipeline:

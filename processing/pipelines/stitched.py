@@ -78,7 +78,7 @@ from processing.radiometry.calibration import RadiometricCalibration
 from processing.radiometry.demosaic import is_bayer
 from processing.radiometry.level1 import (
     FrameStatistics,
-    corrector_for,
+    correctors_for,
     exposed_rows,
     level1_counts_per_dn,
 )
@@ -123,11 +123,9 @@ class Pipeline(
         self._grid = grid_of(rig.virtual_image.width_px, rig.virtual_image.height_px)
         self._pan = PanComposer(rig.virtual_image, pan, cell_px=pan_cell_px(rig))
         self._colour = ColourComposer(rig.virtual_image, self._heads)
-        known = radiometry or {}
-        self._correctors = {
-            sensor.name: corrector_for(sensor, known.get(sensor.name))
-            for sensor in (*pan, *(head.sensor for head in self._heads))
-        }
+        self._correctors = correctors_for(
+            (*pan, *(head.sensor for head in self._heads)), radiometry or {}
+        )
         self._patterns = FixedPatterns(self._correctors)
         self._green = next(
             (

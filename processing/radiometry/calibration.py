@@ -136,12 +136,12 @@ def load_radiometry(path: Path) -> RadiometricCalibration:
             f"{path.name}: damaged ({error}); write it with numpy.savez, keys {', '.join(_KINDS)}"
         ) from error
     calibration = RadiometricCalibration(
-        bias_dn=values["bias_dn"].astype(np.float32),
-        dark_dn_per_s=values["dark_dn_per_s"].astype(np.float32),
+        bias_dn=values["bias_dn"].astype(np.float32, copy=False),
+        dark_dn_per_s=values["dark_dn_per_s"].astype(np.float32, copy=False),
         doubling_k=float(values["doubling_k"]),
         reference_c=float(values["reference_c"]),
-        gain=values["gain"].astype(np.float32),
-        defect=values["defect"].astype(np.uint8),
+        gain=values["gain"].astype(np.float32, copy=False),
+        defect=values["defect"].astype(np.uint8, copy=False),
         response_per_k=float(values.get(_OPTIONAL, 0.0)),
     )
     check_radiometry(path.name, calibration)

@@ -16,6 +16,8 @@ Source: docs/explanation/mathematics/radiometry.md#offset-and-gain, #tdi and #de
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -44,6 +46,8 @@ SATURATED_BIT: Final = 1
 _RESPONSE_UNIT: Final = 16384
 """Fixed-point word of a response of one. Integer running sums are exact, so the result does not
 depend on how many threads shared the rows."""
+_AT_A_TIME: Final = 2
+"""Calibrations as floating-point maps, which are four times what is kept of them."""
 _BIAS_STEP_DN: Final = 1.0 / 32.0
 _DARK_STEP_DN_PER_S: Final = 0.5
 """Steps of the maps: rounded to at most a sixty-fourth of a DN, where a Level-1 word is a quarter
@@ -113,6 +117,28 @@ def level1_counts_per_dn(bits: int) -> float:
         (8.0, 0.5)
     """
     return float(2.0 ** (15 - bits))
+
+
+def correctors_for(
+    sensors: Sequence[Sensor], radiometry: Mapping[str, RadiometricCalibration]
+) -> dict[str, Corrector]:
+    """Make the calibrations of several sensors ready, some at a time: reading them takes seconds.
+
+    Args:
+        sensors: whose frames are corrected.
+        radiometry: by sensor name; a sensor without one is taken as neutral. Read in threads.
+
+    Returns:
+        Correctors by sensor name.
+
+    Raises:
+        CalibrationError: as `corrector_for`.
+    """
+    with ThreadPoolExecutor(_AT_A_TIME, thread_name_prefix="calibration") as pool:
+        correctors = pool.map(
+            lambda sensor: corrector_for(sensor, radiometry.get(sensor.name)), sensors
+        )
+        return dict(zip((sensor.name for sensor in sensors), correctors, strict=True))
 
 
 def corrector_for(sensor: Sensor, calibration: RadiometricCalibration | None) -> Corrector:
