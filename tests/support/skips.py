@@ -12,7 +12,7 @@ from typing import Final
 import pytest
 
 EXPECTED: Final = Path(__file__).with_name("expected_skips.toml")
-NEEDS: Final = ("hardware", "shared", "release", "program")
+NEEDS: Final = ("hardware", "shared", "release")
 
 
 def expected_reasons() -> dict[str, str]:

@@ -29,7 +29,7 @@ from daemon.mission.transfer.store_transfer import transfer_to_store
 from daemon.mission.transfer.store_verification import verify_in_store
 from tests.daemon.diverging_camera import flown_mission
 
-pytestmark = [pytest.mark.peer, pytest.mark.trust]
+pytestmark = [pytest.mark.peer, pytest.mark.trust, pytest.mark.soak]
 ACCOUNT = "devstoreaccount1"
 # The well-known key of the emulator, from Microsoft's documentation; no secret.
 ACCOUNT_KEY = (
