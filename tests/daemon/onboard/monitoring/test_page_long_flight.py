@@ -169,6 +169,37 @@ def test_numbers_of_older_exposures_are_packed(
     assert page[1].evaluate(OLDER.format(expression)) == expected
 
 
+def test_rows_of_a_table_stay_where_nothing_changed(page: tuple[Service, Browser]) -> None:
+    found = page[1].evaluate(
+        """import('/dom.js').then(({ element, updateRows }) => {
+          const body = document.createElement('tbody');
+          let made = 0;
+          const draw = (...items) => {
+            made = 0;
+            updateRows(body, items.map(([number, text]) => ({ number, text })), (one) => one.text,
+              ({ number, text }) => {
+                made += 1;
+                return element('tr', { textContent: `${number}${text}` });
+              });
+            return [[...body.children].map((one) => one.textContent).join(' '), made];
+          };
+          return [draw([3, 'a'], [2, 'a'], [1, 'a']), draw([4, 'a'], [3, 'b'], [2, 'a']),
+            draw([2, 'a'], [4, 'a'], [3, 'c'], [1, 'z']),
+            draw([1, 'z'], [2, 'b'], [4, 'b'], [3, 'c']),
+            draw([1, 'z'], [2, 'b'], [4, 'b'], [3, 'c']), draw([9, 'x']), draw()];
+        })"""
+    )
+    assert found == [
+        ["3a 2a 1a", 3],
+        ["4a 3b 2a", 2],
+        ["2a 4a 3c 1z", 2],
+        ["1z 2b 4b 3c", 2],
+        ["1z 2b 4b 3c", 0],
+        ["9x", 1],
+        ["", 0],
+    ]
+
+
 def test_parts_without_data_lie_where_the_pixels_would(page: tuple[Service, Browser]) -> None:
     """Row 0 is the top of the image; corners are lower left, lower right and so on."""
     footprint = [[10.0, 0.0], [10.0, 8.0], [14.0, 8.0], [14.0, 0.0]]  # latitude, longitude

@@ -29,3 +29,25 @@ export function redraw(container, key, draw) {
   container.dataset.shown = key;
   container.replaceChildren(...draw());
 }
+
+// Rows of `body`, one for each of `items` with a number, in their order. A row whose key is the same stays: a table of hundreds
+// would else be made anew with each record.
+export function updateRows(body, items, keyOf, rowOf) {
+  const present = new Map([...body.children].map((one) => [one.dataset.number, one]));
+  const wanted = new Set(items.map((one) => String(one.number)));
+  for (const [number, row] of present) if (!wanted.has(number)) row.remove();
+  let next = body.firstElementChild;
+  for (const one of items) {
+    const key = keyOf(one);
+    const found = present.get(String(one.number));
+    let row = found;
+    if (!found || found.dataset.key !== key) {
+      row = rowOf(one);
+      Object.assign(row.dataset, { number: one.number, key });
+      if (found && found === next) next = found.nextElementSibling;
+      found?.remove();
+    }
+    if (row === next) next = row.nextElementSibling;
+    else body.insertBefore(row, next);
+  }
+}

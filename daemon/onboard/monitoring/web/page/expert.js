@@ -1,6 +1,6 @@
 // Values for experts, each with one line of explanation, its limit and a colour; and charts over the flight.
 
-import { by, element, redraw, text } from "./dom.js";
+import { by, element, redraw, text, updateRows } from "./dom.js";
 import { serverText, t } from "./i18n.js";
 import { angle, number, percent, sigma, speed } from "./format.js";
 import { lastWhere } from "./feed.js";
@@ -73,17 +73,18 @@ function values({ brief }) {
 const ROWS_SHOWN = 100;
 
 // Figures of the stitching and of time, one row for each of the last exposures.
-function rowOf(one) {
+function cellsOf(one) {
   const f = one.figures || {};
-  const cells = [one.number, one.mark_sigma_ns == null ? "" : sigma(one.mark_sigma_ns), f.sigma0_px == null ? "" : number(f.sigma0_px, 3),
+  return [one.number, one.mark_sigma_ns == null ? "" : sigma(one.mark_sigma_ns), f.sigma0_px == null ? "" : number(f.sigma0_px, 3),
     f.tie_points_pp === undefined ? "" : `${f.tie_points_pp}+${f.tie_points_pc ?? 0}`, f.dc_k == null ? "" : number(f.dc_k, 1),
     f.displaced_sensor || ""];
-  return element("tr", {}, ...cells.map((content) => element("td", { textContent: content })));
 }
+
+const rowOf = (one) => element("tr", {}, ...cellsOf(one).map((content) => element("td", { textContent: content })));
 
 function drawRows(flight) {
   const newest = [...flight.exposures.values()].sort((a, b) => b.number - a.number).slice(0, ROWS_SHOWN);
-  by("expert-rows").replaceChildren(...newest.map(rowOf));
+  updateRows(by("expert-rows"), newest, (one) => JSON.stringify(cellsOf(one)), rowOf);
 }
 
 export function start(_root, feed) {

@@ -1,6 +1,6 @@
 // The verdict of the last exposure, with its findings; and the table of exposures.
 
-import { by, element } from "./dom.js";
+import { by, element, updateRows } from "./dom.js";
 import { knows, serverText, t } from "./i18n.js";
 import { lastWhere } from "./feed.js";
 
@@ -52,8 +52,9 @@ function row(one, feed) {
 function drawRows(feed) {
   const newest = [...feed.flight.exposures.values()].sort((a, b) => b.number - a.number).slice(0, ROWS_SHOWN);
   const focused = document.activeElement?.closest?.("#rows") ? document.activeElement.textContent : null;
-  by("rows").replaceChildren(...newest.map((one) => row(one, feed)));
-  if (focused) [...by("rows").querySelectorAll("button")].find((one) => one.textContent === focused)?.focus();
+  const keyOf = (one) => JSON.stringify([one.verdict, one.step, one.line, one.frames, one.number === feed.selected]);
+  updateRows(by("rows"), newest, keyOf, (one) => row(one, feed));
+  if (focused && !document.activeElement?.closest("#rows")) [...by("rows").querySelectorAll("button")].find((one) => one.textContent === focused)?.focus();
 }
 
 export function start(_root, feed) {
