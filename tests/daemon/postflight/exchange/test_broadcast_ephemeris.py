@@ -55,7 +55,13 @@ def crc24q(data: bytes) -> int:
 
 
 def galileo_parts(
-    prn: int, *, iod: int = 77, toe_s: float = TOE_S, tow: int = TOW, week: int = WEEK
+    prn: int,
+    *,
+    iod: int = 77,
+    toe_s: float = TOE_S,
+    tow: int = TOW,
+    week: int = WEEK,
+    toc_s: float | None = None,
 ) -> list[tuple[int, int]]:
     """Even and odd part, 114 bits each, in the order of E1: words 2, 4, 6, 1, 3, 5, 0."""
     words = [
@@ -66,7 +72,8 @@ def galileo_parts(
                (-117, 14), (0, 2)),
         joined((3, 6), (iod, 10), (-15_500, 24), (9_100, 16), (-2_200, 16), (4_400, 16),
                (5_500, 16), (-660, 16), (107, 8)),
-        joined((4, 6), (iod, 10), (prn, 6), (-29, 16), (31, 16), (toe_s / 60 + 10, 14),
+        joined((4, 6), (iod, 10), (prn, 6), (-29, 16), (31, 16),
+               (toe_s / 60 + 10 if toc_s is None else toc_s / 60, 14),
                (-7_654_321, 31), (-8_765, 21), (-3, 6), (0, 2)),
         joined((5, 6), (3, 11), (4, 11), (5, 14), (0, 5), (-21, 10), (23, 10), (2, 2), (1, 2),
                (1, 1), (0, 1), ((week - 1024) % 4096, 12), (tow, 20), (0, 23)),
@@ -339,6 +346,19 @@ def test_the_week_of_an_orbit_across_the_end_of_the_week() -> None:
     assert (one.values[11], one.values[21]) == (0.0, WEEK - 1356 + 1)
     beidou = datetime(2006, 1, 1, tzinfo=UTC)
     assert one.clock_time == beidou + timedelta(weeks=WEEK - 1356 + 1, seconds=8)
+
+
+def test_a_clock_before_the_end_of_the_week_of_an_orbit_after_it() -> None:
+    parts = galileo_parts(3, toe_s=0.0, tow=604_800 - 30, toc_s=604_200.0)
+    (one,) = found_in(galileo_stream(parts), ublox_pages)
+    assert one.values[21] == WEEK + 1
+    assert one.clock_time == GPS_EPOCH + timedelta(weeks=WEEK, seconds=604_200)
+    frames = beidou_subframes(30, sow=604_800 - 60, toe_s=0.0, later=604_792 // 8)
+    stream = b"".join(sfrbx(3, 30, 0, words_of(bits, 300, 30)) for bits in frames)
+    (one,) = found_in(stream, ublox_pages)
+    assert one.values[21] == WEEK - 1356 + 1
+    beidou = datetime(2006, 1, 1, tzinfo=UTC)
+    assert one.clock_time == beidou + timedelta(weeks=WEEK - 1356, seconds=604_792)
 
 
 def glonass_stream(strings: list[int], slot: int = 5) -> bytes:
