@@ -38,7 +38,9 @@ class CountedWork:
 
     def open(self) -> CountedAction:
         _count_commits(self)
-        return CountedAction(self, self.work.open())
+        action = CountedAction(self, self.work.open())
+        action.note("0 opened")
+        return action
 
 
 class CountedAction:
@@ -49,6 +51,10 @@ class CountedAction:
         flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT
         self._attempts = os.open(counted.attempts, flags, 0o644)
 
+    def note(self, line: str) -> None:
+        """Add a line to the file."""
+        os.write(self._attempts, f"{line}\n".encode())
+
     def clone(self) -> CountedAction:
         return CountedAction(self._counted, self._action.clone())
 
@@ -58,8 +64,7 @@ class CountedAction:
         is_there = product_manifests.is_complete(
             Mission(mission, mission.name), task.number, task.payload.key
         )
-        line = "recognized" if is_there else "computed"
-        os.write(self._attempts, f"{task.number} {line}\n".encode())
+        self.note(f"{task.number} {'recognized' if is_there else 'computed'}")
         result = self._action(task)
         return {"exposure": result["exposure"]}
 

@@ -62,13 +62,18 @@ y_mm = 0.0
 )
 
 
-def flown_mission(root: Path, numbers: Sequence[int] = (1, 2, 3, 4)) -> Mission:
+SERVICE_TOML = b"[plan]\nground_height_m = 100.0\n"
+
+
+def flown_mission(
+    root: Path, numbers: Sequence[int] = (1, 2, 3, 4), service_toml: bytes = SERVICE_TOML
+) -> Mission:
     """A mission whose exposures are stored and sealed, each with time, position and attitude."""
     mission = Mission.create(
         root,
         "diverging",
         rig_toml=RIG_TOML.encode(),
-        service_toml=b"[plan]\nground_height_m = 100.0\n",
+        service_toml=service_toml,
         started_utc=datetime(2026, 11, 21, 10, 15, tzinfo=UTC),
     )
     writer = Level0Writer(mission)

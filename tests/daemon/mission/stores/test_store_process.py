@@ -18,6 +18,8 @@ import pytest
 from typer.testing import CliRunner
 
 from daemon.cli import app
+from daemon.cli.process import as_flown
+from daemon.configuration.model import ProcessingSection
 from daemon.mission.layout import Mission
 from daemon.mission.store.product_manifests import ProductFile, committed_keys, read_manifest
 from daemon.mission.transfer import store_products
@@ -38,8 +40,11 @@ from daemon.mission.transfer.store_products import (
 )
 from daemon.mission.transfer.store_transfer import transfer_to_store
 from daemon.mission.transfer.store_verification import verify_in_store
+from daemon.planning.overlaps import overlaps_of
 from daemon.postflight.batch import software_identity
-from tests.daemon.diverging_camera import ROOT, copied, flown_mission
+from daemon.postflight.batch.level2_sources import level2_source
+from daemon.postflight.batch.level2_work import Level2Work
+from tests.daemon.diverging_camera import ROOT, SERVICE_TOML, copied, flown_mission
 from tests.daemon.mission.stores.faulty_s3 import BUCKET, REGION, Faults
 
 pytestmark = [pytest.mark.peer, pytest.mark.trust]
@@ -346,15 +351,41 @@ def test_an_exposure_that_is_not_there_is_listed(flown: Mission, store: Callable
     assert "has no exposure 99" in failure["cause"]
 
 
+def test_a_worker_takes_the_height_model_of_the_mission_it_fetched(
+    store: Callable[..., str], tmp_path: Path
+) -> None:
+    service = SERVICE_TOML + b'elevation = "dem.asc"\nelevation_crs = "EPSG:25832"\n'
+    mission = flown_mission(tmp_path / "flown", (1, 2), service)
+    heights = "\n".join(["120 120 120 120"] * 4)
+    grid = f"ncols 4\nnrows 4\nxllcorner 600000\nyllcorner 5280000\ncellsize 25000\n{heights}\n"
+    (mission.path / "dem.asc").write_text(grid)
+    place = uploaded(mission, store())
+    with level2_source(place.url) as source:
+        plan, radiometry = as_flown(source.mission, None)
+        local = Level2Work(
+            source.mission.path, None, ProcessingSection(threads=1), plan, radiometry,
+            software_identity.software_identity(),
+        )  # fmt: skip
+        work = source.placed(local)
+        found = source.survey(work, [1], overlaps_of(source.mission, local.rig))
+    assert not plan.elevation.exists()  # the command's own folder is gone, as on another machine
+    work.open()(found.pending[0])
+    assert [number for number, _ in list_products(place).committed()] == [1]
+    process(str(mission.path))
+    assert compared(place)[1] == compared_in_folder(mission)[1]
+
+
 def test_no_frame_is_ever_written_to_a_disk(
     flown: Mission, store: Callable[..., str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     place = uploaded(flown, store())
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     blocks: list[int] = []
+    removed: list[str] = []
     real = shutil.rmtree
 
     def looked(path: Any, *arguments: Any, **options: Any) -> None:
+        removed.append(Path(path).name)
         found = Path(path).rglob("*.tif")
         blocks.extend(one.stat().st_blocks for one in found)
         real(path, *arguments, **options)
@@ -362,4 +393,5 @@ def test_no_frame_is_ever_written_to_a_disk(
     monkeypatch.setattr(shutil, "rmtree", looked)
     process(place.url)
     assert len(blocks) >= 8 and not any(blocks)
+    assert {f"{number:06d}" for number in flown.numbers()} <= set(removed)  # one after the other
     assert not list(tmp_path.glob("*"))
