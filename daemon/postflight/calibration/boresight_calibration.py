@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from daemon import DaemonError
 from daemon.configuration.model import MountSection
@@ -54,6 +55,7 @@ from processing.geometry.rotation import level_from_body, roll_pitch_heading, ve
 
 Array = NDArray[np.float64]
 
+_GLOBAL_TEST = 0.9995
 STEP_NS = 20_000_000
 """Rates and velocities of a trajectory are differences over twice this."""
 
@@ -353,7 +355,7 @@ def report_of(
             "correlation": found.correlation.tolist(),
         },
         verdicts=[*held, *correlated],
-        warnings=[*warnings, *done.adjustment.problems, *sentences],
+        warnings=[*warnings, *done.adjustment.problems, *_misfits(done), *sentences],
         tables=(
             ReportTable(
                 "Result",
@@ -397,6 +399,26 @@ def mount_toml(
         f"time_offset_ms = {at.time_offset_s * 1e3:.4f}",
     ]
     return ("\n".join(lines) + "\n").encode("utf-8")
+
+
+def _misfits(done: BoresightComparison) -> list[str]:
+    """Residuals of images or comparison that their standard deviations do not explain."""
+    sentences = []
+    for what, sigma0, redundancy, remedy in (
+        ("the images", done.adjustment.sigma0, done.adjustment.redundancy,
+         "blunders, a wrong interior orientation, or wrong velocities and rates"),
+        ("the comparison", done.found.sigma0, done.found.redundancy,
+         "check order, units, signs and standard deviations of the inertial values"),
+    ):  # fmt: skip
+        if redundancy <= 0:
+            continue
+        limit = math.sqrt(chi2.ppf(_GLOBAL_TEST, redundancy) / redundancy)
+        if sigma0 > limit:
+            sentences.append(
+                f"residuals of {what} are larger than stated: sigma0 {sigma0:.2f}, at most "
+                f"{limit:.2f} with a probability of 99.95 %: {remedy}"
+            )
+    return sentences
 
 
 def _correlated(found: BoresightCalibration) -> list[str]:

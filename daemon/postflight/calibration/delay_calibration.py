@@ -25,6 +25,7 @@ from processing.bundle.head_times import confounded_times, head_times, jitter_si
 from processing.bundle.network import Network
 from processing.calibration.boresight import ImuMounting, InertialOrientations, rig_motion
 from processing.calibration.head_delays import head_delays
+from processing.calibration.motion_consistency import motion_consistency
 
 _ROUNDS: Final = 12
 _TIME_CONVERGED_S: Final = 1e-5
@@ -59,8 +60,17 @@ def compare_with_delays(
         held, lever_sigma_m: as of `compare_boresight`.
 
     Raises:
-        BoresightError: an exposure without inertial values, or no convergence.
+        BoresightError: velocities or rates that do not fit positions and attitudes, an exposure
+            without inertial values, or no convergence.
     """
+    if inertial.time_s is None:
+        raise BoresightError(
+            "inertial.csv: delays of heads need the column time_s (seconds): by it velocities and "
+            "rates are compared with positions and attitudes"
+        )
+    contradictions = motion_consistency(inertial).problems
+    if contradictions:
+        raise BoresightError("; ".join(contradictions))
     names = network.stations.names
     missing = sorted(set(range(len(names))) - set(exposures))
     if missing:

@@ -16,6 +16,7 @@ from processing.bundle.network import Network
 from processing.bundle.rank_diagnosis import RankDefectError
 from processing.calibration.boresight import calibrate_boresight
 from processing.calibration.head_delays import head_delays
+from processing.calibration.motion_consistency import motion_consistency
 from processing.geometry.rotation import rotations_from_vectors
 from sim_hw.blocks.figure_of_eight import (
     Figure,
@@ -137,6 +138,20 @@ def test_readout_time_is_found_with_affinity_held_and_named_where_it_is_free() -
     assert not any("readout" in s for s in confounded_times(adjust(network)))
     named = confounded_times(adjust(replace(network, cameras=cameras)))
     assert any("readout time of head nadir and its camera nadir" in s for s in named)
+
+
+def test_velocities_and_rates_are_compared_with_positions_and_attitudes(figure) -> None:
+    inertial = inertial_of(figure[0])
+    right = motion_consistency(inertial)
+    assert not right.problems and right.intervals == len(inertial.position_m) - 1
+    assert right.velocity_scale == pytest.approx(1.0, abs=0.01)
+    assert right.rate_scale == pytest.approx(1.0, abs=0.1)
+    half = motion_consistency(replace(inertial, rate_rad_per_s=0.5 * inertial.rate_rad_per_s))
+    assert len(half.problems) == 1 and "rates" in half.problems[0]
+    lines = motion_consistency(inertial_of(_flight(4, (Figure(is_line=True),))))
+    assert np.isnan(lines.rate_scale) and not lines.problems, "swings show nothing of rates"
+    with pytest.raises(ValueError, match="instants"):
+        motion_consistency(replace(inertial, time_s=None))
 
 
 def _with_jitter_sigma(network: Network, sigma_s: dict[str, float]) -> Network:

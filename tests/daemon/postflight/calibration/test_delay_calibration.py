@@ -102,3 +102,67 @@ def test_a_wrong_motion_is_refused_with_file_and_line(
     with pytest.raises(ProjectError) as error:
         read_project(tmp_path / "project.toml")
     assert sentence in str(error.value) and "motion.csv" in str(error.value)
+
+
+def _with_inertial(project: Path, folder: Path, change) -> Path:
+    """A copy of the project whose inertial values, (exposures, columns), are changed."""
+    folder.mkdir()
+    for file in project.iterdir():
+        (folder / file.name).write_text(file.read_text())
+    lines = (project / "inertial.csv").read_text().splitlines()
+    head = next(k for k, line in enumerate(lines) if line.startswith("exposure"))
+    columns = lines[head].split(",")[1:]
+    names = [line.split(",")[0] for line in lines[head + 1 :]]
+    table = np.array([[float(v) for v in line.split(",")[1:]] for line in lines[head + 1 :]])
+    changed = change(table, columns)
+    rows = [",".join([n, *map(repr, row.tolist())]) for n, row in zip(names, changed, strict=True)]
+    (folder / "inertial.csv").write_text("\n".join([*lines[: head + 1], *rows]) + "\n")
+    return folder
+
+
+def _scaled(part: str, factor: float):
+    def change(table: np.ndarray, columns: list[str]) -> np.ndarray:
+        own = [part in column and "change" not in column for column in columns]
+        return np.where(own, table * factor, table)
+
+    return change
+
+
+def _stale(table: np.ndarray, columns: list[str]) -> np.ndarray:
+    own = [column.startswith(("v", "rate")) for column in columns]
+    return np.where(own, np.roll(table, 1, axis=0), table)
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (_scaled("rate", np.pi / 180.0), "rates do not fit the attitudes"),
+        (_scaled("rate", -1.0), "rates do not fit the attitudes"),
+        (_scaled("_mps", 3.6), "velocities do not fit the positions"),
+        (_scaled("_mps", -1.0), "velocities do not fit the positions"),
+        (_stale, "velocities do not fit the positions"),
+        (lambda table, columns: table[:, [1, 0, *range(2, len(columns))]], "velocities"),
+    ],
+    ids=["rad", "negated rates", "km/h", "negated velocities", "stale", "north before east"],
+)
+def test_motion_that_contradicts_the_trajectory_is_refused(
+    flown, tmp_path, change, sentence: str
+) -> None:
+    project, _ = flown
+    wrong = _with_inertial(project, tmp_path / "wrong", change)
+    done = RUN.invoke(app, ["calibrate", "boresight", str(wrong), *OPTIONS])
+    assert done.exit_code != 0 and sentence in f"{done.output} {done.exception}"
+
+
+def test_inertial_values_of_other_exposures_are_warned_of(flown, tmp_path) -> None:
+    project, _ = flown
+
+    def swapped(table: np.ndarray, _: list[str]) -> np.ndarray:
+        return table[[1, 0, *range(2, len(table))]]
+
+    wrong = _with_inertial(project, tmp_path / "wrong", swapped)
+    out = ["--out", str(tmp_path / "out"), "--json"]
+    done = RUN.invoke(app, ["calibrate", "boresight", str(wrong), *OPTIONS, *out])
+    assert done.exit_code == 0, done.output
+    warnings = json.loads(done.stdout)["warnings"]
+    assert any("residuals of the comparison are larger than stated" in w for w in warnings)
