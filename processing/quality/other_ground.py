@@ -175,11 +175,11 @@ def _of_pan(
         resembling = (found[:, 7] > 0.0) & (found[:, 5] >= settings.min_correlation)
         raw = np.rint(at[rows]).astype(np.int64)
         textured = _textured(
-            found[:, 7] >= 0.0,
             (
                 (frames[green], rig.sensor(green), at_green, window_px),
                 (frames[name], rig.sensor(name), raw, window_px * step),
             ),
+            search_px,
         )
         yield from _region(name, shape, matched, at[rows], textured, resembling)
 
@@ -246,13 +246,12 @@ def _of_bands(
             (1, settings.window_px, settings.search_px),
         )
         resembling = (found[:, 7] > 0.0) & (found[:, 5] >= settings.min_correlation)
-        window_px = settings.window_px
         textured = _textured(
-            found[:, 7] >= 0.0,
             (
-                (frames[green], rig.sensor(green), at_green, window_px),
-                (frame, there.sensor, at_band, window_px),
+                (frames[green], rig.sensor(green), at_green, settings.window_px),
+                (frame, there.sensor, at_band, settings.window_px),
             ),
+            settings.search_px,
         )
         yield from _region(
             band.sensor, frame.shape, band.matched_at, at[rows], textured, resembling
@@ -285,10 +284,23 @@ def _best(
     )
 
 
-def _textured(usable: Marks, windows: Sequence[tuple[Array, Sensor, Array, int]]) -> Marks:
-    """Which usable positions have texture in every frame, each with places (n, 2) and a window."""
-    textured = usable.copy()
+def _textured(windows: Sequence[tuple[Array, Sensor, Array, int]], search_px: int) -> Marks:
+    """Which positions have texture and no bad pixel in every frame, each with places (n, 2) and a
+    window.
+
+    The border of a saturated cloud is texture, too, but nothing is matched there.
+    """
+    smallest = min(window_px for *_, window_px in windows)
+    textured = np.ones(len(windows[0][2]), np.bool_)
     for frame, sensor, at, window_px in windows:
+        reach_px = (smallest // 2 + MARGIN_PX + search_px) * window_px // smallest
+        for row in np.flatnonzero(textured):
+            column, line = (int(place) for place in at[row])
+            around = frame[
+                max(line - reach_px, 0) : line + reach_px + 1,
+                max(column - reach_px, 0) : column + reach_px + 1,
+            ]
+            textured[row] = around.size > 0 and not ((around & 1) | (around == 0)).any()
         rows = np.flatnonzero(textured)
         textured[rows] = has_texture(frame, sensor, at[rows], window_px)
     return textured

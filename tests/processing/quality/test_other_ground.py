@@ -17,6 +17,7 @@ from processing.quality.other_ground import (
     OtherGround,
     _region,
     _suspicious,
+    _textured,
     other_ground_figures,
     other_ground_regions,
 )
@@ -61,6 +62,21 @@ def test_windows_without_texture_or_that_resemble_the_ground_are_no_other_ground
     assert not list(_region("SU11", SHAPE, matched, lost, every, third))
     tenth = np.arange(len(lost)) % 10 == 0
     assert list(_region("SU11", SHAPE, matched, lost, every, tenth))
+
+
+@pytest.mark.parametrize("bad", [0, 4001])
+def test_windows_with_saturated_or_missing_pixels_are_not_compared(bad: int) -> None:
+    sensor = RIG.sensor("R")
+    random = np.random.default_rng(3)
+    frame = 2 * random.integers(500, 4000, (sensor.height_px, sensor.width_px)).astype(np.uint16)
+    at = np.array([[200, 200], [600, 400]])
+    window = (frame, sensor, at, 15)
+    assert _textured((window, window), 3).tolist() == [True, True]
+    changed = frame.copy()
+    changed[400 + 7, 600 - 12] = bad
+    assert _textured((window, (changed, sensor, at, 15)), 3).tolist() == [True, False]
+    even = np.full_like(frame, 4000)
+    assert _textured((window, (even, sensor, at, 15)), 3).tolist() == [False, False]
 
 
 def test_positions_that_fail_all_over_a_frame_are_not_suspicious() -> None:
