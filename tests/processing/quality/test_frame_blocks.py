@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from processing.geometry.placement import nominal_placements
 from processing.image.line_means import LineMeans, line_means
+from processing.quality import frame_blocks
 from processing.quality.frame_blocks import (
     BlockEdge,
     _Edge,
@@ -17,6 +18,7 @@ from processing.quality.frame_blocks import (
     block_edges,
     edge_limits,
 )
+from processing.quality.ground_steps import Axis
 from processing.rig import find_rig
 
 Array = NDArray[Any]
@@ -78,3 +80,47 @@ def test_another_frame_steps_alike_only_at_the_same_line_and_by_as_much() -> Non
     }
     for what, elsewhere in other.items():
         assert not _steps_there(sensor, lines, elsewhere), what
+
+
+def edge(axis: Axis, at: int, first: int, last: int, step: float) -> _Edge:
+    return _Edge(axis, at, first, last, step, 0.1)
+
+
+def meet(a: _Edge, b: _Edge) -> bool:
+    """Two sides of one rectangle: opposite, or with a corner."""
+    if not 1 / 3 < abs(a.step / b.step) < 3:
+        return False
+    if a.axis == b.axis:
+        shared = min(a.last, b.last) - max(a.first, b.first)
+        return a.step * b.step < 0 and 2 * shared > max(a.last - a.first, b.last - b.first)
+    near = frame_blocks.NEAR_PX
+    return min(abs(a.at - b.first), abs(a.at - b.last)) < near and (
+        min(abs(b.at - a.first), abs(b.at - a.last)) < near
+    )
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 20, 200])
+def test_edges_with_a_corner_or_an_opposite_one_are_found_among_many(count: int) -> None:
+    draw = np.random.default_rng(count)
+    edges = []
+    for _ in range(count):
+        first = int(draw.integers(0, 3000))
+        step = float(draw.choice([-1, 1]) * draw.uniform(10, 80))
+        last = first + int(draw.integers(50, 900))
+        axis: Axis = "rows" if draw.random() < 0.5 else "columns"
+        edges.append(edge(axis, int(draw.integers(0, 3000)), first, last, step))
+    expected = [a for a in edges if any(meet(a, b) for b in edges if b is not a)]
+    assert list(frame_blocks._cornered(edges)) == expected
+    assert count < 20 or len(expected) > 0
+
+
+def test_edges_next_to_others_along_the_same_axis_are_not_isolated() -> None:
+    reach_px = 10.0
+    alone, next_to, other_axis = (
+        edge("rows", 500, 0, 99, 20.0),
+        edge("rows", 1000, 0, 99, 20.0),
+        edge("columns", 500, 0, 99, 20.0),
+    )
+    near = edge("rows", 1000 + round(frame_blocks.ISOLATED_REACH * reach_px) - 1, 0, 99, 20.0)
+    every = [alone, next_to, other_axis, near]
+    assert list(frame_blocks._isolated(every, every, reach_px)) == [alone, other_axis]
