@@ -109,11 +109,12 @@ def even(place: int) -> int:
 
 
 def position(latitude_deg: float, longitude_deg: float, height_m: float) -> list:
-    """Entries of GPS north and east; whole degrees, the rest as minutes (EXIF 2.32, 4.6.6)."""
+    """Entries of GPS north and east: degrees, minutes, seconds (EXIF 2.32, 4.6.6)."""
     found = [entry(1, "ascii", "N"), entry(3, "ascii", "E"), entry(5, "byte", b"\0")]
     for code, value in ((2, latitude_deg), (4, longitude_deg)):
-        whole, minutes = int(value), (value % 1) * 60.0
-        raw = struct.pack("<6I", whole, 1, round(minutes * 1e6), 1_000_000, 0, 1)
+        whole, minutes = int(value), int((value % 1) * 60.0)
+        seconds = round((value - whole - minutes / 60.0) * 3600.0 * 1e6)
+        raw = struct.pack("<6I", whole, 1, minutes, 1, seconds, 1_000_000)
         found.append((code, 5, 3, raw))
     found.append(entry(6, "rational", height_m))
     return found

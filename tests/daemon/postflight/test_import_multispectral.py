@@ -212,6 +212,30 @@ def test_a_lens_in_other_units_is_refused(scene, tmp_path, tags) -> None:
     assert "its tags are in units that are not known" in refused(tmp_path / "in", tmp_path / "out")
 
 
+def test_positions_and_settings_stay_with_the_frame(scene, tmp_path) -> None:
+    place = (47.123456, 15.987654, 912.5)
+    dji(tmp_path / "in", scene, "Green", "a.tif", gps=place, iso=200)
+    imported(tmp_path / "in", tmp_path / "out")
+    exposure = json.loads((tmp_path / "out/L0/000001/exposure.json").read_text())
+    (frame,) = exposure["frames"]
+    found = frame["settings"]
+    assert (found["GpsLatitudeDeg"], found["GpsLongitudeDeg"]) == pytest.approx(place[:2], abs=1e-9)
+    assert (found["GpsAltitudeM"], found["Gain"], found["BlackLevel"]) == (912.5, 2.0, 4096.0)
+    assert frame["exposure_time_us"] == pytest.approx(2000.0)
+
+
+@pytest.mark.parametrize(
+    ("focal", "units"), [("5.5", "mm"), ("5.5", ""), ("1594.2029", ""), ("1594.2029", "px")]
+)
+def test_a_focal_length_is_in_mm_or_in_pixels(scene, tmp_path, focal, units) -> None:
+    """Older RedEdge wrote pixels without a unit; Pix4D specifies mm."""
+    tags = {"PerspectiveFocalLength": focal, "PerspectiveFocalLengthUnits": units}
+    micasense(tmp_path / "in", scene, "Green", "a.tif", "RedEdge-M", "R1", tags=tags)
+    imported(tmp_path / "in", tmp_path / "out")
+    lens = load_rig(tmp_path / "out/rig.toml").cone("G").lens
+    assert lens.f_mm == pytest.approx(5.5, rel=1e-6)
+
+
 def test_two_cameras_in_one_folder_are_two_missions(scene, tmp_path) -> None:
     """A Dual: both cameras write the same capture into one folder."""
     red = ("Blue", "Green", "Red", "NIR", "Red edge")
