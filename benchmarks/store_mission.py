@@ -84,7 +84,7 @@ def compared(mission: Mission, place: ObjectStore) -> tuple[dict[int, str], dict
 
 def measured(options: argparse.Namespace) -> tuple[dict[str, Any], list[str]]:
     """Figures, and what does not hold."""
-    object_store.REQUEST_TIMEOUT_S = REQUEST_TIMEOUT_S  # type: ignore[misc]
+    object_store.REQUEST_TIMEOUT_S = REQUEST_TIMEOUT_S  # type: ignore[misc]  # hangs are short
     mission = flown(options.folder / "flown", options.exposures, options.side)
     exposure_nbytes = 2 * 2 * options.side**2
     disk_nbytes = exposure_nbytes // 2

@@ -31,7 +31,7 @@ mount -t overlay overlay -o lowerdir=/,upperdir={folder}/upper,workdir={folder}/
 mount -t proc proc $root/proc
 mount --rbind /dev $root/dev
 mount --rbind /sys $root/sys
-mount --bind {folder}/shared $root/{folder}/shared
+mount --bind {folder}/common $root/{folder}/common
 if [ -n "{install}" ]; then
     printf '#!/bin/sh\\nexit 101\\n' > $root/usr/sbin/policy-rc.d
     chmod +x $root/usr/sbin/policy-rc.d
@@ -43,7 +43,7 @@ mount -t tmpfs tmpfs $root/run
 mkdir -p $root/run/munge $root/var/spool/slurmd $root/var/spool/slurmctld $root/etc/slurm
 chroot $root chown slurm /var/spool/slurmctld
 chroot $root chown -R munge: /run/munge /var/log/munge /var/lib/munge /etc/munge
-cp {folder}/shared/slurm.conf $root/etc/slurm/slurm.conf
+cp {folder}/common/slurm.conf $root/etc/slurm/slurm.conf
 chroot $root runuser -u munge -- /usr/sbin/munged --force
 chroot $root /usr/sbin/slurmctld
 chroot $root /usr/sbin/slurmd
@@ -53,7 +53,7 @@ for attempt in $(seq 60); do
 done
 chroot $root sinfo
 cd $root
-exec chroot $root sh {folder}/shared/submit.sh
+exec chroot $root sh {folder}/common/submit.sh
 """
 CONFIGURATION = """
 ClusterName=one
@@ -65,8 +65,8 @@ SlurmdSpoolDir=/var/spool/slurmd
 ProctrackType=proctrack/linuxproc
 TaskPlugin=task/none
 SelectType=select/cons_tres
-SlurmctldLogFile={folder}/shared/slurmctld.txt
-SlurmdLogFile={folder}/shared/slurmd.txt
+SlurmctldLogFile={folder}/common/slurmctld.txt
+SlurmdLogFile={folder}/common/slurmd.txt
 NodeName={host} CPUs={cores} RealMemory={memory_mb} State=UNKNOWN
 PartitionName=main Nodes=ALL Default=YES MaxTime=INFINITE State=UP
 """
@@ -83,28 +83,28 @@ def main() -> None:
     if os.geteuid():
         parser.error("run it as root: it mounts and changes root")
     folder = options.folder.resolve()
-    for name in ("upper", "work", "root", "shared"):
+    for name in ("upper", "work", "root", "common"):
         (folder / name).mkdir(parents=True)
-    (folder / "upper" / str(folder / "shared")[1:]).mkdir(parents=True)
-    shared = folder / "shared"
-    mission = flown_mission(shared / "flown", range(1, options.exposures + 1))
-    certificates = shared / "certificates"
+    (folder / "upper" / str(folder / "common")[1:]).mkdir(parents=True)
+    common = folder / "common"
+    mission = flown_mission(common / "flown", range(1, options.exposures + 1))
+    certificates = common / "certificates"
     certificates.mkdir()
-    for path in authority(shared / "authority", "slurm"):
+    for path in authority(common / "authority", "slurm"):
         shutil.copy2(path, certificates / path.name)
     (certificates / "own.key").chmod(0o600)
     memory_mb = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") * 9 // 10 >> 20
-    (shared / "slurm.conf").write_text(
+    (common / "slurm.conf").write_text(
         CONFIGURATION.format(
             host=platform.node(), folder=folder, cores=os.cpu_count(), memory_mb=memory_mb
         )
     )
-    (shared / "syntopic").write_text(f'#!/bin/sh\nexec {sys.executable} -m daemon "$@"\n')
-    (shared / "syntopic").chmod(0o755)
-    binaries = f"{shared}:{Path(sys.executable).parent}:{os.environ['PATH']}"
-    (shared / "submit.sh").write_text(
+    (common / "syntopic").write_text(f'#!/bin/sh\nexec {sys.executable} -m daemon "$@"\n')
+    (common / "syntopic").chmod(0o755)
+    binaries = f"{common}:{Path(sys.executable).parent}:{os.environ['PATH']}"
+    (common / "submit.sh").write_text(
         f"cd {ROOT}\nexport PATH={binaries} PYTHONPATH={ROOT}\n"
-        f"exec sbatch --wait --nodes=1 --output={shared}/job.txt systemd/cluster/slurm.sh "
+        f"exec sbatch --wait --nodes=1 --output={common}/job.txt systemd/cluster/slurm.sh "
         f"{mission.path} {certificates}\n"
     )
     inside = INSIDE.format(
