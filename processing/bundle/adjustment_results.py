@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.bundle.adjust import Adjustment
-from processing.bundle.network import INTERIOR
+from processing.bundle.forward_models import FORWARD
+from processing.bundle.network import INTERIOR, Model
 from processing.bundle.normal_equations import point_normals
 from processing.bundle.terms import UNITS
 from processing.geometry.rotation import angles_by_rotation_vector, omega_phi_kappa
@@ -105,7 +106,9 @@ def parameters_of(result: Adjustment) -> tuple[AdjustedParameter, ...]:
         columns = np.concatenate([result.layout.interior[index], result.layout.terms[index]])
         values = np.concatenate([result.state.interior[index], result.state.terms[index]])
         names = [*INTERIOR, *(t.name for t in camera.terms)]
-        units = [_unit(name) for name in INTERIOR] + [UNITS[t.kind] for t in camera.terms]
+        units = [_unit(name, camera.model) for name in INTERIOR] + [
+            UNITS[t.kind] for t in camera.terms
+        ]
         free = np.flatnonzero(columns >= 0)
         own = result.cofactor[np.ix_(columns[free], columns[free])]
         spread = np.sqrt(np.clip(np.diag(own), 1e-300, None))
@@ -332,8 +335,8 @@ def _sigmas(result: Adjustment, columns: NDArray[np.int64], by: Array) -> Array:
     return np.asarray(result.sigma0 * np.sqrt(np.clip(np.diag(covariance), 0.0, None)))
 
 
-def _unit(name: str) -> tuple[str, float]:
+def _unit(name: str, model: Model) -> tuple[str, float]:
     powers = {"k1": "mm^-2", "k2": "mm^-4", "k3": "mm^-6", "p1": "mm^-1", "p2": "mm^-1"}
     if name in powers:
-        return powers[name], 1.0
+        return ("1" if model in FORWARD else powers[name]), 1.0
     return ("mm", 1.0) if name in ("dx0", "dy0", "df") else ("1", 1.0)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.bundle.forward_models import FORWARD, forward_derivatives, forward_ideal_mm
 from processing.bundle.network import CameraModel
 from processing.bundle.terms import term_design
 
@@ -56,6 +57,8 @@ def ideal_mm(camera: CameraModel, interior: Array, terms: Array, xy_mm: Array) -
         >>> ideal_mm(CameraModel("C", f_mm=100.0), interior, np.zeros(0), np.array([[20.0, 0.0]]))
         array([[20.008,  0.   ]])
     """
+    if camera.model in FORWARD:
+        return forward_ideal_mm(camera, interior, xy_mm)
     xy_mm = _placed(camera, terms, xy_mm)
     if camera.model == "australis":
         x, y = xy_mm[:, 0] - camera.xp_mm, xy_mm[:, 1] - camera.yp_mm
@@ -77,6 +80,8 @@ def interior_derivatives(camera: CameraModel, interior: Array, terms: Array, xy_
     Returns:
         Shape (n, 2, 10); df of the centred model acts in the projection: zero.
     """
+    if camera.model in FORWARD:
+        return forward_derivatives(camera, interior, xy_mm)[0]
     xy_mm = _placed(camera, terms, xy_mm)
     if camera.model == "australis":
         return _ten(camera, xy_mm[:, 0] - camera.xp_mm, xy_mm[:, 1] - camera.yp_mm)
@@ -89,6 +94,25 @@ def interior_derivatives(camera: CameraModel, interior: Array, terms: Array, xy_
     result[:, :, 8] = by_place[:, :, 0] * about[:, 0, None]
     result[:, :, 9] = by_place[:, :, 0] * about[:, 1, None]
     return result
+
+
+def measured_by_ideal(camera: CameraModel, interior: Array, xy_mm: Array) -> Array | None:
+    """d(measured) / d(ideal), which carries residuals of ideal coordinates to measured ones.
+
+    Args:
+        camera: model, principal point and principal distance.
+        interior: the ten, shape (10,).
+        xy_mm: measured, shape (n, 2), mm.
+
+    Returns:
+        Shape (n, 2, 2); None for models that correct measured coordinates: their residuals are of
+        ideal ones, which are as large.
+
+    Source: docs/explanation/mathematics/bundle.md#forward-models.
+    """
+    if camera.model not in FORWARD:
+        return None
+    return np.asarray(np.linalg.inv(forward_derivatives(camera, interior, xy_mm)[1]))
 
 
 def term_derivatives(camera: CameraModel, interior: Array, terms: Array, xy_mm: Array) -> Array:

@@ -16,6 +16,7 @@ from processing import ProcessingError
 from processing.bundle.camera_model import (
     ideal_mm,
     interior_derivatives,
+    measured_by_ideal,
     principal_distance_mm,
     term_derivatives,
 )
@@ -224,6 +225,9 @@ def _image_rows(
         patterns = _pattern_design(network, image, measured_mm) if network.patterns else None
         if patterns is not None:
             misclosure = misclosure - np.einsum("nak,nk->na", patterns, state.pattern[image])
+        to_measured = measured_by_ideal(camera, interior, measured_mm)
+        if to_measured is not None:
+            misclosure = np.einsum("nij,nj->ni", to_measured, misclosure)
         entries: list[tuple[Indices, Array]] = []
         by_point = np.zeros((len(rows), 2, 3))
         if build.derivatives:
@@ -241,6 +245,8 @@ def _image_rows(
             by_interior = -interior_derivatives(camera, interior, state.terms[index], measured_mm)
             if camera.model == "centred":
                 by_interior[:, :, 2] = -projected / c
+            elif camera.model != "australis":
+                by_interior[:, :, 2] -= projected / c
             blocks = [
                 (layout.station[station], by_station),
                 (layout.attitude[attitude], by_exposure @ skew(at_exposure)),
@@ -261,7 +267,11 @@ def _image_rows(
             if motion is not None:
                 by_time = _by_time(motion, in_rig, by_rig, by_station)
                 blocks += time_columns(layout, network, image, by_time, motion.by_readout)
-            entries = [(columns, values.reshape(len(rows), 2, -1)) for columns, values in blocks]
+            blocks = [(columns, values.reshape(len(rows), 2, -1)) for columns, values in blocks]
+            if to_measured is not None:
+                blocks = [(columns, to_measured @ values) for columns, values in blocks]
+                by_point = to_measured @ by_point
+            entries = blocks
         locked = layout.locked[point]
         for axis in range(2):
             build.add(

@@ -30,7 +30,7 @@ Indices = NDArray[np.int64]
 INTERIOR: Final = ("dx0", "dy0", "df", "k1", "k2", "k3", "p1", "p2", "b1", "b2")
 """The Australis ten, in the order of every array that holds them."""
 
-Model = Literal["australis", "centred"]
+Model = Literal["australis", "centred", "opencv", "fisheye"]
 
 
 class NetworkError(ProcessingError, ValueError):
@@ -48,6 +48,8 @@ class CameraModel:
     `model` selects how the ten act on measured coordinates (`camera_model`): `australis` is eq. 5.1
     of Heier et al. (2002) about the given principal point; `centred` applies affinity and shear
     first and the polynomials about the estimated principal point, as most close-range programs do.
+    `opencv` and `fisheye` distort ideal coordinates (`forward_models`); of `fisheye` p1 is the
+    fourth coefficient, and p2 is not used.
 
     `interior` holds starting values of the ten, (10,); `free` names those to be estimated, `sigma`
     gives a priori standard deviations of any of them or of terms (pseudo-observations of the
@@ -343,6 +345,12 @@ def _problems(n: Network) -> list[str]:
     for camera in n.cameras:
         if not camera.f_mm > 0.0:
             found.append(f"camera {camera.name}: f {camera.f_mm} mm; it is positive")
+        if camera.model == "fisheye" and ("p2" in camera.free or camera.interior[7] != 0.0):
+            found.append(f"camera {camera.name}: fisheye has no p2; its four are k1, k2, k3 and p1")
+        if camera.terms and camera.model in ("opencv", "fisheye"):
+            found.append(
+                f"camera {camera.name}: additional parameters need the model australis or centred"
+            )
         unknown = camera.free - set(INTERIOR)
         if unknown:
             found.append(f"camera {camera.name}: {sorted(unknown)} are none of {INTERIOR}")

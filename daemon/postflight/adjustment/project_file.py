@@ -11,6 +11,7 @@ from daemon.mission.foreign_files import ForeignFileError, read_regular_file
 from daemon.postflight.adjustment.csv_tables import ProjectError
 from processing.bundle.critical_values import TestName
 from processing.bundle.free_datum import FreeDatum
+from processing.bundle.network import Model
 from processing.bundle.robust_weights import WeightFunction
 from processing.bundle.self_calibration import SetName
 from processing.rig.problem_sentences import findings_of, line_finder, sentences
@@ -80,7 +81,7 @@ class CameraSection(_ProjectSection):
     f_mm: float = Field(gt=0.0)
     xp_mm: float = 0.0
     yp_mm: float = 0.0
-    model: Literal["australis", "centred"] = "australis"
+    model: Model = "australis"
     pixel_um: float | None = Field(default=None, gt=0.0)
     width_px: int | None = Field(default=None, gt=0)
     height_px: int | None = Field(default=None, gt=0)

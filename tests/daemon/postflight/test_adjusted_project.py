@@ -22,6 +22,8 @@ from daemon.postflight.adjustment.project_file import (
 from daemon.postflight.adjustment.project_writer import write_project
 from processing.bundle.network import Distances, HeadMounting, MeasuredAttitudes
 from tests.processing.bundle.simulated_networks import aerial
+from tests.processing.bundle.test_forward_models import FISHEYE, PLAIN
+from tests.processing.bundle.test_forward_models import _block as forward_block
 
 NO_CHECKS = CheckPoints((), np.zeros((0, 3)), np.zeros((0, 3)))
 
@@ -185,3 +187,17 @@ def problems_of(block: Path) -> tuple[str, ...]:
     outcome = CliRunner().invoke(app, ["adjust", str(block)])
     problems: tuple[str, ...] = getattr(outcome.exception, "problems", ())
     return problems
+
+
+def test_a_fisheye_camera_is_adjusted_from_its_project(tmp_path: Path) -> None:
+    network, _ = forward_block("fisheye", FISHEYE * PLAIN, 1e-3)
+    camera = network.cameras[0]
+    section = CameraSection(name="c", f_mm=camera.f_mm, model="fisheye", free=tuple(camera.free))
+    file = ProjectFile(format=1, name="fisheye", camera=(section,))
+    write_project(tmp_path / "p", file, network, NO_CHECKS)
+    done = CliRunner().invoke(app, ["adjust", str(tmp_path / "p"), "--json"])
+    assert done.exit_code == 0, done.output
+    report = json.loads(done.stdout)
+    k1 = next(p for p in report["parameters"] if p["name"] == "k1")
+    assert k1["unit"] == "1" and abs(k1["value"] - FISHEYE[3]) < 5.0 * k1["sigma"]
+    assert report["sigma0"] == pytest.approx(1.0, abs=0.1)
