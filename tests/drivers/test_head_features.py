@@ -307,3 +307,36 @@ def test_chunks_are_named_or_the_reason_is(
         assert driver.bind()["chunks"].startswith(expected)
         is_active = emulated.registers.number_or("ChunkModeActive", 0)
         assert is_active == (expected == "Timestamp")
+
+
+def test_a_head_above_its_limit_is_reported_once_until_it_has_cooled() -> None:
+    text = with_nodes(THERMOMETER, "DeviceTemperature")
+    with head(text, temperature_max_c=60.0) as (_, driver, _memory):
+        driver.bind()
+        reported: list[Record] = []
+        driver.emitter.sink = reported.append
+        for value_c in (59.0, 60.5, 70.0, None, 59.0, 61.0, 57.0, 60.0, 60.1):
+            driver._check_temperature(value_c)
+        sentences = [r.sentence for r in reported if isinstance(r, DeviceEvent) and r.name == "hot"]
+        assert [s.partition(" has ")[2][:9] for s in sentences] == ["60.5 degC", "60.1 degC"]
+        assert all("its limit is 60 degC" in s for s in sentences)
+
+
+def test_a_hot_head_is_reported_while_it_delivers() -> None:
+    text = with_nodes(THERMOMETER, "DeviceTemperature")
+    with head(text, temperature_max_c=60.0) as (emulated, driver, _memory):
+        emulated.registers.nodes.write("KelvinReg", 3500)
+        driver.bind()
+        came = threading.Event()
+
+        def watch(record: Record) -> None:
+            if isinstance(record, DeviceEvent) and record.name == "hot":
+                came.set()
+
+        thread = threading.Thread(target=driver.run, args=(watch,))
+        thread.start()
+        try:
+            assert came.wait(WITHIN_S)
+        finally:
+            driver.close()
+            thread.join(WITHIN_S)

@@ -46,6 +46,8 @@ from drivers.timescales.clock import Clock
 POP_TIMEOUT_S: Final = 0.1
 PROBE_TIMEOUT_S: Final = 0.2
 PROBE_ATTEMPTS: Final = 3
+COOLED_K: Final = 2.0
+"""Below its limit, after which a hot head counts as cooled down."""
 LOSS_GRACE_S: Final = 2.0
 """Time without any answer after which a head is lost; shorter pauses are tolerated."""
 CONTROL_WAIT_MARGIN_S: Final = 0.1
@@ -102,6 +104,7 @@ class AravisHead(AravisSettings, HeadDevice):
         self._session: _Session | None = None
         self._of_stream: Counter[str] = Counter()
         self._is_held_reported = False
+        self._is_hot = False
 
     def bind(self, sink: Sink | None = None) -> Mapping[str, str]:
         """Open the head and write its settings. See `drivers.contract.Head`.
@@ -458,6 +461,7 @@ class AravisHead(AravisSettings, HeadDevice):
         with self._control:
             session.latch = session.camera.latch()
             session.temperature_c = session.camera.thermometer.read_c()
+            self._check_temperature(session.temperature_c)
             if session.camera.ptp is not None:
                 session.ptp = session.camera.ptp.read(self.name, self.clock.mono_ns())
                 self.counters["ptp_readings"] += 1
@@ -466,6 +470,22 @@ class AravisHead(AravisSettings, HeadDevice):
                 session.camera.check_alive()
         self.counters["latches"] += session.latch is not None
         return True
+
+    def _check_temperature(self, value_c: float | None) -> None:
+        """Report once that the head is too hot, and again only after it has cooled down."""
+        limit_c = self.temperature_max_c
+        if not limit_c or value_c is None:
+            return
+        if value_c < limit_c - COOLED_K:
+            self._is_hot = False
+        elif value_c > limit_c and not self._is_hot:
+            self._is_hot = True
+            self.emitter.emit(
+                "hot",
+                f"The head {self.name} has {value_c:.1f} degC, and its limit is {limit_c:g} degC. "
+                "Cool it, or lengthen the interval; its frames may be wrong.",
+                fault=True,
+            )
 
     def _count(self, session: _Session) -> None:
         before, now = self._of_stream, session.stream.counted()

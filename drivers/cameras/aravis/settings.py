@@ -113,6 +113,12 @@ class AravisSettings(Configured):
     ptp = Setting(
         False, help="let a PTP master on the network (IEEE 1588) discipline the head's clock"
     )
+    temperature_max_c = Setting(
+        0.0,
+        minimum=0,
+        maximum=130,
+        help="the head's own temperature above which it is reported as too hot, degC; 0 for none",
+    )
     control_wait_limit_s = Setting(
         15.0, minimum=1, maximum=120, help="how long a dead controller's hold is waited out"
     )
