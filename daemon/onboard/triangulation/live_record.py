@@ -65,6 +65,7 @@ def summary_json(done: MissionTriangulation) -> dict[str, Any]:
         "sigma0": None if last is None else last.sigma0,
         "image_sigma_px": None if live is None else [float(v) for v in live.image_sigma_px],
         "accuracy": None if accuracy is None else accuracy.as_json(),
+        "coverage": None if done.coverage is None else done.coverage.as_json(),
         "control": None if control is None else {**control, "residuals": None},
         "drifts": [one.as_json() for one in done.drifts],
         "line_ties": [

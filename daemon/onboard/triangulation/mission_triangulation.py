@@ -41,6 +41,7 @@ from daemon.onboard.triangulation.findings import (
     findings_of,
 )
 from daemon.onboard.triangulation.flown_lines import FlownLines
+from daemon.onboard.triangulation.ground_coverage import GroundCoverage, coverage_of
 from daemon.onboard.triangulation.measured_images import SensorSigmas, measured_image, oriented
 from daemon.orientation.exterior_orientation import (
     NavigationSource,
@@ -135,6 +136,7 @@ class MissionTriangulation:
         self.drifts: tuple[Drift, ...] = ()
         self.findings: tuple[TriangulationFinding, ...] = ()
         self.heights: HeightModelCheck | None = None
+        self.coverage: GroundCoverage | None = None
         self.residuals: tuple[PointResidual, ...] = ()
         self.block_seconds = 0.0
         self.block_count = 0
@@ -275,6 +277,7 @@ class MissionTriangulation:
             return
         self.drifts = drifts_of(self.live)
         self.heights = self._check_heights()
+        self.coverage = coverage_of(self.live)
         if self._surveyed is not None and self.frame is not None:
             self.residuals = residuals_of(self.live, self.frame, self._surveyed, self._measurements)
         found = findings_of(

@@ -29,6 +29,7 @@ def quality_page(content: Mapping[str, Any]) -> str:
         f"{content['adjusted']} in the last adjustment{sigma0}."
         f"{' Simulated.' if content['simulated'] else ''}</p>",
         _accuracy(content),
+        _coverage(content.get("coverage")),
         _control(content.get("control")),
         "<h2>Findings</h2>",
         _list(f"<b>{escape(f['name'])}</b>: {escape(f['sentence'])}" for f in content["findings"]),
@@ -61,6 +62,21 @@ def _accuracy(content: Mapping[str, Any]) -> str:
         f'<td class="n">{found["height_95_m"]:.3f} m</td></tr></table>'
         f"<p>{found['points']} tie points; image coordinates {px[0]:.3f} and {px[1]:.3f} px. "
         "Standard deviations by the adjustment; no point on the ground was measured.</p>"
+    )
+
+
+def _coverage(areas: Mapping[str, Any] | None) -> str:
+    """Areas by number of images."""
+    if areas is None:
+        return ""
+    once, twice, thrice = (
+        f"{areas[key] / 1e6:.3f} km²" for key in ("once_m2", "twice_m2", "thrice_m2")
+    )
+    left_out = areas["left_out"]
+    note = f" {left_out} images that look near the horizon do not count." if left_out else ""
+    return (
+        f"<h2>Coverage</h2><p>{once}; by two or more images {twice}, by three or more {thrice}. "
+        f"By the orientations above and the height of the tie points.{note}</p>"
     )
 
 
