@@ -1,6 +1,6 @@
 """The steps of a Containerfile in a root made by mmdebstrap, where no registry is at hand.
 
-    python -m tests.support.container_root CONTAINERFILE CONTEXT ROOT [COMMAND ...]
+    python -m tests.support.container_root [--data FOLDER] CONTAINERFILE CONTEXT ROOT [COMMAND ...]
 
 It runs as root. ARG, FROM, RUN, COPY, ENV, USER, ENTRYPOINT and CMD are known. Every FROM begins
 with the same base, whatever image it names. Certificates and name servers of this machine are
@@ -22,7 +22,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 CERTIFICATES = "/etc/ssl/certs/ca-certificates.crt"
-SEEN = (CERTIFICATES, "/etc/resolv.conf", "/etc/hosts")
+SEEN_CERTIFICATES = "/run/certificates.crt"
+SEEN = {
+    CERTIFICATES: SEEN_CERTIFICATES,
+    "/etc/resolv.conf": "/etc/resolv.conf",
+    "/etc/hosts": "/etc/hosts",
+}
+"""Files of this machine by their place in the root."""
 PATH = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
 
 
@@ -46,9 +52,9 @@ class Stage:
             ContainerfileError: it failed.
         """
         mounts = [f"mount --rbind /dev {self.root}/dev", f"mount -t proc proc {self.root}/proc"]
-        for path in SEEN if has_network else ():
+        for path, seen in SEEN.items() if has_network else ():
             if Path(path).exists():
-                place = self.root / path[1:]
+                place = self.root / seen[1:]
                 place.parent.mkdir(parents=True, exist_ok=True)
                 place.touch()
                 mounts.append(f"mount --bind {path} {place}")
@@ -56,7 +62,7 @@ class Stage:
         words = shlex.join(command)
         script = " && ".join([*mounts, f"exec chroot {user} {self.root} {words}"])
         namespaces = ["unshare", "--mount", "--pid", "--fork", *([] if has_network else ["--net"])]
-        given = {"PIP_CERT": CERTIFICATES, "SSL_CERT_FILE": CERTIFICATES} if has_network else {}
+        given = {"PIP_CERT": SEEN_CERTIFICATES} if has_network else {}
         done = subprocess.run(
             [*namespaces, "sh", "-c", script], env=self.environment | given, check=False
         )
@@ -148,7 +154,7 @@ def main() -> None:
     parser.add_argument("root", type=Path, help="new folder for base and stages")
     parser.add_argument("--suite", default="trixie", help="suite of Debian")
     parser.add_argument("--data", type=Path, help="folder that is /data for the command")
-    parser.add_argument("command", nargs="*", help="arguments of the entry point")
+    parser.add_argument("command", nargs=argparse.REMAINDER, help="arguments of the entry point")
     options = parser.parse_args()
     if os.geteuid():
         parser.error("run it as root: it mounts and changes root")
