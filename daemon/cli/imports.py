@@ -181,7 +181,7 @@ BLOCK_HELP = """Import cameras, orientations and points of another program for `
 Programs: colmap (folder of a text model), opensfm (reconstruction.json and tracks.csv), metashape
 (cameras.xml), bundler (bundle.out), bal (problem file), bingo, patb and pix4d (folder with
 measurements, orientation and cameras.txt), inpho (project). Distortion is converted to the ten
-parameters by fit; above 0.02 px the measurements are corrected for it instead. Without
+parameters by fit; above 0.02 px Brown's model is kept, or the measurements are corrected. Without
 --position-sigma the project is a free network.
 
 Examples: `syntopic import block sparse/0 --from colmap --out block`,

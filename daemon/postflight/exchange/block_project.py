@@ -1,8 +1,8 @@
 """An adjustment project of an imported block: cameras, orientations, object and image points.
 
 Distortion of the other program is converted to the ten parameters by fit. Where it does not fit,
-the measurements are corrected for it, and the camera has none. Without standard deviations of
-positions the project is a free network.
+Brown's model is kept as it is (`opencv`); of other models the measurements are corrected, and the
+camera has no distortion. Without standard deviations of positions the project is a free network.
 """
 
 from __future__ import annotations
@@ -35,12 +35,13 @@ from processing.bundle.network import (
     Gnss,
     ImagePoints,
     Images,
+    Model,
     Network,
     Points,
     Stations,
     no_gnss,
 )
-from processing.geometry.forward_distortion import rays_from_measured_px
+from processing.geometry.forward_distortion import ForwardDistortion, rays_from_measured_px
 from processing.geometry.lens import lens_correction
 from processing.rig import Lens
 
@@ -106,15 +107,18 @@ def import_block(
         )
     pitches = [camera.pitch_mm or NOMINAL_PITCH_MM for camera in block.cameras]
     fits = [_lens_of(c, pitch) for c, pitch in zip(block.cameras, pitches, strict=True)]
-    block, fits = _corrected(block, pitches, fits)
-    network = _network(block, pitches, [lens for lens, _ in fits], sigma_px, position_sigma_m)
+    block, fits, models = _carried(block, pitches, fits)
+    lenses = [lens for lens, _ in fits]
+    network = _network(block, pitches, lenses, models, sigma_px, position_sigma_m)
     file = ProjectFile(
         format=1,
         name=f"{block.name}, imported from {program}",
         adjust=AdjustSection(robust=True, minimum_norm=position_sigma_m is None),
         camera=tuple(
-            _section(camera, pitch, lens)
-            for camera, pitch, (lens, _) in zip(block.cameras, pitches, fits, strict=True)
+            _section(camera, pitch, lens, model)
+            for camera, pitch, lens, model in zip(
+                block.cameras, pitches, lenses, models, strict=True
+            )
         ),
     )
     none = CheckPoints((), np.zeros((0, 3)), np.zeros((0, 3)))
@@ -161,10 +165,13 @@ def _lens_of(camera: BlockCamera, pitch_mm: float) -> tuple[Lens, float]:
     return lens, float(np.abs(lens_correction(lens, measured) - delta).max()) / pitch_mm
 
 
-def _corrected(
+def _carried(
     block: Block, pitches: list[float], fits: list[tuple[Lens, float]]
-) -> tuple[Block, list[tuple[Lens, float]]]:
-    """The block with measurements corrected for distortions that the ten parameters do not fit.
+) -> tuple[Block, list[tuple[Lens, float]], list[Model]]:
+    """The block, lenses and models, where the ten parameters do not fit a distortion.
+
+    Brown's model is kept: its coefficients go into the lens without a unit. For others the
+    measurements are corrected.
 
     Raises:
         BlockError: a measurement that no ray has in the other program's model.
@@ -173,6 +180,7 @@ def _corrected(
     of = np.array([image.camera for image in block.images], dtype=np.int64)[block.points.image]
     notes = list(block.notes)
     found = list(fits)
+    models: list[Model] = ["australis"] * len(fits)
     for number, (camera, pitch, (_, worst_px)) in enumerate(
         zip(block.cameras, pitches, fits, strict=True)
     ):
@@ -186,19 +194,40 @@ def _corrected(
                 f"camera {camera.name}: its distortion has no inverse at {lost} of {len(rays)} "
                 "measurements; adjust it in the other program with fewer parameters"
             )
-        px[own] = [model.cx_px, model.cy_px] + model.fy_px * rays
-        found[number] = Lens(f_mm=model.fy_px * pitch), 0.0
         finding = (
             f"fits the ten parameters within {worst_px:.3f} px only, {FIT_LIMIT_PX:g} px is the "
             "limit"
             if math.isfinite(worst_px)
             else "has no inverse in the corners"
         )
+        if not any((model.skew_px, model.k4, model.k5, model.k6, model.radial_r8)):
+            models[number] = "opencv"
+            found[number] = _brown(model, pitch), 0.0
+            notes.append(
+                f"camera {camera.name}: its distortion {finding}. The camera keeps its own model, "
+                "opencv"
+            )
+            continue
+        px[own] = [model.cx_px, model.cy_px] + model.fy_px * rays
+        found[number] = Lens(f_mm=model.fy_px * pitch), 0.0
         notes.append(
             f"camera {camera.name}: its distortion {finding}. The measurements are corrected for "
             "it, and the camera of the project has none"
         )
-    return replace(block, points=replace(block.points, px=px), notes=tuple(notes)), found
+    return replace(block, points=replace(block.points, px=px), notes=tuple(notes)), found, models
+
+
+def _brown(model: ForwardDistortion, pitch_mm: float) -> Lens:
+    """Coefficients of the project's model `opencv`; b1 is what fx differs from fy by."""
+    return Lens(
+        f_mm=model.fy_px * pitch_mm,
+        k1=model.k1,
+        k2=model.k2,
+        k3=model.k3,
+        p1=model.p1,
+        p2=model.p2,
+        b1=model.fy_px / model.fx_px - 1.0,
+    )
 
 
 def _with(lens: Lens, values: Mapping[str, float]) -> Lens:
@@ -214,13 +243,14 @@ def _principal_point_mm(camera: BlockCamera, pitch_mm: float) -> tuple[float, fl
     )
 
 
-def _section(camera: BlockCamera, pitch_mm: float, lens: Lens) -> CameraSection:
+def _section(camera: BlockCamera, pitch_mm: float, lens: Lens, model: Model) -> CameraSection:
     xp_mm, yp_mm = _principal_point_mm(camera, pitch_mm)
     return CameraSection(
         name=camera.name,
         f_mm=lens.f_mm,
         xp_mm=xp_mm,
         yp_mm=yp_mm,
+        model=model,
         pixel_um=pitch_mm * 1e3,
         width_px=camera.width_px,
         height_px=camera.height_px,
@@ -231,17 +261,20 @@ def _network(
     block: Block,
     pitches: list[float],
     lenses: list[Lens],
+    models: list[Model],
     sigma_px: float,
     position_sigma_m: tuple[float, float, float] | None,
 ) -> Network:
     names = tuple(image.name.replace(" ", "_") for image in block.images)
     n, points = len(names), block.points
     cameras = []
-    for camera, pitch, lens in zip(block.cameras, pitches, lenses, strict=True):
+    for camera, pitch, lens, model in zip(block.cameras, pitches, lenses, models, strict=True):
         xp_mm, yp_mm = _principal_point_mm(camera, pitch)
         interior = np.array([getattr(lens, _FIELDS.get(key, key)) for key in INTERIOR])
         cameras.append(
-            CameraModel(camera.name, lens.f_mm, xp_mm, yp_mm, interior=interior, pixel_mm=pitch)
+            CameraModel(
+                camera.name, lens.f_mm, xp_mm, yp_mm, model, interior=interior, pixel_mm=pitch
+            )
         )
     place = np.array([image.centre_m for image in block.images])
     of = np.array([image.camera for image in block.images], dtype=np.int64)

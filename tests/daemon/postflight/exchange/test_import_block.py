@@ -197,26 +197,57 @@ def imported_and_adjusted(path: Path, out: Path) -> tuple[dict, dict]:
     return json.loads(done.stdout), json.loads(adjusted.stdout)
 
 
-def test_a_distortion_that_does_not_fit_is_taken_out_of_the_measurements(tmp_path) -> None:
+STRONG = (-0.28, 0.12)
+
+
+def test_a_brown_distortion_that_does_not_fit_keeps_its_model(tmp_path) -> None:
     """As real cameras have it: the ten parameters leave a quarter of a pixel in the corners."""
-    strong = (-0.28, 0.12)
-    path = colmap(made_scene(*strong), tmp_path / "in", *strong)
+    path = colmap(made_scene(*STRONG), tmp_path / "in", *STRONG)
     content, report = imported_and_adjusted(path, tmp_path / "project")
     note = content["notes"][-1]
-    assert "The measurements are corrected for it" in note and "0.02 px is the limit" in note
+    assert "keeps its own model, opencv" in note and "0.02 px is the limit" in note
     assert content["residuals_px"] == {"camera1": 0.0}
     assert report["sigma0"] == pytest.approx(1.0, abs=0.1)
     (camera,) = read_project(tmp_path / "project/project.toml").network.cameras
-    assert not camera.interior.any()
+    assert camera.model == "opencv"
+    assert np.allclose(camera.interior[3:], [*STRONG, 0, 0, 0, 0, 0], atol=1e-9)
     # The other sign of k1 in the file is no longer the camera that took the measurements.
-    wrong = colmap(made_scene(*strong), tmp_path / "wrong", 0.28, -0.12)
+    wrong = colmap(made_scene(*STRONG), tmp_path / "wrong", 0.28, -0.12)
     _, report = imported_and_adjusted(wrong, tmp_path / "other")
     assert report["sigma0"] > 5.0
 
 
+def changed_camera(path: Path, place: int, value: float) -> None:
+    """FULL_OPENCV: fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6."""
+    lines = (path / "cameras.txt").read_text().splitlines()
+    words = lines[-1].split()
+    assert words[1] == "FULL_OPENCV"
+    words[4 + place] = repr(value)
+    (path / "cameras.txt").write_text("\n".join([*lines[:-1], " ".join(words)]) + "\n")
+
+
+def test_pixels_that_are_not_square_are_carried_with_the_model(tmp_path) -> None:
+    points, centres, turns, seen = made_scene(*STRONG)
+    wider = [(k, p, u * 1.001, v) for k, p, u, v in seen]
+    path = colmap((points, centres, turns, wider), tmp_path / "in", *STRONG)
+    changed_camera(path, 0, F * 1.001)
+    _, report = imported_and_adjusted(path, tmp_path / "project")
+    assert report["sigma0"] == pytest.approx(1.0, abs=0.1)
+
+
+def test_another_distortion_that_does_not_fit_is_taken_out_of_the_measurements(tmp_path) -> None:
+    path = colmap(made_scene(*STRONG), tmp_path / "in", *STRONG)
+    changed_camera(path, 9, 1e-5)
+    content, report = imported_and_adjusted(path, tmp_path / "project")
+    assert "The measurements are corrected for it" in content["notes"][-1]
+    assert report["sigma0"] == pytest.approx(1.0, abs=0.1)
+    (camera,) = read_project(tmp_path / "project/project.toml").network.cameras
+    assert camera.model == "australis" and not camera.interior.any()
+
+
 def test_a_measurement_that_no_ray_has_is_refused(tmp_path) -> None:
     """k1 = -4 folds the image over inside its border: the corners have no ray."""
-    path = colmap(made_scene(-0.28, 0.12), tmp_path / "in", -4.0, 0.0)
+    path = colmap(made_scene(*STRONG), tmp_path / "in", -4.0, 0.0)
     done = RUN.invoke(
         app, ["import", "block", str(path), "--from", "colmap", "--out", str(tmp_path / "p")]
     )
