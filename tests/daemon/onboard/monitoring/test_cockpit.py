@@ -200,6 +200,28 @@ def test_degraded_with_many_faults(cockpit: Cockpit) -> None:
     check(cockpit, "degraded", east_deg=0.0005)
 
 
+def test_each_page_next_to_the_map_is_whole(cockpit: Cockpit) -> None:
+    """What `check` measures, with every tab open; each size in one of the themes."""
+    browser = cockpit.browser
+    tabs = browser.evaluate("[...document.querySelectorAll('#tabs button')].map((one) => one.id)")
+    assert len(tabs) == 9
+    found = []
+    for (width, height), theme in zip(SIZES, ("dark", "", "dark"), strict=True):
+        cockpit.resize(width, height, theme)
+        for tab in tabs:
+            browser.click(f"#{tab}")
+            where = f"{tab} at {width}x{height} {theme or 'light'}"
+            faults = browser.evaluate("measures()")
+            found += [(where, fault, faults[fault]) for fault in FAULTS if faults[fault]]
+            if faults["scrolls"] or faults["weakest"][1] < CONTRAST:
+                found.append((where, "scrolls or contrast", faults["weakest"]))
+            if width < 2000:
+                found += [(where, "axe", one) for one in axe(browser)]
+    assert found == [], "\n".join(map(str, found))
+    browser.click("#tab-flight")
+    cockpit.resize(1280, 800)
+
+
 def test_no_text_is_missing_from_the_catalogs_and_none_is_clipped(cockpit: Cockpit) -> None:
     """The pseudo-locale brackets every text of the catalogs and makes it a third longer."""
     browser = cockpit.browser

@@ -31,7 +31,7 @@ const atLeastHalfKelvin = (_, minimum, maximum) => {
 
 function chart(id, title, unit, range, series) {
   const container = document.getElementById(id);
-  return new uPlot({
+  const created = new uPlot({
     title,
     width: Math.max(container.clientWidth, 200),
     height: HEIGHT_PX,
@@ -46,6 +46,9 @@ function chart(id, title, unit, range, series) {
       label, stroke, dash, width: 2, spanGaps: false, points: { size: 4 },
     }))],
   }, [[], ...series.map(() => [])], container);
+  // Its legend is drawn by a table that has no data cells.
+  created.root.querySelector(".u-legend")?.setAttribute("role", "presentation");
+  return created;
 }
 
 export function drawCharts() {
