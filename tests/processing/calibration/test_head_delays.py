@@ -15,7 +15,7 @@ from processing.bundle.head_times import confounded_times, head_times, jitter_si
 from processing.bundle.network import Network
 from processing.bundle.rank_diagnosis import RankDefectError
 from processing.calibration.boresight import calibrate_boresight
-from processing.calibration.head_delays import head_delays
+from processing.calibration.head_delays import head_delays, orientation_columns
 from processing.calibration.motion_consistency import motion_consistency
 from processing.geometry.rotation import rotations_from_vectors
 from sim_hw.blocks.figure_of_eight import (
@@ -73,6 +73,36 @@ def test_delays_against_the_marks_hold_what_both_share(figure) -> None:
     by = np.eye(9)[1:] - np.eye(9)[0]
     between = np.sqrt(np.diag(by @ total.covariance @ by.T))
     assert between == pytest.approx([t.delay_sigma_s for t in head_times(timed.adjustment)[1:]])
+
+
+def test_sigmas_of_delays_after_the_marks_follow_from_images_and_trajectory(figure) -> None:
+    flight, timed = figure
+    every = tuple(range(len(flight.time_s)))
+    total = head_delays(timed.adjustment, every, timed.found)
+    at = orientation_columns(timed.adjustment, every)
+    by_image = timed.found.by_image[6]
+    block = timed.adjustment.sigma0**2 * timed.adjustment.cofactor
+    of_trajectory = timed.found.covariance[6, 6] - by_image @ block[np.ix_(at, at)] @ by_image
+    assert of_trajectory > 0.0
+    for k in range(1, 9):
+        both = np.append(at, timed.adjustment.layout.head_delay[k])
+        change = np.append(by_image, 1.0)
+        variance = of_trajectory + change @ block[np.ix_(both, both)] @ change
+        assert total.covariance[k, k] == pytest.approx(variance, rel=1e-9)
+
+
+def test_errors_that_are_common_to_all_exposures_stay_in_the_shift(figure) -> None:
+    flight, timed = figure
+    images = controlled_of(timed.adjustment, tuple(range(len(flight.time_s))))
+    shift = {}
+    for correlation_s in (None, 1e7):
+        inertial = replace(inertial_of(flight), position_correlation_s=correlation_s)
+        found = calibrate_boresight(images, inertial, timed.found.mounting)
+        shift[correlation_s] = found.sigma[7]
+    assert shift[1e7] > 0.99 * flight.spread.position_m[0] > 1.5 * shift[None]
+    with pytest.raises(ValueError, match="a correlation time is positive"):
+        inertial = replace(inertial_of(flight), position_correlation_s=-1.0)
+        calibrate_boresight(images, inertial, timed.found.mounting)
 
 
 def test_the_ten_change_with_the_images_as_stated(figure) -> None:
@@ -178,6 +208,8 @@ def test_jitter_of_each_head_is_estimated_from_the_block() -> None:
     assert result is not None
     for head in heads:
         assert sigma[head.name] == pytest.approx(head.jitter_s, rel=0.6), head.name
+    ratios = np.array([sigma[head.name] / head.jitter_s for head in heads])
+    assert np.exp(np.log(ratios).mean()) == pytest.approx(1.0, abs=0.25)
     assert min(sigma["oblique 2"], sigma["oblique 5"]) > 2.0 * max(
         sigma[h.name] for h in heads if h.jitter_s < 5e-4
     )
