@@ -286,6 +286,9 @@ class _Growing:
         """Adjust what there is as a free network, with the interior orientation as an unknown."""
         for _ in range(2):
             rows = np.flatnonzero(self.used())
+            if not len(rows):
+                # The images of a wrong start contradict each other; nothing fits any more.
+                return
             images = np.flatnonzero(self.oriented)
             points, point = np.unique(self.tracks.point[rows], return_inverse=True)
             image = np.searchsorted(images, self.tracks.image[rows])

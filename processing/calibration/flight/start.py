@@ -223,7 +223,8 @@ def _orient_together(
     if away > _BENT_SHARE * size:
         raise FlightCalibrationError(
             f"{names}: images and positions contradict each other by {away:.1f} m. Lines that "
-            "hardly overlap do not hang together, or times of positions and frames do not match"
+            "hardly overlap do not hang together, the ground repeats itself, or times of positions "
+            "and frames do not match"
         )
     new = own[block.oriented]
     found.station_m[new] = fit.applied(block.station[block.oriented])

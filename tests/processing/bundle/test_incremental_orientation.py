@@ -136,3 +136,15 @@ def test_an_image_that_sees_points_of_one_place_only_is_left_without_orientation
     own = block._rows[0]
     block.xyz[tracks.point[own]] = 1e-5 * np.column_stack([block.ideal[own], np.ones(len(own))])
     assert not block._resect(0)
+
+
+def test_an_adjustment_without_fitting_points_changes_nothing() -> None:
+    """As in a trial whose first images contradict each other."""
+    camera = CameraModel("head", F, interior=np.zeros(len(INTERIOR)), pixel_mm=PIXEL)
+    image, point = np.repeat([0, 1, 2], 20), np.tile(np.arange(20), 3)
+    xy_mm = np.random.default_rng(2).uniform(-1.0, 1.0, (60, 2))
+    block = _Growing(camera, PhotographTracks(image, point, xy_mm, 3, 20))
+    block.station[:2], block.rotation[:2] = np.eye(3)[:2], np.eye(3)
+    block.adjust()
+    assert not block.used().any()
+    assert np.array_equal(block.station[:2], np.eye(3)[:2])

@@ -61,6 +61,12 @@ def findings_of(found: FlightCalibration, frames: FlightFrames) -> FlightFinding
             f"frames of one exposure are up to {frames.apart_m:.2f} m of flight apart and are "
             "taken as of one place; trigger the heads together"
         )
+    if frames.contradicting:
+        warnings.append(
+            f"{frames.contradicting} of {frames.matched} pairs of images were left out: by the "
+            "positions they do not lie where their matches put them, as over ground that repeats "
+            "itself"
+        )
     warnings += _positions(found, frames)
     warnings += found.adjustment.problems
     warnings += frames.unreadable

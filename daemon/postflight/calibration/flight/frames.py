@@ -22,6 +22,7 @@ from daemon.orientation.local_frame import LocalFrame
 from daemon.orientation.rtklib_positions import SUFFIX, read_positions
 from daemon.orientation.trajectory import read_trajectory, trajectory_of_samples
 from processing.calibration.flight.images import FlightImages
+from processing.calibration.flight.plausible_pairs import contradicting_pairs
 from processing.matching.board_corners import grey_picture
 from processing.matching.photograph_tracks import (
     ImageFeatures,
@@ -57,7 +58,8 @@ class FlightFrames:
 
     `apart_m` is the largest distance flown between frames of one exposure; `temperature_c` the mean
     of each probe; `without_sigma` counts positions without a standard deviation, for which
-    `default_sigma_m` is taken, horizontal and vertical.
+    `default_sigma_m` is taken, horizontal and vertical. Of `matched` pairs of images,
+    `contradicting` ones were left out, since they cannot lie where their matches put them.
     """
 
     rig: Rig
@@ -70,6 +72,8 @@ class FlightFrames:
     without_sigma: int
     default_sigma_m: tuple[float, float]
     unreadable: tuple[str, ...]
+    contradicting: int = 0
+    matched: int = 0
 
 
 @dataclass(frozen=True)
@@ -123,11 +127,13 @@ def read_flight(
     matches = match_photographs(
         features, pairs, progress=lambda done: progress("matching", done, len(pairs))
     )
+    points = [one.px for one in features]
+    wrong = contradicting_pairs(rig.cones, head, exposure, position[kept], points, matches)
     images = FlightImages(
         head,
         exposure,
         np.unique([one.line for one in chosen], return_inverse=True)[1].astype(np.int64),
-        join_tracks(features, matches),
+        join_tracks(features, {k: v for k, v in matches.items() if k not in wrong}),
         position[kept] + moved,
         sigma,
         np.array(mount_of(held[0])[0].antenna_m),
@@ -143,6 +149,8 @@ def read_flight(
         without,
         default_m,
         tuple(unreadable),
+        len(wrong),
+        len(matches),
     )
 
 

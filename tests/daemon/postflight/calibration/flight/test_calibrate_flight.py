@@ -141,6 +141,24 @@ def test_positions_come_from_a_post_processed_trajectory(
     assert found.images.position_sigma_m[0].tolist() == [0.05, 0.05, 0.08]
 
 
+def test_pairs_that_contradict_the_positions_are_left_out_and_counted(
+    flown: tuple[Path, Rig, Rig], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given: list[Any] = []
+
+    def contradicting(*arguments: Any) -> set[tuple[int, int]]:
+        given.extend(arguments)
+        return {pair for pair in arguments[-1] if pair[0] == 0}
+
+    monkeypatch.setattr(frames, "FEATURES_MAX", 300)
+    monkeypatch.setattr(frames, "contradicting_pairs", contradicting)
+    found = frames.read_flight([flown[0]])
+    _, head, exposure, position_m, px, pairs = given
+    assert 0 < found.contradicting < found.matched == len(pairs)
+    assert 0 not in found.images.tracks.image
+    assert len(head) == len(exposure) == len(px) and len(position_m) == found.exposures
+
+
 def test_flights_that_cannot_calibrate_are_refused(
     flown: tuple[Path, Rig, Rig], tmp_path: Path
 ) -> None:
