@@ -66,7 +66,7 @@ class FlightSigmas:
 
 
 @dataclass(frozen=True)
-class HeadTruth:
+class TimedHead:
     """A head: rig from camera (3, 3), offset m in rig axes (x right, y forward, z up), principal
     distance mm, delay, standard deviation of its jitter and readout time, s."""
 
@@ -89,7 +89,7 @@ class FigureFlight:
     `centre_m` and `rotation` (object from rig) are true at the marks plus `common_delay_s`.
     """
 
-    heads: tuple[HeadTruth, ...]
+    heads: tuple[TimedHead, ...]
     time_s: Array
     figure: Indices
     centre_m: Array
@@ -198,7 +198,7 @@ def nine_heads(
     delay_s: float = 0.02,
     jitter_s: float = 0.0,
     readout_s: float = 0.0,
-) -> tuple[HeadTruth, ...]:
+) -> tuple[TimedHead, ...]:
     """A nadir head and eight oblique ones around it, with random errors of their mounting.
 
     Delays lie between zero and `delay_s`; the first head has none: the common delay is its own.
@@ -213,7 +213,7 @@ def nine_heads(
         offset = ring * np.array([math.sin(azimuth), math.cos(azimuth), 0.0])
         offset = offset + random.normal(0.0, 0.03, 3)
         heads.append(
-            HeadTruth(
+            TimedHead(
                 "nadir" if k == 0 else f"oblique {k}",
                 np.eye(3) if k == 0 else mounted.as_matrix(),
                 np.zeros(3) if k == 0 else offset,
@@ -230,7 +230,7 @@ def simulate_figure_flight(
     seed: int,
     figures: tuple[Figure, ...] = (Figure(),),
     *,
-    heads: tuple[HeadTruth, ...] | None = None,
+    heads: tuple[TimedHead, ...] | None = None,
     wind_mps: tuple[float, float] = (5.0, 6.0),
     interval_s: float = 4.0,
     points_per_image: int = 60,
@@ -365,7 +365,7 @@ def _append_marks(
         rows.setdefault(name, []).append(values)
 
 
-def _image_of(path: _Path, t: float, head: HeadTruth, points: Array) -> tuple[Indices, Array]:
+def _image_of(path: _Path, t: float, head: TimedHead, points: Array) -> tuple[Indices, Array]:
     """Points inside the frame of a head whose middle row is exposed at `t`, and where they are."""
 
     def projected(instant: Array, own: Array) -> tuple[Array, Array]:

@@ -58,8 +58,7 @@ def test_an_exposure_without_inertial_values_is_named(flown, tmp_path) -> None:
         (short / file.name).write_text(content)
     done = RUN.invoke(app, ["calibrate", "boresight", str(short), *OPTIONS])
     assert done.exit_code != 0
-    said = " ".join(done.output.split()) if done.output else str(done.exception)
-    assert "000003" in said + str(done.exception)
+    assert "000003" in f"{done.output} {done.exception}"
 
 
 def test_a_project_keeps_delays_and_motion(flown, tmp_path) -> None:
