@@ -60,11 +60,11 @@ class Stage:
                 mounts.append(f"mount --bind {path} {place}")
         user = f"--userspec={self.user}:{self.user}" if self.user else ""
         words = shlex.join(command)
-        script = " && ".join([*mounts, f"exec chroot {user} {self.root} {words}"])
+        script = " && ".join([*mounts, f"exec /usr/sbin/chroot {user} {self.root} {words}"])
         namespaces = ["unshare", "--mount", "--pid", "--fork", *([] if has_network else ["--net"])]
         given = {"PIP_CERT": SEEN_CERTIFICATES} if has_network else {}
         done = subprocess.run(
-            [*namespaces, "sh", "-c", script], env=self.environment | given, check=False
+            [*namespaces, "/bin/sh", "-c", script], env=self.environment | given, check=False
         )
         if done.returncode:
             raise ContainerfileError(f"{words}: status {done.returncode}")
