@@ -180,7 +180,14 @@ def _cache_misses() -> int:
 
 
 def main(names: Sequence[str]) -> int:
-    """Compile recorded variants of these kernels that are not in the cache; the exit status."""
+    """Compile recorded variants that are not in the cache.
+
+    Args:
+        names: of the kernels, "module.function".
+
+    Returns:
+        The exit status.
+    """
     table = recorded_variants()
     try:
         compile_recorded(kernels(), table={name: table[name] for name in names})

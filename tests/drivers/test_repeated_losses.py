@@ -176,6 +176,7 @@ def test_a_loss_and_the_refusals_to_reopen_are_one_report() -> None:
         for error in errors:
             raise error
 
+    # Opens once, after two refusals.
     head._open_device = open_device  # type: ignore[method-assign]
     head.run(sink)
     assert sink.event_names == ["lost"]

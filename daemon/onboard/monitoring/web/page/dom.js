@@ -31,7 +31,7 @@ export function redraw(container, key, draw) {
 }
 
 // Rows of `body`, one for each of `items` with a number, in their order. A row whose key is the same stays: a table of hundreds
-// would else be made anew with each record.
+// would else be made again with each record.
 export function updateRows(body, items, keyOf, rowOf) {
   const present = new Map([...body.children].map((one) => [one.dataset.number, one]));
   const wanted = new Set(items.map((one) => String(one.number)));
