@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from daemon.mission.layout import Mission
+from daemon.onboard.triangulation import control_points
 from daemon.onboard.triangulation.control_points import (
     ControlPointsError,
     PointResidual,
@@ -198,3 +199,24 @@ def test_a_point_moves_with_the_orientations_as_its_gain_states() -> None:
     assert measured_point(f_mm, station, rotation, np.zeros(2, np.int64), xy[:2], sigma[:2]) is None
     up = np.array([place[0], place[1], 2000.0])
     assert np.isnan(projected_mm(f_mm, station, rotation, up)).all()
+
+
+def test_rough_ground_around_a_point_is_in_the_standard_deviation_of_its_height() -> None:
+    random = np.random.default_rng(2)
+    drawn, stated = [], []
+    for _ in range(200):
+        ties = np.column_stack([random.uniform(-80.0, 80.0, (40, 2)), np.zeros(40)])
+        ties[:, 2] = 0.05 * ties[:, 0] + random.normal(0.0, 2.0, 40)
+        place = np.array([0.0, 0.0, random.normal(0.0, 2.0)])
+        sigma = np.full((40, 3), 0.1)
+        found = control_points._by_surface("A", "check", place, ties, sigma, 0.02, 1000.0)
+        if not found.reason:  # the nearest lie all around it
+            drawn.append(found.difference_m[2])
+            stated.append(found.sigma_m[2])
+    assert len(drawn) > 150
+    assert np.sqrt(np.mean(np.square(drawn))) == pytest.approx(
+        np.sqrt(np.mean(np.square(stated))), rel=0.15
+    )
+    assert control_points._by_surface(
+        "A", "check", np.array([500.0, 0.0, 0.0]), ties, sigma, 0.02, 1000.0
+    ).reason.startswith("0 tie points")
