@@ -32,7 +32,6 @@ from daemon.configuration.model import ConfigurationError, PlanSection, Processi
 from daemon.configuration.problems import nested_value
 from daemon.mission.layout import Mission
 from daemon.orientation.exterior_orientation import mount_of
-from daemon.planning.overlaps import overlaps_of
 from daemon.terminal.console import Console
 from drivers.base.extras import require
 from processing.image.kernels import DEFAULT_INTERPOLATION, INTERPOLATIONS
@@ -103,6 +102,7 @@ def process(
     as_json: AsJson = False,
 ) -> None:
     from daemon.mission.transfer.object_store import is_store_url
+    from daemon.planning.overlaps import overlaps_of
     from daemon.postflight.batch.level2_sources import level2_source
     from daemon.postflight.batch.level2_work import Level2Work
     from daemon.postflight.batch.software_identity import software_identity

@@ -20,7 +20,7 @@ export function noDataRings(footprint, area) {
 // The pattern of the hatch: a fill that no colour of a verdict has.
 function addHatch(container) {
   const svg = (name, attributes) => {
-    const created = document.createElementNS("http://www.w3.org/2000/svg", name);
+    const created = L.SVG.create(name);
     for (const [key, value] of Object.entries(attributes)) created.setAttribute(key, value);
     return created;
   };
