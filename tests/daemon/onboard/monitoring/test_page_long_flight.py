@@ -57,7 +57,7 @@ def test_older_exposures_are_drawn_and_found_and_the_rest_is_dropped(
     for number in range(1, 341):
         for event in flight_events.exposure(number, "good", north_m=60.0 * number):
             emit_patiently(service, event)
-    service.emit(flight_events.status(triggers=340))
+    emit_patiently(service, flight_events.status(triggers=340))
     shown = "import('/map.js').then((map) => map.footprintCount())"
     browser.wait_for(f"{shown}.then((count) => count === 340)", WITHIN_S)
     whole = browser.evaluate("import('/telemetry.js').then(({ flight }) => flight.exposures.size)")
