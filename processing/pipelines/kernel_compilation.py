@@ -145,7 +145,7 @@ def compile_for(
     Args:
         rig: the camera.
         radiometry: calibrations by sensor name.
-        settings: of the pipeline.
+        settings: of the pipeline; None takes those under which it does all it can.
         progress: called after each kernel that another process compiled.
         processes: None takes one for each core, 0 compiles in this process as the pipeline runs.
 
@@ -166,7 +166,8 @@ def compile_for(
         radiometry = {first.name: synthetic_radiometry(first)}
     demosaic(np.zeros((8, 8), np.uint16), "RGGB", out=np.zeros((3, 8, 8), np.uint16))
     if rig.virtual_image is not None:
-        Pipeline(rig, radiometry, settings).warm_up()
+        complete = PipelineSettings(baselines=True, geometry=True)
+        Pipeline(rig, radiometry, settings or complete).warm_up()
     elif has_head_images(rig):
         HeadPipeline(rig, radiometry).warm_up()
     else:

@@ -147,7 +147,7 @@ class Pipeline(
         return other
 
     def warm_up(self) -> None:
-        """Compile every kernel a flight will need, from the cache where there is one.
+        """Load every kernel that exposures with these settings call.
 
         A rehearsal exposure goes through all steps. Frames in memory may be read-only to the
         kernels: that is another variant of those that correct.
@@ -158,15 +158,10 @@ class Pipeline(
             exposure_time_s={sensor.name: 0.005 for sensor in self.rig.sensors},
             tdi_shifts={sensor.name: 1 for sensor in self.rig.sensors},
         )
-        settings = self.settings
-        try:
-            self.settings = replace(settings, baselines=True, geometry=True)
-            self.process(frames, conditions)
-            for frame in frames.values():
-                frame.flags.writeable = False
-            self._correct(self._read(frames, conditions))
-        finally:
-            self.settings = settings
+        self.process(frames, conditions)
+        for frame in frames.values():
+            frame.flags.writeable = False
+        self._correct(self._read(frames, conditions))
 
     def _correct(self, exposure: ExposureInput) -> CorrectedFrames:
         rig, frames, conditions = self.rig, exposure.frames, exposure.conditions
