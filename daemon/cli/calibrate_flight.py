@@ -80,9 +80,21 @@ def flight(
         place = calibration_folder(out, f"{frames.rig.name}-flight", today, next_to=missions[0])
         try:
             found = calibrate_flight(frames.rig, frames.images, progress=show_progress)
+            findings = findings_of(found, frames)
+            refusal = None
         except FlightCalibrationError as error:
-            raise FlightFramesError(f"{frames.rig.name}: {error}") from error
-    findings = findings_of(found, frames)
+            refusal = error
+        if frames.plausible is not None and (refusal or findings.blocking):
+            # Over ground that repeats itself; elsewhere turns and slopes may seem contradictions.
+            frames = frames.without_contradicting(frames.plausible)
+            try:
+                found = calibrate_flight(frames.rig, frames.images, progress=show_progress)
+                findings = findings_of(found, frames)
+                refusal = None
+            except FlightCalibrationError as error:
+                refusal = error
+        if refusal is not None:
+            raise FlightFramesError(f"{frames.rig.name}: {refusal}") from refusal
     made = calibrated_rig(found, frames, findings, date=today)
     report = flight_report(
         found, frames, findings, calibration_id=place.name, date=today, previous=before

@@ -58,8 +58,9 @@ class FlightFrames:
 
     `apart_m` is the largest distance flown between frames of one exposure; `temperature_c` the mean
     of each probe; `without_sigma` counts positions without a standard deviation, for which
-    `default_sigma_m` is taken, horizontal and vertical. Of `matched` pairs of images,
-    `contradicting` ones were left out, since they cannot lie where their matches put them.
+    `default_sigma_m` is taken, horizontal and vertical. `plausible` are the images without pairs
+    that seem to contradict the positions; None where there are none. Of `matched` pairs of images,
+    `contradicting` ones were left out.
     """
 
     rig: Rig
@@ -72,8 +73,15 @@ class FlightFrames:
     without_sigma: int
     default_sigma_m: tuple[float, float]
     unreadable: tuple[str, ...]
+    plausible: FlightImages | None = None
     contradicting: int = 0
     matched: int = 0
+    plausible_pairs: int = 0
+
+    def without_contradicting(self, plausible: FlightImages) -> FlightFrames:
+        """The same flight by `plausible` alone: for ground that repeats itself."""
+        wrong = self.matched - self.plausible_pairs
+        return replace(self, images=plausible, plausible=None, contradicting=wrong)
 
 
 @dataclass(frozen=True)
@@ -133,11 +141,12 @@ def read_flight(
         head,
         exposure,
         np.unique([one.line for one in chosen], return_inverse=True)[1].astype(np.int64),
-        join_tracks(features, {k: v for k, v in matches.items() if k not in wrong}),
+        join_tracks(features, matches),
         position[kept] + moved,
         sigma,
         np.array(mount_of(held[0])[0].antenna_m),
     )
+    plausible = {pair: found for pair, found in matches.items() if pair not in wrong}
     return FlightFrames(
         rig,
         tuple(mission.id for mission in held),
@@ -149,8 +158,9 @@ def read_flight(
         without,
         default_m,
         tuple(unreadable),
-        len(wrong),
-        len(matches),
+        plausible=replace(images, tracks=join_tracks(features, plausible)) if wrong else None,
+        matched=len(matches),
+        plausible_pairs=len(plausible),
     )
 
 

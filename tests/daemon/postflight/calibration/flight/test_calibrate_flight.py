@@ -154,6 +154,9 @@ def test_pairs_that_contradict_the_positions_are_left_out_and_counted(
     monkeypatch.setattr(frames, "contradicting_pairs", contradicting)
     found = frames.read_flight([flown[0]])
     _, head, exposure, position_m, px, pairs = given
+    assert found.contradicting == 0 and 0 in found.images.tracks.image
+    assert found.plausible is not None
+    found = found.without_contradicting(found.plausible)
     assert 0 < found.contradicting < found.matched == len(pairs)
     assert 0 not in found.images.tracks.image
     assert len(head) == len(exposure) == len(px) and len(position_m) == found.exposures
