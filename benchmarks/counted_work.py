@@ -10,7 +10,7 @@ import errno
 import os
 import random
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +35,9 @@ class CountedWork:
     @property
     def memory_nbytes(self) -> int:
         return self.work.memory_nbytes
+
+    def with_threads(self, threads: int) -> CountedWork:
+        return replace(self, work=self.work.with_threads(threads))
 
     def open(self) -> CountedAction:
         _count_commits(self)

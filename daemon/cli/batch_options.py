@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import functools
+import inspect
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.progress import (
@@ -23,9 +26,9 @@ from daemon.configuration.model import ConfigurationError
 from daemon.terminal.console import Console
 
 if TYPE_CHECKING:
-    from daemon.postflight.batch.batch_run import BatchCounts
+    from daemon.postflight.batch.batch_run import BatchCounts, BatchOutcome, Compute
     from daemon.postflight.batch.capacity import ProcessAllocation
-    from daemon.postflight.batch.executor import BatchExecutor
+    from daemon.postflight.batch.executor import BatchExecutor, BatchTask, BatchWork
 
 Processes = Annotated[
     int | None,
@@ -58,90 +61,181 @@ class _RateColumn(ProgressColumn):
         return Text(f"{speed:.2f}/s" if speed else "")
 
 
-def executor_for(plan: ProcessAllocation, processes: int | None) -> BatchExecutor:
-    """The executor on this machine: processes, or this one where it suffices.
+@dataclass(frozen=True)
+class Placement:
+    """Where the tasks of one work are computed, and with how many threads a process."""
+
+    executor: BatchExecutor
+    allocation: ProcessAllocation
+
+    @property
+    def threads(self) -> int:
+        return self.allocation.threads
+
+
+@dataclass(frozen=True)
+class ExecutorOptions:
+    """Options of a command whose exposures are computed by processes or by a cluster.
+
+    The annotations are those of the command line (`takes_executor`).
+    """
+
+    processes: Processes = None
+    threads: Threads = None
+    scheduler: Scheduler = None
+    tls_ca: TlsCa = None
+    tls_certificate: TlsCertificate = None
+    tls_key: TlsKey = None
+
+    def check(self) -> None:
+        """Refuse a cluster that cannot be used, before anything is read.
+
+        Raises:
+            MissingExtraError: dask is not installed.
+            ConfigurationError: an address off this machine without TLS, or processes of this
+                machine.
+        """
+        if self.scheduler is not None:
+            self.cluster()
+
+    def cluster(self) -> BatchExecutor:
+        """The executor on the cluster of `scheduler`.
+
+        Raises:
+            MissingExtraError, ConfigurationError: see `check`.
+        """
+        from daemon.postflight.batch.cluster_address import cluster_address
+        from drivers.base.extras import require
+
+        scheduler = self.scheduler or ""
+        if self.processes is not None:
+            raise ConfigurationError(
+                [
+                    "--processes counts processes of this machine; with --scheduler those of the "
+                    f"cluster compute. Leave it out, and give it to: syntopic worker {scheduler}"
+                ]
+            )
+        address = cluster_address(scheduler, self.tls_ca, self.tls_certificate, self.tls_key)
+        require("cluster")
+        from daemon.postflight.batch.dask_executor import DaskExecutor
+
+        console = Console(stderr=True, soft_wrap=True)
+        return DaskExecutor(
+            address, announce=lambda sentence: console.print(sentence, highlight=False)
+        )
+
+    def place(self, task_nbytes: int, tasks: int, tasks_per_process: int = 1) -> Placement:
+        """An executor for so many tasks: the cluster, processes, or this process.
+
+        Args:
+            task_nbytes: memory of one process with a task.
+            tasks: their number.
+            tasks_per_process: as many as take longer than the start of a process.
+
+        Raises:
+            ConfigurationError: more processes than memory, or a cluster that cannot be used.
+        """
+        if self.scheduler is not None:
+            from daemon.postflight.batch.capacity import ProcessAllocation
+
+            return Placement(self.cluster(), ProcessAllocation(0, self.threads or 1, "its workers"))
+        plan = self._allocation(task_nbytes, tasks, tasks_per_process)
+        if self.processes == 0 or (self.processes is None and plan.processes == 1):
+            from daemon.postflight.batch.in_process import InProcessExecutor
+            from daemon.products.pipeline_pool import usable_count
+
+            return Placement(InProcessExecutor(IN_PROCESS_COUNT, usable_count), plan)
+        from daemon.postflight.batch.local_processes import LocalProcessExecutor
+
+        return Placement(LocalProcessExecutor(plan.processes), plan)
+
+    def run(
+        self,
+        work: BatchWork,
+        tasks: Sequence[BatchTask],
+        description: str,
+        tasks_per_process: int = 1,
+    ) -> BatchOutcome:
+        """Compute tasks where these options say, with progress on stderr.
+
+        Args:
+            work: what is computed.
+            tasks: one for each exposure.
+            description: such as "writing".
+            tasks_per_process: see `place`.
+
+        Raises:
+            Exception: see `daemon.postflight.batch.batch_run.run_batch`.
+        """
+        from daemon.postflight.batch.batch_run import run_batch
+
+        placed = self.place(work.memory_nbytes, len(tasks), tasks_per_process)
+        with shown_progress(description, len(tasks), 0) as show:
+            return run_batch(placed.executor, work.with_threads(placed.threads), tasks, show)
+
+    def compute(self, description: str, tasks_per_process: int = 1) -> Compute:
+        """The same as a function of work and tasks, which raises KeyboardInterrupt after Ctrl-C.
+
+        Args:
+            description: such as "writing".
+            tasks_per_process: see `place`.
+        """
+
+        def compute(work: BatchWork, tasks: Sequence[BatchTask]) -> BatchOutcome:
+            return completed(self.run(work, tasks, description, tasks_per_process))
+
+        from daemon.postflight.batch.batch_run import completed
+
+        return compute
+
+    def _allocation(
+        self, task_nbytes: int, tasks: int, tasks_per_process: int
+    ) -> ProcessAllocation:
+        from daemon.postflight.batch import capacity
+
+        cores, available = capacity.usable_cores(), capacity.available_memory_nbytes()
+        plan = capacity.plan_processes(
+            task_nbytes,
+            -(-tasks // tasks_per_process),
+            cores=cores,
+            available_nbytes=available,
+            threads=self.threads,
+        )
+        count = self.processes
+        if count is None:
+            return plan
+        if count * task_nbytes > available and count > 1:
+            raise ConfigurationError(
+                [
+                    f"--processes {count} needs {count * task_nbytes / 1e9:.1f} GB of memory; "
+                    f"{available / 1e9:.1f} GB are available. Give --processes {plan.processes}"
+                ]
+            )
+        own = self.threads or (min(2, cores) if count == 0 else max(1, cores // count))
+        return replace(plan, processes=count, threads=own, reason="as requested")
+
+
+def takes_executor(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command the options of `ExecutorOptions` in place of its parameter `where`.
 
     Args:
-        plan: as computed.
-        processes: as requested; 0 or None.
+        command: a function that typer runs, with the keyword `where`.
     """
-    if processes == 0 or (processes is None and plan.processes == 1):
-        from daemon.postflight.batch.in_process import InProcessExecutor
-        from daemon.products.pipeline_pool import usable_count
+    signature = inspect.signature(command, eval_str=True)
+    options = inspect.signature(ExecutorOptions, eval_str=True).parameters.values()
+    parameters: list[inspect.Parameter] = []
+    for parameter in signature.parameters.values():
+        own = [option.replace(kind=parameter.kind) for option in options]
+        parameters += own if parameter.name == "where" else [parameter]
 
-        return InProcessExecutor(IN_PROCESS_COUNT, usable_count)
-    from daemon.postflight.batch.local_processes import LocalProcessExecutor
+    @functools.wraps(command)
+    def run(**given: Any) -> None:
+        where = {field.name: given.pop(field.name) for field in fields(ExecutorOptions)}
+        command(**given, where=ExecutorOptions(**where))
 
-    return LocalProcessExecutor(processes or plan.processes)
-
-
-def cluster_executor(
-    scheduler: str,
-    ca: Path | None,
-    certificate: Path | None,
-    key: Path | None,
-    processes: int | None = None,
-) -> BatchExecutor:
-    """The executor on a cluster.
-
-    Args:
-        scheduler: its address.
-        ca: certificate of the authority.
-        certificate: of this command.
-        key: of the certificate.
-        processes: as requested for this machine; refused.
-
-    Raises:
-        MissingExtraError: dask is not installed.
-        ConfigurationError: an address off this machine without TLS, or processes of this machine.
-    """
-    from daemon.postflight.batch.cluster_address import cluster_address
-    from drivers.base.extras import require
-
-    if processes is not None:
-        raise ConfigurationError(
-            [
-                "--processes counts processes of this machine; with --scheduler those of the "
-                f"cluster compute. Leave it out, and give it to: syntopic worker {scheduler}"
-            ]
-        )
-    require("cluster")
-    from daemon.postflight.batch.dask_executor import DaskExecutor
-
-    console = Console(stderr=True, soft_wrap=True)
-    return DaskExecutor(
-        cluster_address(scheduler, ca, certificate, key),
-        announce=lambda sentence: console.print(sentence, highlight=False),
-    )
-
-
-def process_plan(
-    task_nbytes: int, tasks: int, processes: int | None, threads: int | None
-) -> ProcessAllocation:
-    """Processes and threads for so many tasks on this machine, as now loaded.
-
-    Raises:
-        ConfigurationError: more processes than memory.
-    """
-    from dataclasses import replace
-
-    from daemon.postflight.batch import capacity
-
-    cores, available = capacity.usable_cores(), capacity.available_memory_nbytes()
-    plan = capacity.plan_processes(
-        task_nbytes, tasks, cores=cores, available_nbytes=available, threads=threads
-    )
-    if processes is None:
-        return plan
-    if processes * task_nbytes > available and processes > 1:
-        raise ConfigurationError(
-            [
-                f"--processes {processes} needs {processes * task_nbytes / 1e9:.1f} GB of memory; "
-                f"{available / 1e9:.1f} GB are available. Give --processes {plan.processes}"
-            ]
-        )
-    own = threads or (min(2, cores) if processes == 0 else max(1, cores // processes))
-    return replace(plan, processes=processes, threads=own, reason="as requested")
+    run.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
+    run.__annotations__ = {one.name: one.annotation for one in parameters}
+    return run
 
 
 @contextmanager

@@ -10,18 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.progress import Progress
 
-from daemon.cli.batch_options import (
-    Processes,
-    Scheduler,
-    Threads,
-    TlsCa,
-    TlsCertificate,
-    TlsKey,
-    cluster_executor,
-    executor_for,
-    process_plan,
-    shown_progress,
-)
+from daemon.cli.batch_options import ExecutorOptions, takes_executor
 from daemon.cli.exit_status import exit_if_failed
 from daemon.cli.options import AsJson
 from daemon.configuration.model import ConfigurationError
@@ -46,6 +35,7 @@ Examples: `syntopic pansharpen MISSION`, `syntopic pansharpen MISSION --only 3 -
 """
 
 
+@takes_executor
 def pansharpen(
     mission: Annotated[Path, typer.Argument(help="Mission folder.")],
     only: Annotated[
@@ -55,15 +45,10 @@ def pansharpen(
     bits: Annotated[
         list[int] | None, typer.Option(help="Bits per sample: 16 or 8; repeatable.")
     ] = None,
-    threads: Threads = None,
-    processes: Processes = None,
-    scheduler: Scheduler = None,
-    tls_ca: TlsCa = None,
-    tls_certificate: TlsCertificate = None,
-    tls_key: TlsKey = None,
+    *,
+    where: ExecutorOptions,
     as_json: AsJson = False,
 ) -> None:
-    from daemon.postflight.batch.batch_run import run_batch
     from daemon.postflight.batch.executor import BatchTask
     from daemon.postflight.batch.pansharpen_work import PansharpenWork
     from daemon.products import level3
@@ -72,9 +57,7 @@ def pansharpen(
     images, depths = image or list(level3.IMAGES), bits or list(level3.DEPTHS)
     if set(images) - set(level3.IMAGES) or set(depths) - set(level3.DEPTHS):
         raise ConfigurationError(["--image is rgb or cir, --bits is 16 or 8"])
-    cluster = None
-    if scheduler is not None:
-        cluster = cluster_executor(scheduler, tls_ca, tls_certificate, tls_key, processes)
+    where.check()
     folder = Mission.open(mission)
     rig = load_rig(folder.rig_path)
     with folder.held():
@@ -90,14 +73,7 @@ def pansharpen(
         requested = dict.fromkeys(only or sorted(tones.scales))
         numbers = [number for number in requested if number not in unreadable_numbers]
         work = PansharpenWork(folder.path.absolute(), tones, tuple(images), tuple(depths))
-        placed = process_plan(work.memory_nbytes, len(numbers), processes, threads)
-        executor, own_threads = executor_for(placed, processes), placed.threads
-        if cluster is not None:
-            executor, own_threads = cluster, threads or 1
-        with shown_progress("pansharpening", len(numbers), 0) as show:
-            outcome = run_batch(
-                executor, work.with_threads(own_threads), [BatchTask(n) for n in numbers], show
-            )
+        outcome = where.run(work, [BatchTask(number) for number in numbers], "pansharpening")
     walked = outcome.results
     rows = [walked[number] for number in sorted(walked)]
     failures = (*unreadable, *outcome.failures)

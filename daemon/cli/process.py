@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from contextlib import nullcontext
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,16 +12,10 @@ from pydantic import ValidationError
 
 from daemon.cli.batch_options import (
     DryRun,
-    Processes,
-    Scheduler,
-    Threads,
-    TlsCa,
-    TlsCertificate,
-    TlsKey,
-    cluster_executor,
-    executor_for,
-    process_plan,
+    ExecutorOptions,
+    Placement,
     shown_progress,
+    takes_executor,
 )
 from daemon.cli.exit_status import exit_if_failed
 from daemon.cli.level2_tables import print_reports
@@ -39,7 +32,6 @@ from processing.rig.problem_sentences import findings_of, sentences
 
 if TYPE_CHECKING:
     from daemon.postflight.batch.capacity import ProcessAllocation
-    from daemon.postflight.batch.executor import BatchExecutor
     from daemon.postflight.batch.level2_sources import AnyLevel2Work, Level2Source
     from daemon.postflight.batch.level2_work import Level2Survey, Level2Work
 
@@ -67,6 +59,7 @@ Examples: `syntopic process MISSION`, `syntopic process MISSION --only 3 --metho
 """
 
 
+@takes_executor
 def process(
     mission: Annotated[str, typer.Argument(help="Mission folder, or its address in a store.")],
     only: Annotated[
@@ -89,15 +82,11 @@ def process(
     baselines: Annotated[
         bool, typer.Option(help="Comparison with the fixed method, with and without TDM.")
     ] = False,
-    threads: Threads = None,
-    processes: Processes = None,
     again: Annotated[bool, typer.Option("--again", help="Compute complete products again.")] = (
         False
     ),
-    scheduler: Scheduler = None,
-    tls_ca: TlsCa = None,
-    tls_certificate: TlsCertificate = None,
-    tls_key: TlsKey = None,
+    *,
+    where: ExecutorOptions,
     dry_run: DryRun = False,
     as_json: AsJson = False,
 ) -> None:
@@ -111,9 +100,7 @@ def process(
         raise ConfigurationError(
             [f"--method is free or fixed, --interpolation one of {', '.join(INTERPOLATIONS)}"]
         )
-    cluster = None
-    if scheduler is not None:
-        cluster = cluster_executor(scheduler, tls_ca, tls_certificate, tls_key, processes)
+    where.check()
     if is_store_url(mission):
         require("stores")
     with level2_source(mission if is_store_url(mission) else str(folder_of(mission))) as source:
@@ -139,26 +126,24 @@ def process(
         with nullcontext() if dry_run else source.writing():
             numbers = only or folder.numbers()
             found = source.survey(source.placed(work), numbers, overlaps_of(folder, work.rig))
-            placed = process_plan(work.memory_nbytes, len(found.pending), processes, threads)
+            placed = where.place(work.memory_nbytes, len(found.pending))
             if dry_run:
-                _print_dry_run(source, found, None if cluster else placed, as_json=as_json)
+                on_cluster = where.scheduler is not None
+                _print_dry_run(
+                    source, found, None if on_cluster else placed.allocation, as_json=as_json
+                )
                 return
-            executor = executor_for(placed, processes)
-            if cluster is not None:
-                executor = cluster
-                placed = replace(placed, threads=threads or 1, reason="its workers")
             if not (found.pending or found.complete):
                 _refuse_unsuitable(folder, work)
             placed_work = source.placed(work.with_threads(placed.threads))
-            _run(source, placed_work, found, executor, placed, as_json=as_json)
+            _run(source, placed_work, found, placed, as_json=as_json)
 
 
 def _run(
     source: Level2Source,
     work: AnyLevel2Work,
     found: Level2Survey,
-    executor: BatchExecutor,
-    placed: ProcessAllocation,
+    placed: Placement,
     *,
     as_json: bool,
 ) -> None:
@@ -166,12 +151,12 @@ def _run(
     from daemon.postflight.batch.batch_run import BatchOutcome, run_batch
     from processing.radiometry.calibration import CalibrationError
 
-    outcome, console = BatchOutcome(), Console(stderr=True)
+    outcome, console, executor = BatchOutcome(), Console(stderr=True), placed.executor
     complete = len(found.complete)
     if found.pending:
         console.print(
             f"{len(found.pending)} exposures to compute, {complete} complete; "
-            f"{executor.description}, {placed.threads} threads each ({placed.reason})",
+            f"{executor.description}, {placed.threads} threads each ({placed.allocation.reason})",
             highlight=False,
         )
         with shown_progress("processing", complete + len(found.pending), complete) as show:

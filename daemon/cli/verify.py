@@ -11,13 +11,7 @@ from rich.progress import Progress
 from rich.table import Table
 from rich.text import Text
 
-from daemon.cli.batch_options import (
-    Scheduler,
-    TlsCa,
-    TlsCertificate,
-    TlsKey,
-    cluster_executor,
-)
+from daemon.cli.batch_options import ExecutorOptions, Scheduler, TlsCa, TlsCertificate, TlsKey
 from daemon.cli.exit_status import status_of
 from daemon.cli.options import AsJson
 from daemon.cli.transfer import folder_of
@@ -82,9 +76,10 @@ def verify(
             folder = Mission.open(folder_of(mission), checks_subfolders=False)
             check_all: CheckAll = check_in_threads
             if scheduler is not None:
-                check_all = verified_by(
-                    cluster_executor(scheduler, tls_ca, tls_certificate, tls_key, processes)
+                where = ExecutorOptions(
+                    processes, None, scheduler, tls_ca, tls_certificate, tls_key
                 )
+                check_all = verified_by(where.cluster())
             elif processes is not None:
                 check_all = verified_by(LocalProcessExecutor(processes))
             report = store.verify(folder, show, check_all)

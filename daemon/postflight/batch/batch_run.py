@@ -10,9 +10,9 @@ import errno
 import heapq
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any, Final, TypeAlias
 
 from daemon.mission.exposure_batch import ExposureFailure, cause_of
 from daemon.mission.store.product_manifests import ClaimedElsewhereError
@@ -25,6 +25,7 @@ from daemon.postflight.batch.executor import (
     TaskLost,
     TaskOutcome,
 )
+from daemon.postflight.batch.in_process import InProcessExecutor
 
 LOSSES_MAX: Final = 3
 """Ends of the process that an exposure may cause; the last attempt is made with no other in work,
@@ -68,6 +69,38 @@ class BatchOutcome:
     failures: list[ExposureFailure] = field(default_factory=list)
     counts: BatchCounts = field(default_factory=BatchCounts)
     is_interrupted: bool = False
+
+
+Compute: TypeAlias = Callable[[BatchWork, Sequence[BatchTask]], BatchOutcome]
+"""Computes all tasks of a work somewhere; after Ctrl-C it raises KeyboardInterrupt."""
+
+
+def in_this_process(work: BatchWork, tasks: Sequence[BatchTask]) -> BatchOutcome:
+    """Compute tasks in this process, one at a time.
+
+    Args:
+        work: what is computed.
+        tasks: one for each exposure.
+
+    Raises:
+        KeyboardInterrupt: after Ctrl-C, when the task in work is finished.
+        Exception: the work cannot be opened.
+    """
+    return completed(run_batch(InProcessExecutor(1), work, tasks))
+
+
+def completed(outcome: BatchOutcome) -> BatchOutcome:
+    """The outcome of a run that was not interrupted.
+
+    Args:
+        outcome: of `run_batch`.
+
+    Raises:
+        KeyboardInterrupt: it was.
+    """
+    if outcome.is_interrupted:
+        raise KeyboardInterrupt
+    return outcome
 
 
 def run_batch(
@@ -176,7 +209,7 @@ class _Run:
             cure = (
                 "give fewer --processes or a machine with more memory"
                 if lost.kind == "out-of-memory"
-                else f"run it alone with --only {task.number} --processes 0 to see its messages"
+                else "repeat the command with --processes 0 to see its messages"
             )
             self._fail(task, f"quarantined after {count} attempts: {lost.cause}{alone}; {cure}")
         elif count == limit - 1 and limit == LOSSES_MAX:

@@ -41,6 +41,9 @@ class BatchWork(Protocol):
     @property
     def threads(self) -> int: ...
 
+    def with_threads(self, threads: int) -> BatchWork:
+        """The same work with another number of threads of one process."""
+
     def open(self) -> BatchAction:
         """Load calibrations and kernels; called once in each process.
 
