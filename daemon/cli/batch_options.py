@@ -233,6 +233,7 @@ def takes_executor(command: Callable[..., None]) -> Callable[..., None]:
         where = {field.name: given.pop(field.name) for field in fields(ExecutorOptions)}
         command(**given, where=ExecutorOptions(**where))
 
+    # typer reads it.
     run.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
     run.__annotations__ = {one.name: one.annotation for one in parameters}
     return run

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.progress import Progress
 
+from daemon.cli.batch_options import ExecutorOptions, takes_executor
 from daemon.cli.exit_status import exit_if_failed
 from daemon.cli.export_block import BLOCK_HELP, block
 from daemon.cli.export_gis import GIS_HELP, STAC_HELP, gis, stac
@@ -46,6 +46,10 @@ distance, principal point with axes and signs, pixel size, serial numbers, valid
 
 Example: `syntopic export certificate MISSION`
 """
+
+PICTURES_PER_PROCESS = 8
+ORIENTATIONS_PER_PROCESS = 5000
+"""So many exposures take longer than the start of a process."""
 
 app = typer.Typer(
     help="""Export a mission for other programs.
@@ -131,6 +135,7 @@ def foxglove(
 
 
 @app.command(help=PICTURES_HELP)
+@takes_executor
 def pictures(
     mission: Annotated[Path, typer.Argument(help="Mission folder with Level-2 or Level-3.")],
     kind: Annotated[str, typer.Option("--as", help="Format: cog, tiff, jp2 or jpeg.")] = "cog",
@@ -150,10 +155,13 @@ def pictures(
     only: Annotated[
         list[int] | None, typer.Option(help="Number of an exposure; repeatable.")
     ] = None,
+    *,
+    where: ExecutorOptions,
     as_json: AsJson = False,
 ) -> None:
     from daemon.mission.layout import Mission
-    from daemon.postflight.export.level2_export import KINDS, PictureError, export_pictures
+    from daemon.postflight.export.level2_export import KINDS, PictureError
+    from daemon.postflight.export.picture_export import export_pictures
 
     if kind not in KINDS:
         raise PictureError(f"--as is {kind!r}; {', '.join(KINDS)} are right")
@@ -163,9 +171,9 @@ def pictures(
         )
     if kind != "jpeg":
         require("geotiff")
+    where.check()
     folder = Mission.open(mission)
-    with folder.held(), Progress(console=Console(stderr=True), transient=True) as progress:
-        task = progress.add_task("writing", total=len(only or folder.numbers()))
+    with folder.held():
         files, failures = export_pictures(
             folder,
             kind,
@@ -178,7 +186,7 @@ def pictures(
             roll_pitch_yaw_sigma_deg=None
             if attitude_sigma is None
             else (attitude_sigma[0] * 1e-3, attitude_sigma[1] * 1e-3, attitude_sigma[2] * 1e-3),
-            progress=lambda count: progress.update(task, completed=count),
+            compute=where.compute("writing", PICTURES_PER_PROCESS),
         )
     if as_json:
         content = {
@@ -221,6 +229,7 @@ def certificate(
 
 
 @app.command(help=ORIENTATION_HELP)
+@takes_executor
 def orientation(
     mission: Annotated[Path, typer.Argument(help="Mission folder.")],
     trajectory: Annotated[
@@ -236,14 +245,16 @@ def orientation(
     dem: Annotated[
         Path | None, typer.Option(help="Height model for footprints: GeoTIFF or .asc.")
     ] = None,
+    *,
+    where: ExecutorOptions,
     as_json: AsJson = False,
 ) -> None:
     from daemon.mission.layout import Mission
     from daemon.postflight.export import orientation_set as orientation_export
 
+    where.check()
     folder = Mission.open(mission)
-    with folder.held(), Progress(console=Console(stderr=True), transient=True) as progress:
-        task = progress.add_task("orienting", total=len(folder.numbers()))
+    with folder.held():
         done = orientation_export.export_orientation(
             folder,
             crs=crs,
@@ -251,7 +262,7 @@ def orientation(
             receiver=receiver,
             mount_file=mount,
             dem_file=dem,
-            progress=lambda count: progress.update(task, completed=count),
+            compute=where.compute("orienting", ORIENTATIONS_PER_PROCESS),
         )
     if as_json:
         typer.echo(json.dumps(orientation_export.as_json(done)))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import uuid
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,13 +18,10 @@ import numpy as np
 
 from daemon import DaemonError
 from daemon.mission.exposure import Exposure
-from daemon.mission.exposure_batch import ExposureFailure, for_each_exposure
 from daemon.mission.layout import Mission, exposure_name
-from daemon.mission.store.durable import make_directories, replace_file
 from daemon.mission.store.level0 import read_description
-from daemon.orientation.exterior_orientation import ExteriorOrientation, sealed_exposures
+from daemon.orientation.exterior_orientation import ExteriorOrientation
 from daemon.orientation.georeference import Georeference
-from daemon.orientation.orientation_inputs import read_orientation_inputs
 from daemon.postflight.export.exif import PictureMetadata, RigPlace, with_metadata
 from daemon.postflight.export.picture_files import (
     SUFFIXES,
@@ -37,7 +34,7 @@ from daemon.products.level3 import IMAGES as LEVEL3_IMAGES
 from daemon.products.level3 import level3_root
 from processing.geometry.orientation import BODY_FROM_CAMERA, ENU_FROM_NED, on_level_ground
 from processing.geometry.rotation import omega_phi_kappa, roll_pitch_heading, rotation_matrix
-from processing.rig import Rig, load_rig
+from processing.rig import Rig
 
 KINDS = tuple(SUFFIXES)
 GRID = 5
@@ -73,101 +70,7 @@ class Level2Image:
     is_perspective: bool = True
 
 
-def export_pictures(
-    mission: Mission,
-    kind: str,
-    *,
-    crs: str | None = None,
-    trajectory_file: Path | None = None,
-    mount_file: Path | None = None,
-    only: Sequence[int] = (),
-    level: int = 2,
-    depth: int = 16,
-    roll_pitch_yaw_sigma_deg: tuple[float, float, float] | None = None,
-    progress: Callable[[int], None] = lambda _done: None,
-) -> tuple[list[Path], tuple[ExposureFailure, ...]]:
-    """Write every raster of a level as `kind` into `export/<kind>/`.
-
-    Args:
-        kind: "cog", "tiff", "jp2" or "jpeg".
-        level: 2, or 3 for pansharpened RGB and CIR.
-        depth: 16 or 8 bits of Level-3; Level-2 has 16.
-        roll_pitch_yaw_sigma_deg: standard deviations of attitude, where they are known.
-
-    Returns:
-        The files, and the exposures that could not be exported.
-
-    Raises:
-        PictureError: no Level-2, no orientation, or rasterio is missing.
-        TrajectoryError, GeoreferenceError: as their modules say.
-    """
-    read = sealed_exposures(mission)
-    exposures = {
-        number: exposure
-        for number, exposure in read.results.items()
-        if exposure.mark_gps_ns is not None and (not only or number in only)
-    }
-    unreadable = [f for f in read.failures if not only or f.exposure in only]
-    if level == 2 and (bands := _single_bands(mission, exposures)):
-        raise PictureError(
-            f"{mission.path}: Level-2 has registered bands as single rasters, which this command "
-            f"does not export; take L2/<exposure>/{bands[0]}.tif as it is, or heads with "
-            "orientation by `syntopic export block --images raw`"
-        )
-    inputs = read_orientation_inputs(
-        mission,
-        list(exposures.values()),
-        crs=crs,
-        trajectory_file=trajectory_file,
-        mount_file=mount_file,
-    )
-    rig = inputs.rig
-    folder = mission.export_dir / kind
-    make_directories(folder)
-
-    def export_one(number: int) -> list[Path]:
-        exposure, written = exposures[number], []
-        for picture in _pictures(mission, rig, exposure, inputs.oriented([exposure]), level, depth):
-            shot = metadata_of(
-                rig, picture, inputs.crs, simulated=exposure.simulated, mission_id=mission.id,
-                roll_pitch_yaw_sigma_deg=roll_pitch_yaw_sigma_deg,
-            )  # fmt: skip
-            final = folder / f"{picture.name}{SUFFIXES[kind]}"
-            if kind == "jpeg":
-                replace_file(final, jpeg_with_metadata(picture, shot))
-            else:
-                _raster(kind, picture, shot, inputs.georeference, inputs.ground_height_m, final)
-            written.append(final)
-        return written
-
-    done = for_each_exposure(exposures, export_one, progress)
-    files = [path for written in done.results.values() for path in written]
-    failures = (*unreadable, *done.failures)
-    if not files:
-        causes = "".join(f"; {cause}" for cause in dict.fromkeys(one.cause for one in failures))
-        raise PictureError(
-            f"{mission.path}: no exposure has both Level-{level} and an orientation; run "
-            f"`syntopic {'process' if level == 2 else 'pansharpen'}` first, and give --trajectory "
-            "where no receiver knew the attitude"
-            f"{causes}"
-        )
-    return files, failures
-
-
-def _single_bands(mission: Mission, exposures: Iterable[int]) -> list[str]:
-    """Bands that Level-2 has as a raster each, in the geometry of one; empty with other rasters."""
-    rig = load_rig(mission.rig_path)
-    if rig.virtual_image is not None:
-        return []
-    cones = {cone.name for cone in rig.cones}
-    bands = [band for cone in rig.cones for band in cone.bands if band not in cones]
-    folders = [mission.level2(number) for number in exposures]
-    if any((folder / f"{cone}.tif").exists() for folder in folders for cone in cones):
-        return []
-    return [b for b in bands if any((folder / f"{b}.tif").exists() for folder in folders)]
-
-
-def _pictures(
+def pictures_of(
     mission: Mission,
     rig: Rig,
     exposure: Exposure,
@@ -175,6 +78,19 @@ def _pictures(
     level: int,
     depth: int,
 ) -> Iterator[Level2Image]:
+    """Rasters of an exposure that are there and oriented.
+
+    Args:
+        mission: of the exposure.
+        rig: of the mission.
+        exposure: whose rasters.
+        oriented: orientations of its cones.
+        level: 2, or 3 for pansharpened RGB and CIR.
+        depth: 16 or 8 bits of Level-3.
+
+    Raises:
+        RasterError: a description cannot be read.
+    """
     folder = mission.level2(exposure.number)
     if level == 3:
         folder = level3_root(mission) / exposure_name(exposure.number)
@@ -317,7 +233,7 @@ def _rig_place(rig: Rig, eo: ExteriorOrientation, mission_id: str) -> RigPlace |
     )
 
 
-def _raster(
+def write_picture(
     kind: str,
     picture: Level2Image,
     shot: PictureMetadata,
@@ -325,6 +241,20 @@ def _raster(
     ground_m: float,
     final: Path,
 ) -> None:
+    """Write one raster with tags and ground control points.
+
+    Args:
+        kind: "cog", "tiff" or "jp2".
+        picture: what is written.
+        shot: its metadata.
+        georeference: system of the ground control points.
+        ground_m: height of the ground above the ellipsoid.
+        final: the file.
+
+    Raises:
+        RasterError: the raster cannot be read.
+        OSError: the disk refused.
+    """
     planes = read_planes(picture.path)
     _, height, width = planes.shape
     points = _ground_control(picture, georeference, ground_m, width, height)

@@ -7,7 +7,7 @@ post-processed trajectory arrives.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from daemon import DaemonError
 from daemon.configuration.model import MountSection
 from daemon.mission.canonical_json import plain_name, sha256_hex
 from daemon.mission.exposure import Exposure
-from daemon.mission.exposure_batch import ExposureFailure, for_each_exposure
+from daemon.mission.exposure_batch import ExposureFailure
 from daemon.mission.layout import Mission
 from daemon.mission.store.level2 import verdict_of, write_folder
 from daemon.orientation import footprints
@@ -40,9 +40,12 @@ from daemon.orientation.orientation_files import (
     csv_text,
     patb_text,
 )
-from daemon.orientation.orientation_inputs import OrientationError, read_orientation_inputs
+from daemon.orientation.orientation_inputs import OrientationError
 from daemon.orientation.stac_items import ItemContext, item_collection
 from daemon.orientation.trajectory import flown_trajectory
+from daemon.postflight.batch.batch_run import Compute, in_this_process
+from daemon.postflight.batch.executor import BatchTask
+from daemon.postflight.export.orientation_work import OrientationWork, orientation_request
 from processing.geometry.rotation import vectors_from_rotations
 from processing.rig import Rig
 
@@ -75,7 +78,7 @@ def export_orientation(
     receiver: str | None = None,
     mount_file: Path | None = None,
     dem_file: Path | None = None,
-    progress: Callable[[int], None] = lambda _done: None,
+    compute: Compute = in_this_process,
 ) -> OrientationSet:
     """Orient all sealed exposures and write the set.
 
@@ -85,7 +88,7 @@ def export_orientation(
         receiver: whose navigation, where the flight had several.
         mount_file: TOML with a `[mount]` in place of the one that was flown.
         dem_file: height model that footprints are followed to, in the same system.
-        progress: called with the number of exposures done.
+        compute: where exposures are oriented.
 
     Raises:
         OrientationError: no exposure could be oriented.
@@ -93,7 +96,7 @@ def export_orientation(
     """
     read = sealed_exposures(mission)
     exposures = list(read.results.values())
-    inputs = read_orientation_inputs(
+    request = orientation_request(
         mission,
         exposures,
         crs=crs,
@@ -101,12 +104,13 @@ def export_orientation(
         mount_file=mount_file,
         receiver=receiver,
     )
+    inputs = request.read()
     rig, trajectory, georeference = inputs.rig, inputs.trajectory, inputs.georeference
-    done = for_each_exposure(
-        read.results, lambda number: list(inputs.of(read.results[number])), progress
+    done = compute(
+        OrientationWork(request), [BatchTask(number, one) for number, one in read.results.items()]
     )
     failures = (*read.failures, *done.failures)
-    found = [one for of_exposure in done.results.values() for one in of_exposure]
+    found = [one for number in sorted(done.results) for one in done.results[number]]
     oriented = tuple(one for one in found if isinstance(one, ExteriorOrientation))
     missing = tuple(one for one in found if isinstance(one, MissingOrientation))
     if not oriented:
