@@ -29,13 +29,13 @@ from daemon.orientation.exterior_orientation import sealed_exposures
 from daemon.orientation.local_frame import LocalFrame
 from daemon.postflight.triangulation.triangulation import (
     TriangulationSettings,
-    attitude_sigmas,
     block_of,
     match_mission_block,
     project_of,
     weight_by_residuals,
 )
 from processing.bundle.adjust import adjust
+from processing.bundle.camera_orientations import camera_orientations
 from processing.bundle.initial_values import completed
 from processing.bundle.measured_points import measured_point
 from processing.geometry.rotation import vectors_from_rotations
@@ -43,14 +43,14 @@ from processing.matching.block_matching import image_mm
 from processing.rig import VirtualImage, shipped_rigs
 from sim_hw.processes.exposures import EPOCH_GPS_NS, FIRST_AFTER_S
 from sim_hw.world.flight import Pose, SimulatedFlight
-from sim_hw.world.post_processed_trajectory import COLUMNS, marks_of_lines
+from sim_hw.world.post_processed_trajectory import marks_of_lines
 from sim_hw.world.world import World, WorldSettings
 from tests.daemon.flown_block import (
     FlownBlock,
     GroundPoints,
     ground_points,
-    read_record,
     write_flown,
+    write_navigation,
 )
 
 Array = NDArray[np.float64]
@@ -59,7 +59,6 @@ Indices = NDArray[np.int64]
 MEASURED_PX = 0.1
 """Sigma of a measured image coordinate."""
 TURN_S = 120
-AROUND, STEP_NS = 20, 10_000_000
 CONFIDENCE = 0.999
 
 
@@ -142,30 +141,6 @@ def fly(folder: Path, each: int, lines: int, crossings: int, seed: int) -> Flown
     return write_flown(folder, world, crossed, marks, names)
 
 
-def write_navigation(flown: FlownBlock) -> Path:
-    """The navigation of the records as a trajectory, with the same errors; its file."""
-    path = flown.mission.parent / "trajectory.csv"
-    keys = ("latitude_deg", "longitude_deg", "height_m", "roll_rad", "pitch_rad", "heading_rad")
-    rows = []
-    for number, mark in enumerate(flown.marks, 1):
-        navigation = read_record(flown.mission, number)["navigation"]
-        recorded = np.array([navigation[key] for key in keys])
-        error = recorded - _navigation(flown, mark)
-        for step in range(-AROUND, AROUND + 1):
-            instant = mark + step * STEP_NS
-            values = _navigation(flown, instant) + error
-            values[3:] = np.degrees(values[3:])
-            rows.append(",".join([str(instant), *(repr(float(v)) for v in values)]))
-    path.write_text("\n".join([",".join(COLUMNS), *rows]) + "\n")
-    return path
-
-
-def _navigation(flown: FlownBlock, gps_ns: int) -> Array:
-    """True latitude, longitude, height, roll, pitch and heading (deg, m, rad), (6,)."""
-    pose = flown.flight.pose(gps_ns)
-    return np.array([*flown.flight.geodetic(pose.position_enu_m), *flown.flight.attitude_rad(pose)])
-
-
 def live(mission: Path) -> tuple[Orientations, Array, dict[str, Any]]:
     """The live triangulation at landing.
 
@@ -198,7 +173,7 @@ def live(mission: Path) -> tuple[Orientations, Array, dict[str, Any]]:
         np.array([one.image.number for one in own]),
         np.array([one.position_m for one in own]),
         np.array([one.rotation for one in own]),
-        block.last.covariance(),
+        block.last.cameras.covariance(),
     )
     return found, block.image_sigma_px, figures
 
@@ -207,17 +182,11 @@ def after_landing(mission: Path, trajectory: Path) -> tuple[Orientations, dict[s
     """As `syntopic triangulate`."""
     begun = time.perf_counter()
     block = block_of(Mission.open(mission), trajectory_file=trajectory)
-    settings = TriangulationSettings(attitude_sigma_rad=attitude_sigmas((5.0, 5.0, 8.0)))
+    settings = TriangulationSettings()
     tied = match_mission_block(block, settings.matching, lambda _done: None)
     project = weight_by_residuals(project_of(block, tied, settings), tied.points)
     done = adjust(completed(project.network), project.settings)
-    columns = np.concatenate(
-        [
-            np.concatenate([done.layout.station[k], done.layout.attitude[k]])
-            for k in range(len(block.names))
-        ]
-    )
-    covariance = done.sigma0**2 * done.cofactor[np.ix_(columns, columns)]
+    cameras = camera_orientations(done)
     figures = {
         "seconds": time.perf_counter() - begun,
         "sigma0": done.sigma0,
@@ -227,7 +196,7 @@ def after_landing(mission: Path, trajectory: Path) -> tuple[Orientations, dict[s
     number = np.array([eo.exposure for eo in block.oriented])
     return (
         Orientations(
-            block.frame, number, done.state.station, done.state.attitude, np.asarray(covariance)
+            block.frame, number, cameras.station_m, cameras.rotation, cameras.covariance()
         ),
         figures,
     )

@@ -48,13 +48,13 @@ def intersect(
     as_json: AsJson = False,
 ) -> None:
     from daemon.mission.layout import Mission
+    from daemon.orientation.navigation_sigmas import attitude_sigmas
     from daemon.postflight.adjustment.csv_tables import write_table
     from daemon.postflight.triangulation.space_intersection import (
         IntersectionError,
         IntersectionSigmas,
     )
     from daemon.postflight.triangulation.space_intersection import intersect as intersected
-    from daemon.postflight.triangulation.triangulation import attitude_sigmas
 
     if out is not None and out.exists():
         raise IntersectionError(f"{out} exists; give another name with --out")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast
 
@@ -14,7 +15,6 @@ from rich.progress import Progress
 from daemon.cli.exit_status import ExitStatus, exit_if_failed
 from daemon.cli.options import (
     AsJson,
-    AttitudeSigma,
     Crs,
     MountFile,
     Trajectory,
@@ -24,6 +24,9 @@ from daemon.configuration.model import ConfigurationError
 from daemon.terminal.console import Console
 
 if TYPE_CHECKING:
+    from daemon.mission.layout import Mission
+    from daemon.orientation.navigation_sigmas import NavigationSigmas
+    from processing.bundle.flown_network import GnssDrift
     from processing.bundle.self_calibration import SetName
 
 HELP = """Triangulate the stitched PAN images of a mission, or the images of its heads.
@@ -53,7 +56,6 @@ Examples: `syntopic triangulate MISSION --trajectory sbet.out`,
 `syntopic triangulate MISSION --set sensors-full --points points.csv --measured measured.csv`
 """
 
-FLOWN_SIGMA_M = (0.05, 0.05, 0.08)
 SETS = ("none", "radial", "sensors", "sensors-full")
 
 
@@ -90,11 +92,33 @@ def triangulate(
     position_sigma: Annotated[
         tuple[float, float, float] | None,
         typer.Option(
-            help="Standard deviation of positions in m: east north up (default: 0.05 0.05 0.08, of "
-            "photographs 3 3 5)."
+            help="Standard deviation of positions in m: east north up (default: as the receiver "
+            "states, else as configured, 0.05 0.05 0.08; of photographs 3 3 5)."
         ),
     ] = None,
-    attitude_sigma: AttitudeSigma = (5.0, 5.0, 8.0),
+    attitude_sigma: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(
+            help="Standard deviation of roll, pitch, heading in mdeg (default: as configured, 5 5 "
+            "8)."
+        ),
+    ] = None,
+    boresight_sigma: Annotated[
+        float | None,
+        typer.Option(
+            help="Standard deviation of the calibrated boresight's angles in mdeg (default: as "
+            "configured, 6).",
+            min=1e-3,
+        ),
+    ] = None,
+    lever_sigma: Annotated[
+        float | None,
+        typer.Option(
+            help="Standard deviation of the calibrated lever arm in m (default: as configured, "
+            "0.02).",
+            min=1e-6,
+        ),
+    ] = None,
     search: Annotated[
         int, typer.Option(help="Search radius around the prediction in pixels.", min=4, max=200)
     ] = 24,
@@ -109,17 +133,19 @@ def triangulate(
     ] = False,
     as_json: AsJson = False,
 ) -> None:
+    from daemon.mission.layout import Mission
+
+    folder = Mission.open(mission)
     if live:
         from daemon.cli.triangulate_live import triangulate_live
 
+        sigmas = _sigmas(folder, position_sigma, attitude_sigma, boresight_sigma, lever_sigma)
         triangulate_live(
-            mission, position_sigma or FLOWN_SIGMA_M, attitude_sigma, trajectory,
-            points=points, measured=measured, as_json=as_json,
-        )  # fmt: skip
+            folder, sigmas, trajectory, points=points, measured=measured, as_json=as_json
+        )
         return
     from daemon.cli.adjust import _peak_mib
     from daemon.cli.triangulate_photographs import POSITION_SIGMA_M, triangulate_photographs
-    from daemon.mission.layout import Mission
     from daemon.postflight.adjustment.csv_tables import ProjectError
     from daemon.postflight.adjustment.summary import print_report, report_of
     from daemon.postflight.importers.photographs import is_photographs
@@ -131,7 +157,6 @@ def triangulate(
     from daemon.postflight.triangulation.triangulation import (
         TriangulationError,
         TriangulationSettings,
-        attitude_sigmas,
         block_of,
         match_mission_block,
         project_of,
@@ -148,7 +173,6 @@ def triangulate(
             [f"--set is one of {', '.join(SETS)}; --gnss is none, shift or linear"]
         )
     begun = time.perf_counter()
-    folder = Mission.open(mission)
     of_photographs = is_photographs(folder)
     name = "photographs" if of_photographs else set_name
     results = out or folder.export_dir / "triangulation" / name
@@ -156,7 +180,6 @@ def triangulate(
         raise ProjectError(
             [f"{results} holds a triangulation already; give another folder with --out"]
         )
-    position_sigma = position_sigma or (POSITION_SIGMA_M if of_photographs else FLOWN_SIGMA_M)
     if of_photographs:
         triangulate_photographs(
             folder,
@@ -164,7 +187,7 @@ def triangulate(
             points=points,
             measured=measured,
             crs=crs,
-            position_sigma_m=position_sigma,
+            position_sigma_m=position_sigma or POSITION_SIGMA_M,
             reject_beyond=reject,
             as_json=as_json,
         )
@@ -172,9 +195,8 @@ def triangulate(
     requirements = TriangulationSettings(
         parameters=cast("SetName", set_name),
         interior=interior,
-        position_sigma_m=position_sigma,
-        attitude_sigma_rad=attitude_sigmas(attitude_sigma),
-        drift=gnss,
+        sigmas=_sigmas(folder, position_sigma, attitude_sigma, boresight_sigma, lever_sigma),
+        drift=cast("GnssDrift", gnss),
         reject_beyond=reject,
         matching=BlockMatching(first_search_px=search),
     )
@@ -230,6 +252,27 @@ def triangulate(
     console.print(f"Results: {results}, report {results / 'report.html'}", soft_wrap=True)
     exit_if_failed(block.failures)
     _exit_if_not_final(result.problems)
+
+
+def _sigmas(
+    mission: Mission,
+    position_m: tuple[float, float, float] | None,
+    attitude_mdeg: tuple[float, float, float] | None,
+    boresight_mdeg: float | None,
+    lever_arm_m: float | None,
+) -> NavigationSigmas:
+    """Standard deviations as configured for the flight, or as given."""
+    from daemon.orientation.navigation_sigmas import flown_sigmas
+
+    flown = flown_sigmas(mission)
+    return replace(
+        flown,
+        position_m=position_m or flown.position_m,
+        attitude_mdeg=attitude_mdeg or flown.attitude_mdeg,
+        boresight_mdeg=boresight_mdeg or flown.boresight_mdeg,
+        lever_arm_m=lever_arm_m or flown.lever_arm_m,
+        uses_stated=position_m is None,
+    )
 
 
 def _exit_if_not_final(problems: Sequence[str]) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import typer
@@ -14,11 +14,14 @@ from rich.progress import Progress
 from daemon.cli.exit_status import ExitStatus, exit_if_failed
 from daemon.terminal.console import Console, light_table
 
+if TYPE_CHECKING:
+    from daemon.mission.layout import Mission
+    from daemon.orientation.navigation_sigmas import NavigationSigmas
+
 
 def triangulate_live(
-    mission: Path,
-    position_sigma: tuple[float, float, float],
-    attitude_sigma: tuple[float, float, float],
+    folder: Mission,
+    sigmas: NavigationSigmas,
     trajectory: Path | None,
     *,
     points: Path | None = None,
@@ -26,18 +29,13 @@ def triangulate_live(
     as_json: bool,
 ) -> None:
     """Replay the live triangulation of a mission and write its files."""
-    from daemon.mission.layout import Mission
     from daemon.onboard.live_orthomosaic.mission_map import MissionMap
     from daemon.onboard.triangulation.live_record import summary_json, write_live
-    from daemon.onboard.triangulation.measured_images import SensorSigmas
     from daemon.onboard.triangulation.mission_triangulation import MissionTriangulation
     from daemon.orientation.exterior_orientation import sealed_exposures
     from daemon.orientation.orientation_inputs import trajectory_of
     from processing.pipelines.live_triangulation import LiveSettings
 
-    folder = Mission.open(mission)
-    plan_m = float(np.hypot(*position_sigma[:2]) / np.sqrt(2.0))
-    sigmas = SensorSigmas(plan_m, position_sigma[2], attitude_sigma)
     read = sealed_exposures(folder)
     source = (
         None if trajectory is None else trajectory_of(folder, read.results.values(), trajectory)

@@ -14,53 +14,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.bundle.adjust import Adjustment, AdjustmentSettings, adjust
-from processing.bundle.initial_values import intersect
-from processing.bundle.network import (
-    Attitudes,
-    CameraModel,
-    Gnss,
-    HeadMounting,
-    ImagePoints,
-    Images,
-    MeasuredAttitudes,
-    Network,
-    Points,
-    Stations,
+from processing.bundle.camera_orientations import CameraOrientations, camera_orientations
+from processing.bundle.flown_network import (
+    MeasuredOrientations,
+    MountingPrior,
+    flown_exposures,
 )
-from processing.geometry.rotation import skew, vectors_from_rotations
+from processing.bundle.initial_values import intersect
+from processing.bundle.network import CameraModel, ImagePoints, Images, Network, Points
+from processing.geometry.rotation import vectors_from_rotations
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 _GNSS_GROUPS: Final = (4, 5)
 _ATTITUDE_GROUP: Final = 6
-
-
-@dataclass(frozen=True)
-class MeasuredOrientations:
-    """Orientations of n images as measured.
-
-    Attributes:
-        position_m: (n, 3) projection centres, object system.
-        rotation: (n, 3, 3) object from camera.
-        position_sigma_m: (n, 3); infinite where nothing was measured.
-        attitude_sigma_rad: (n, 3) about the camera's axes; infinite likewise.
-        is_mounted: (n,) the mounting applies; not so to orientations that were adjusted before.
-    """
-
-    position_m: Array
-    rotation: Array
-    position_sigma_m: Array
-    attitude_sigma_rad: Array
-    is_mounted: NDArray[np.bool_]
-
-
-@dataclass(frozen=True)
-class MountingPrior:
-    """Standard deviations of the calibrated boresight (rad) and lever arm (m), by coordinate."""
-
-    boresight_sigma_rad: float = 1e-4
-    lever_arm_sigma_m: float = 0.02
 
 
 @dataclass(frozen=True)
@@ -94,9 +62,7 @@ class BlockAdjustment:
 
     Attributes:
         result: the adjustment with all its statistics.
-        station_m, rotation: (n, 3), (n, 3, 3), of the camera, mounting applied.
-        jacobian: (6 n, columns) of projection centres (m) and rotation vectors about the camera's
-            axes (rad), three and three by image.
+        cameras: orientations of the images with their covariance, mounting applied.
         points: the points that were adjusted, as numbered by the caller.
         xyz_m, xyz_sigma_m: (points, 3).
         rejected: (m,) image points that contradict the others.
@@ -105,9 +71,7 @@ class BlockAdjustment:
     """
 
     result: Adjustment
-    station_m: Array
-    rotation: Array
-    jacobian: Array
+    cameras: CameraOrientations
     points: Indices
     xyz_m: Array
     xyz_sigma_m: Array
@@ -119,37 +83,6 @@ class BlockAdjustment:
     def sigma0(self) -> float:
         """A posteriori standard deviation of unit weight."""
         return self.result.sigma0
-
-    @property
-    def variance_factor(self) -> float:
-        """Factor on cofactors: never below one, since the measured orientations keep their sigmas
-        where image points fit better than expected."""
-        return max(1.0, self.sigma0) ** 2
-
-    def covariance(self) -> Array:
-        """Full covariance of all orientations.
-
-        Returns:
-            Shape (6 n, 6 n), m and rad.
-        """
-        return np.asarray(
-            self.variance_factor * self.jacobian @ self.result.cofactor @ self.jacobian.T
-        )
-
-    def covariances(self) -> Array:
-        """Covariance of each orientation by itself.
-
-        Returns:
-            Shape (n, 6, 6), m and rad.
-        """
-        n = len(self.station_m)
-        own = np.empty((n, 6, 6))
-        for k in range(n):
-            part = self.jacobian[6 * k : 6 * k + 6]
-            columns = np.flatnonzero(part.any(axis=0))
-            block = part[:, columns]
-            own[k] = block @ self.result.cofactor[np.ix_(columns, columns)] @ block.T
-        return np.asarray(self.variance_factor * own)
 
 
 @dataclass(frozen=True)
@@ -196,30 +129,18 @@ def adjust_images(
 
     Source: docs/explanation/mathematics/bundle.md#adjustment.
     """
-    station, rotation = start or (measured.position_m, measured.rotation)
     points, point = np.unique(ties.point, return_inverse=True)
-    n = len(station)
+    n = len(measured.position_m)
     names = tuple(str(k) for k in range(n))
     every = np.arange(n)
-    head = np.where(measured.is_mounted & (prior is not None), 0, -1)
-    mount: tuple[HeadMounting, ...] = ()
-    if prior is not None and (head == 0).any():
-        mount = (
-            HeadMounting(
-                "mounting", np.eye(3), np.zeros(3),
-                rotation_free=True, offset_free=True,
-                rotation_sigma_rad=prior.boresight_sigma_rad,
-                offset_sigma_m=prior.lever_arm_sigma_m,
-            ),
-        )  # fmt: skip
-    else:
-        head = np.full(n, -1)
+    flown = flown_exposures(names, measured, prior, start=start)
     sigma = np.tile(ties.sigma_mm, (len(ties.xy_mm), 1))
     network = Network(
         cameras=(CameraModel("camera", f_mm),),
-        stations=Stations(names, station, np.zeros(n, dtype=bool)),
-        attitudes=Attitudes(names, rotation, np.zeros(n, dtype=bool)),
-        images=Images(names, every, every, np.zeros(n, dtype=np.int64), head.astype(np.int64)),
+        stations=flown.stations,
+        attitudes=flown.attitudes,
+        images=Images(names, every, every, np.zeros(n, dtype=np.int64),
+                      np.full(n, 0 if flown.heads else -1)),
         points=Points(
             tuple(str(k) for k in range(len(points))),
             xyz_m[points],
@@ -227,14 +148,9 @@ def adjust_images(
             np.zeros(len(points), dtype=bool),
         ),
         image_points=ImagePoints(ties.image, point.astype(np.int64), ties.xy_mm, sigma),
-        heads=mount,
-        gnss=Gnss(
-            every, every, measured.position_m, measured.position_sigma_m, np.zeros((n, 3)),
-            np.full(n, -1), np.zeros(n),
-        ),
-        measured_attitudes=MeasuredAttitudes(
-            every, measured.rotation, measured.attitude_sigma_rad
-        ),
+        heads=flown.heads,
+        gnss=flown.gnss,
+        measured_attitudes=flown.measured_attitudes,
     )  # fmt: skip
     result = adjust(network, AdjustmentSettings(reject_beyond=reject_beyond, max_rounds=rounds))
     return _of(result, points, prior)
@@ -304,45 +220,22 @@ def added_parameters(
 
 
 def _of(result: Adjustment, points: Indices, prior: MountingPrior | None) -> BlockAdjustment:
-    network, layout, state = result.network, result.layout, result.state
-    n, columns = len(network.images.names), layout.columns
-    station, rotation = state.station.copy(), state.attitude.copy()
-    jacobian = np.zeros((6 * n, columns))
     mounting = None
-    for k in range(n):
-        rows = slice(6 * k, 6 * k + 3), slice(6 * k + 3, 6 * k + 6)
-        turn, offset = np.eye(3), np.zeros(3)
-        if network.images.head[k] == 0:
-            turn, offset = state.head_rotation[0], state.head_offset[0]
-            _fill(jacobian, rows[0], layout.head_offset[0], state.attitude[k])
-            _fill(jacobian, rows[1], layout.head_rotation[0], np.eye(3))
-        _fill(jacobian, rows[0], layout.station[k], np.eye(3))
-        _fill(jacobian, rows[0], layout.attitude[k], -state.attitude[k] @ skew(offset[None])[0])
-        _fill(jacobian, rows[1], layout.attitude[k], turn.T)
-        station[k] = state.station[k] + state.attitude[k] @ offset
-        rotation[k] = state.attitude[k] @ turn
-    if network.heads and prior is not None:
+    if result.network.heads and prior is not None:
         mounting = _mounting(result, prior)
     factor = {g.name: g.factor for g in result.groups if np.isfinite(g.factor)}
     unit = max(1.0, result.sigma0)
     spread = np.sqrt(np.clip(np.einsum("pii->pi", result.point_cofactor), 0.0, None))
     return BlockAdjustment(
         result,
-        station,
-        rotation,
-        jacobian,
+        camera_orientations(result),
         points,
-        state.points,
+        result.state.points,
         np.where(result.left_out[:, None], np.nan, unit * spread),
-        result.rejected | result.left_out[network.image_points.point],
+        result.rejected | result.left_out[result.network.image_points.point],
         (float(factor.get("image x", 1.0)), float(factor.get("image y", 1.0))),
         mounting,
     )
-
-
-def _fill(jacobian: Array, rows: slice, columns: Indices, block: Array) -> None:
-    if (columns >= 0).all():
-        jacobian[rows, columns] = block
 
 
 def _mounting(result: Adjustment, prior: MountingPrior) -> AdjustedMounting:

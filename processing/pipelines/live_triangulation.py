@@ -15,12 +15,11 @@ from numpy.typing import NDArray
 from processing import ProcessingError
 from processing.bundle.block_adjustment import (
     BlockAdjustment,
-    MeasuredOrientations,
-    MountingPrior,
     TieObservations,
     adjust_images,
     intersected,
 )
+from processing.bundle.flown_network import MeasuredOrientations, MountingPrior
 from processing.geometry.rotation import rotations_from_vectors
 from processing.matching.block_matching import image_mm
 from processing.matching.growing_block import GrowingBlock, GrowingSettings, ImageTies
@@ -268,7 +267,6 @@ class LiveTriangulation:
             np.array([one.rotation for one in images]),
             np.array([one.position_sigma_m for one in images]),
             np.array([one.attitude_sigma_rad for one in images]),
-            np.ones(len(images), dtype=bool),
         )
 
     def _adjust(self, own: Indices, source: Source) -> BlockAdjustment | None:
@@ -305,15 +303,15 @@ class LiveTriangulation:
     ) -> None:
         used = ~done.rejected
         count = np.bincount(ties.image[used], minlength=len(own))
-        covariances = done.covariances()
+        covariances = done.cameras.covariances()
         for at, k in enumerate(own):
             before = self.orientations[k]
             if source == "window" and before.source == "block":
                 continue  # the block is the better result, and its covariance is whole
             self.orientations[k] = LiveOrientation(
                 before.image,
-                done.station_m[at],
-                done.rotation[at],
+                done.cameras.station_m[at],
+                done.cameras.rotation[at],
                 covariances[at],
                 source if count[at] else "measured",
                 int(count[at]),

@@ -20,7 +20,7 @@ from processing.rig import shipped_rigs
 from sim_hw.processes.exposures import EPOCH_GPS_NS, FIRST_AFTER_S
 from sim_hw.world import true_camera
 from sim_hw.world.flight import SimulatedFlight
-from sim_hw.world.post_processed_trajectory import marks_of_lines
+from sim_hw.world.post_processed_trajectory import COLUMNS, marks_of_lines
 from sim_hw.world.rendering import render_ideal
 from sim_hw.world.scene import open_scene
 from sim_hw.world.world import World, WorldSettings
@@ -30,6 +30,7 @@ Array = NDArray[np.float64]
 POSITION_M = np.array([0.05, 0.05, 0.08])
 ATTITUDE_DEG = np.array([0.005, 0.005, 0.008])
 BORESIGHT_DEG = 0.0057
+AROUND, STEP_NS = 20, 10_000_000
 MARGIN_PX = 20
 """Points nearer to the edge of an image are not measured in it."""
 
@@ -94,6 +95,30 @@ def write_flown(
     plan = f"[plan]\nground_height_m = {world.plan.ground_height_m}\n"
     (mission / "service.toml").write_text(plan)
     return FlownBlock(mission, world, flight, marks, np.array(place), np.array(rotation))
+
+
+def write_navigation(flown: FlownBlock) -> Path:
+    """The navigation of the records as a trajectory, with the same errors; its file."""
+    path = flown.mission.parent / "trajectory.csv"
+    keys = ("latitude_deg", "longitude_deg", "height_m", "roll_rad", "pitch_rad", "heading_rad")
+    rows = []
+    for number, mark in enumerate(flown.marks, 1):
+        navigation = read_record(flown.mission, number)["navigation"]
+        recorded = np.array([navigation[key] for key in keys])
+        error = recorded - _navigation(flown, mark)
+        for step in range(-AROUND, AROUND + 1):
+            instant = mark + step * STEP_NS
+            values = _navigation(flown, instant) + error
+            values[3:] = np.degrees(values[3:])
+            rows.append(",".join([str(instant), *(repr(float(v)) for v in values)]))
+    path.write_text("\n".join([",".join(COLUMNS), *rows]) + "\n")
+    return path
+
+
+def _navigation(flown: FlownBlock, gps_ns: int) -> Array:
+    """True latitude, longitude, height, roll, pitch and heading (deg, m, rad), (6,)."""
+    pose = flown.flight.pose(gps_ns)
+    return np.array([*flown.flight.geodetic(pose.position_enu_m), *flown.flight.attitude_rad(pose)])
 
 
 @dataclass(frozen=True)

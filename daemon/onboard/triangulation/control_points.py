@@ -180,7 +180,7 @@ def residuals_of(
     index = {number: k for k, number in enumerate(numbers)}
     station = np.array([live.orientations[k].position_m for k in live.last_images])
     rotation = np.array([live.orientations[k].rotation for k in live.last_images])
-    covariance = live.last.covariance() if measured is not None else np.zeros((0, 0))
+    covariance = live.last.cameras.covariance() if measured is not None else np.zeros((0, 0))
     _, ties, ties_sigma = live.tied_points()
     found = []
     for p, (name, role) in enumerate(zip(surveyed.names, surveyed.roles, strict=True)):

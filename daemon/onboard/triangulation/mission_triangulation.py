@@ -42,13 +42,14 @@ from daemon.onboard.triangulation.findings import (
 )
 from daemon.onboard.triangulation.flown_lines import FlownLines
 from daemon.onboard.triangulation.ground_coverage import GroundCoverage, coverage_of
-from daemon.onboard.triangulation.measured_images import SensorSigmas, measured_image, oriented
+from daemon.onboard.triangulation.measured_images import measured_image, oriented
 from daemon.orientation.exterior_orientation import (
     NavigationSource,
     mount_of,
     sealed_exposure,
 )
 from daemon.orientation.local_frame import LocalFrame
+from daemon.orientation.navigation_sigmas import NavigationSigmas
 from daemon.planning.plan_readers import read_plan
 from daemon.planning.relief import TerrainRelief, relief_of
 from processing import ProcessingError
@@ -100,8 +101,8 @@ class MissionTriangulation:
 
     Args:
         mission: its folder.
-        settings: of the triangulation.
-        sigmas: of navigation, where the receiver states none.
+        settings: of the triangulation; its prior of the mounting is that of `sigmas`.
+        sigmas: of navigation and mounting.
         trajectory: in place of the navigation in the records.
         control: table of control and check points, with which the block is compared.
         measured: table of their image coordinates.
@@ -114,13 +115,14 @@ class MissionTriangulation:
 
     mission: Mission
     settings: LiveSettings = field(default_factory=LiveSettings)
-    sigmas: SensorSigmas = field(default_factory=SensorSigmas)
+    sigmas: NavigationSigmas = field(default_factory=NavigationSigmas)
     trajectory: NavigationSource | None = None
     control: Path | None = None
     measured: Path | None = None
     on_image: Callable[[LiveOrientation, NDArray[np.uint16]], None] | None = None
 
     def __post_init__(self) -> None:
+        self.settings = replace(self.settings, prior=self.sigmas.prior)
         self.rig: Rig = load_rig(self.mission.rig_path)
         if self.rig.virtual_image is None:
             raise LiveTriangulationError(

@@ -36,14 +36,13 @@ from daemon.onboard.service.messages import (
 from daemon.onboard.service.processes import ServiceConnection
 from daemon.onboard.triangulation.findings import CUT_OFF, NOT_SEALED
 from daemon.onboard.triangulation.live_record import summary_json, write_live
-from daemon.onboard.triangulation.measured_images import SensorSigmas
 from daemon.onboard.triangulation.mission_triangulation import (
     ExposureTriangulated,
     MissionTriangulation,
 )
 from daemon.orientation.exterior_orientation import sealed_exposure
+from daemon.orientation.navigation_sigmas import navigation_sigmas
 from daemon.products.processing_threads import configure_threads
-from processing.bundle.block_adjustment import MountingPrior
 from processing.pipelines.live_triangulation import LiveSettings
 
 NICENESS: Final = 19
@@ -116,15 +115,8 @@ class _Work:
     ) -> None:
         self._link, self._tasks, self._landing = link, tasks, landing
         folder = Mission(mission, mission.name)
-        settings = LiveSettings(
-            prior=MountingPrior(
-                math.radians(section.boresight_sigma_mdeg * 1e-3), section.lever_arm_sigma_m
-            ),
-            images_max=section.exposures_max,
-        )
-        sigmas = SensorSigmas(
-            section.position_sigma_m, section.height_sigma_m, section.attitude_sigma_mdeg
-        )
+        settings = LiveSettings(images_max=section.exposures_max)
+        sigmas = navigation_sigmas(section)
         self._map: MissionMap | None = None
         try:
             self._done: MissionTriangulation | None = MissionTriangulation(

@@ -38,6 +38,7 @@ from daemon.postflight.calibration.calibration_report import (
 )
 from daemon.postflight.plots import Curve, chart_svg
 from processing.bundle.adjust import Adjustment
+from processing.bundle.flown_network import MOUNTING
 from processing.bundle.network import Network, no_gnss, no_measured_attitudes
 from processing.calibration.boresight import (
     PARAMETERS,
@@ -86,8 +87,13 @@ class BoresightComparison:
 
 
 def control_only(network: Network) -> Network:
-    """The network without antenna positions and attitudes."""
-    return replace(network, gnss=no_gnss(), measured_attitudes=no_measured_attitudes())
+    """The network without antenna positions and attitudes, and without corrections of the mounting
+    against them: exposures are then those of the camera."""
+    bare = replace(network, gnss=no_gnss(), measured_attitudes=no_measured_attitudes())
+    images = network.images
+    if [head.name for head in network.heads] != [MOUNTING] or (images.head < 0).any():
+        return bare
+    return replace(bare, heads=(), images=replace(images, head=np.full_like(images.head, -1)))
 
 
 def controlled_of(result: Adjustment, exposures: Sequence[int]) -> ImageOrientations:

@@ -27,12 +27,18 @@ from processing.bundle.adjust import Adjustment
 from processing.bundle.adjustment_results import (
     check_point_differences,
     control_residuals,
-    exposures_of,
     image_residuals_mm,
     systematic_residuals,
 )
+from processing.bundle.camera_orientations import (
+    adjusted_cameras,
+    camera_orientations,
+    variance_factor,
+)
+from processing.bundle.flown_network import MOUNTING
+from processing.bundle.unknowns import initial_values
 from processing.geometry.orientation import grid_from_enu
-from processing.geometry.rotation import omega_phi_kappa
+from processing.geometry.rotation import omega_phi_kappa, vectors_from_rotations
 from processing.matching.block_matching import BlockTiePoints, match_counts_by_line
 
 Array = NDArray[np.float64]
@@ -51,15 +57,19 @@ def triangulation_of(
     tie = used & (network.image_points.point < tied.points)
     rms_um = np.sqrt(np.mean(residual[tie] ** 2, axis=0)) * 1e3
     sigma_um = [float(v) * 1e3 for v in network.image_points.sigma_mm[tie].mean(axis=0)]
-    pattern = systematic_residuals(result, 0, CELLS)
-    filled = pattern.count >= _MIN_IN_CELL
-    worst = np.hypot(*pattern.mean_mm[filled].T).max() * 1e3 if filled.any() else math.nan
+    used_cameras = np.unique(network.images.camera[network.image_points.image[used]])
+    patterns = [systematic_residuals(result, int(k), CELLS) for k in used_cameras]
+    means = np.concatenate([one.mean_mm[one.count >= _MIN_IN_CELL] for one in patterns])
+    worst = np.hypot(*means.T).max() * 1e3 if len(means) else math.nan
     rays = np.bincount(network.image_points.point[tie], minlength=tied.points)[: tied.points]
     along, across = match_counts_by_line(tied, block.lines)
     checks = project.checks
     control = control_residuals(result)
     against = check_point_differences(result, checks.names, checks.xyz_m, checks.sigma_m)
-    px = block.image.pitch_um
+    of_camera = np.array([camera.pixel_mm or block.image.pitch_mm for camera in network.cameras])
+    pixel_mm = of_camera[network.images.camera[network.image_points.image[tie]]][:, None]
+    rms_px = np.sqrt(np.mean((residual[tie] / pixel_mm) ** 2, axis=0))
+    sigma_px = (network.image_points.sigma_mm[tie] / pixel_mm).mean(axis=0)
     return {
         "exposures": len(block.names),
         "lines": len(set(block.lines)),
@@ -71,10 +81,11 @@ def triangulation_of(
         "matches_across": across,
         "rays": {str(n): int((rays == n).sum()) for n in range(2, int(rays.max(initial=1)) + 1)},
         "image_rms_um": [float(v) for v in rms_um],
-        "image_rms_px": [float(v) / px for v in rms_um],
+        "image_rms_px": [float(v) for v in rms_px],
         "image_sigma_um": sigma_um,
-        "image_sigma_px": [v / px for v in sigma_um],
+        "image_sigma_px": [float(v) for v in sigma_px],
         "systematic_most_um": float(worst) if math.isfinite(worst) else None,
+        "mounting": mountings_of(result),
         "control": _agreement(control.names, control.difference_m, block.gsd_m),
         "checks": _agreement(against.names, against.difference_m, block.gsd_m)
         | {
@@ -82,6 +93,31 @@ def triangulation_of(
             "squares": against.squares if against.names else None,
         },
     }
+
+
+def mountings_of(result: Adjustment) -> list[dict[str, Any]]:
+    """Corrections of boresights (mdeg, about the camera's axes) and lever arms (m, along them)
+    against the calibration, with standard deviations."""
+    found: list[dict[str, Any]] = []
+    given = initial_values(result.network)
+    for k, head in enumerate(result.network.heads):
+        turn = given.head_rotation[k].T @ result.state.head_rotation[k]
+        quantities = (
+            ("boresight", "mdeg", math.degrees(1e3) * vectors_from_rotations(turn[None])[0],
+             math.degrees(1e3), result.layout.head_rotation[k]),
+            ("lever arm", "m", result.state.head_offset[k] - given.head_offset[k], 1.0,
+             result.layout.head_offset[k]),
+        )  # fmt: skip
+        for what, unit, value, factor, columns in quantities:
+            if (columns < 0).any():
+                continue
+            variance = variance_factor(result.sigma0) * np.diag(result.cofactor)[columns]
+            found += [
+                {"head": head.name, "what": what, "axis": axis, "unit": unit, "value": float(v),
+                 "sigma": factor * math.sqrt(max(float(s), 0.0))}
+                for axis, v, s in zip("xyz", value, variance, strict=True)
+            ]  # fmt: skip
+    return found
 
 
 def _agreement(names: tuple[str, ...], difference_m: Array, gsd_m: float) -> dict[str, Any]:
@@ -121,13 +157,14 @@ def _fill(
     frame = {"latitude_deg": block.frame.latitude_deg, "longitude_deg": block.frame.longitude_deg}
     (folder / FRAME_FILE).write_text(json.dumps(frame) + "\n", encoding="utf-8")
     georeference = Georeference(block.crs)
-    place = block.frame.to_geodetic(result.state.station)
-    sigma = {o.name: o for o in exposures_of(result)}
+    adjusted = camera_orientations(result)
+    place = block.frame.to_geodetic(adjusted.station_m)
+    sigma = {o.name: o for o in adjusted_cameras(result)}
     rows: list[tuple[str | float, ...]] = []
     for k, name in enumerate(block.names):
         latitude, longitude, height = (float(v) for v in place[k])
         at = georeference.place(latitude, longitude, height)
-        enu = block.frame.local_from_enu(latitude, longitude).T @ result.state.attitude[k]
+        enu = block.frame.local_from_enu(latitude, longitude).T @ adjusted.rotation[k]
         angles = np.degrees(omega_phi_kappa(grid_from_enu(at.azimuth_of_north_rad) @ enu))
         own = sigma[name]
         rows.append(
@@ -180,6 +217,13 @@ def print_triangulation(console: Console, found: Mapping[str, Any]) -> None:
             f"(means of {CELLS[0]} x {CELLS[1]} cells)",
             highlight=False,
         )
+    if found["mounting"]:
+        mounting = light_table("Against the calibration", ("quantity",), ("value", "sigma", "unit"))
+        for one in found["mounting"]:
+            name = f"{one['what']}, camera's {one['axis']}"
+            head = "" if one["head"] == MOUNTING else f"{one['head']} "
+            mounting.add_row(head + name, f"{one['value']:.4g}", f"{one['sigma']:.3g}", one["unit"])
+        console.print(mounting)
     table = light_table("Residuals", ("",), ("points", "x", "y", "z", "unit"))
     for key in ("control", "checks"):
         part = found[key]

@@ -7,7 +7,6 @@ and the orientations in the requested coordinate system. Matching is in
 
 from __future__ import annotations
 
-import math
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -23,23 +22,28 @@ from daemon.mission.layout import Mission
 from daemon.mission.store.level0 import check_tiff, read_description, read_tiff
 from daemon.orientation.exterior_orientation import ExteriorOrientation, sealed_exposures
 from daemon.orientation.local_frame import LocalFrame
+from daemon.orientation.navigation_sigmas import NavigationSigmas
 from daemon.orientation.orientation_inputs import read_orientation_inputs
 from daemon.postflight.adjustment.csv_tables import CsvTable, read_table
 from daemon.postflight.adjustment.project import CheckPoints, Project
 from daemon.postflight.adjustment.project_file import ProjectFile
 from processing.bundle.adjust import AdjustmentSettings, adjust
+from processing.bundle.flown_network import (
+    MOUNTING,
+    FlownExposures,
+    GnssDrift,
+    GnssLines,
+    MeasuredOrientations,
+    flown_exposures,
+)
 from processing.bundle.gauss_newton import Progress
 from processing.bundle.initial_values import completed
 from processing.bundle.network import (
-    Attitudes,
     CameraModel,
-    Gnss,
     ImagePoints,
     Images,
-    MeasuredAttitudes,
     Network,
     Points,
-    Stations,
 )
 from processing.bundle.normal_equations import refuse_large_block
 from processing.bundle.self_calibration import SetName, parts_of, with_self_calibration
@@ -66,15 +70,14 @@ class TriangulationSettings:
     """Options of a triangulation.
 
     `parameters` is the set of additional parameters, `interior` whether it holds the interior
-    orientation. Sigmas: position (3,) m east, north, up; attitude (3,) rad about the camera's axes.
-    `drift`: what is unknown of the GNSS positions of each line.
+    orientation. `sigmas` are those of navigation and mounting. `drift`: what is unknown of the GNSS
+    positions of each line.
     """
 
     parameters: SetName = "none"
     interior: bool = False
-    position_sigma_m: tuple[float, float, float] = (0.05, 0.05, 0.08)
-    attitude_sigma_rad: tuple[float, float, float] = (1e-4, 1e-4, 1.5e-4)
-    drift: str = "none"
+    sigmas: NavigationSigmas = field(default_factory=NavigationSigmas)
+    drift: GnssDrift = "none"
     reject_beyond: float = 4.0
     matching: BlockMatching = field(default_factory=BlockMatching)
 
@@ -280,7 +283,6 @@ def project_of(
     point = np.concatenate([tied.point, surveyed.point + ties])
     px = np.concatenate([tied.px, surveyed.px])
     spread = np.concatenate([np.full(len(tied.image), TIE_SIGMA_PX), surveyed.sigma_px]) * pitch
-    lines = tuple(dict.fromkeys(block.lines))
     file = _file(block, options)
     try:
         camera = with_self_calibration(
@@ -293,33 +295,21 @@ def project_of(
     except ValueError as error:
         raise TriangulationError(str(error)) from error
     every = np.arange(n)
+    flown = _flown(block, options)
     network = Network(
         cameras=(camera,),
-        stations=Stations(block.names, block.station_m, np.zeros(n, bool)),
-        attitudes=Attitudes(block.names, block.rotation, np.zeros(n, bool)),
-        images=Images(block.names, every, every, np.zeros(n, np.int64), np.full(n, -1)),
+        stations=flown.stations,
+        attitudes=flown.attitudes,
+        images=Images(
+            block.names, every, every, np.zeros(n, np.int64), np.zeros(n, dtype=np.int64)
+        ),
         points=Points(names, xyz, sigma, np.zeros(len(names), bool)),
         image_points=ImagePoints(
             image, point, image_mm(block.image, px), np.stack([spread, spread], axis=1)
         ),
-        gnss=Gnss(
-            station=every,
-            attitude=every,
-            position_m=block.station_m,
-            sigma_m=np.tile(options.position_sigma_m, (n, 1)),
-            lever_m=np.zeros((n, 3)),
-            line=np.array([lines.index(line) for line in block.lines], dtype=np.int64),
-            time_s=np.array([eo.gps_ns - block.oriented[0].gps_ns for eo in block.oriented]) * 1e-9,
-            lines=tuple(line or "line" for line in lines),
-            drift="linear"
-            if options.drift == "linear"
-            else "shift"
-            if options.drift == "shift"
-            else "none",
-        ),
-        measured_attitudes=MeasuredAttitudes(
-            every, block.rotation, np.tile(options.attitude_sigma_rad, (n, 1))
-        ),
+        heads=flown.heads,
+        gnss=flown.gnss,
+        measured_attitudes=flown.measured_attitudes,
     )
     settings = AdjustmentSettings(
         robust=True, reject_beyond=options.reject_beyond, variance_components=True
@@ -330,6 +320,25 @@ def project_of(
         surveyed.sigma_m[~control],
     )
     return Project(file.name, file, network, settings, checks)
+
+
+def _flown(block: ImageBlock, options: TriangulationSettings) -> FlownExposures:
+    """Observations and unknowns of navigation, as in flight."""
+    names = tuple(dict.fromkeys(block.lines))
+    lines = GnssLines(
+        tuple(line or "line" for line in names),
+        np.array([names.index(line) for line in block.lines], dtype=np.int64),
+        np.array([eo.gps_ns - block.oriented[0].gps_ns for eo in block.oriented]) * 1e-9,
+        options.drift,
+    )
+    sigmas = options.sigmas
+    measured = MeasuredOrientations(
+        block.station_m,
+        block.rotation,
+        np.array([sigmas.of_position(eo) for eo in block.oriented]),
+        np.tile(sigmas.about_camera_rad, (len(block.names), 1)),
+    )
+    return flown_exposures(block.names, measured, sigmas.prior, lines=lines)
 
 
 def weight_by_residuals(project: Project, ties: int, progress: Progress | None = None) -> Project:
@@ -445,14 +454,14 @@ def _file(block: ImageBlock, options: TriangulationSettings) -> ProjectFile:
                 "image_sigma_um": TIE_SIGMA_PX * block.image.pitch_um,
             },
             "camera": [camera],
+            "head": [
+                {
+                    "name": MOUNTING,
+                    "rotation": "free",
+                    "offset": "free",
+                    "rotation_sigma_deg": options.sigmas.boresight_mdeg * 1e-3,
+                    "offset_sigma_m": options.sigmas.lever_arm_m,
+                }
+            ],
         }
     )
-
-
-def attitude_sigmas(mdeg: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Sigmas about the camera's x, y, z of sigmas of roll, pitch and heading, mdeg, in rad.
-
-    The camera looks down: its x is across (pitch), its y along the flight (roll).
-    """
-    roll, pitch, heading = (math.radians(v * 1e-3) for v in mdeg)
-    return pitch, roll, heading

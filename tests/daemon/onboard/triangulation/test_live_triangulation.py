@@ -28,14 +28,27 @@ from daemon.onboard.triangulation.live_record import live_json, summary_json, wr
 from daemon.onboard.triangulation.mission_triangulation import MissionTriangulation
 from daemon.orientation.exterior_orientation import sealed_exposures
 from daemon.orientation.local_frame import LocalFrame
+from daemon.postflight.triangulation.report import mountings_of
+from daemon.postflight.triangulation.triangulation import (
+    TriangulationSettings,
+    block_of,
+    match_mission_block,
+    project_of,
+    weight_by_residuals,
+)
+from processing.bundle.adjust import adjust
 from processing.bundle.block_adjustment import added_parameters
+from processing.bundle.camera_orientations import camera_orientations
+from processing.bundle.initial_values import completed
 from processing.geometry.rotation import vectors_from_rotations
+from processing.matching.block_matching import BlockMatching
 from processing.pipelines.live_triangulation import MeasuredImage
 from tests.daemon.flown_block import (
     FlownBlock,
     ground_points,
     read_record,
     write_image,
+    write_navigation,
     write_points,
     write_record,
 )
@@ -91,7 +104,7 @@ def _errors(flown: FlownBlock, done: MissionTriangulation) -> np.ndarray:
 
 def test_adjusted_orientations_err_as_their_full_covariance_states(flown, triangulated) -> None:
     errors = _errors(flown, triangulated)
-    covariance = triangulated.live.last.covariance()
+    covariance = triangulated.live.last.cameras.covariance()
     flat = errors.ravel()
     squares = flat @ np.linalg.solve(covariance, flat) / len(flat)
     low, high = stats.chi2.ppf([0.0005, 0.9995], len(flat)) / len(flat)
@@ -100,6 +113,37 @@ def test_adjusted_orientations_err_as_their_full_covariance_states(flown, triang
     assert (np.abs(errors) < 4.5 * sigma).all()
     # Tie points improve on what was measured.
     assert (sigma[:, 3:5] < 0.6 * math.radians(0.0076)).all()
+
+
+def test_the_triangulation_after_landing_shares_its_unknowns_with_that_in_flight(
+    flown, triangulated
+) -> None:
+    trajectory = write_navigation(flown)
+    block = block_of(Mission.open(flown.mission), trajectory_file=trajectory)
+    matching = BlockMatching(cells=(10, 7))
+    tied = match_mission_block(block, matching, lambda _done: None)
+    project = weight_by_residuals(project_of(block, tied, TriangulationSettings()), tied.points)
+    done = adjust(completed(project.network), project.settings)
+    cameras = camera_orientations(done)
+    errors, sigma = [], np.sqrt(np.diag(cameras.covariance())).reshape(-1, 6)
+    for k, one in enumerate(triangulated.live.orientations):
+        there = block.frame.to_geodetic(cameras.station_m[k : k + 1])
+        step = one.position_m - triangulated.frame.from_geodetic(*there.T)[0]
+        between = triangulated.frame.local_from_enu(
+            block.frame.latitude_deg, block.frame.longitude_deg
+        )
+        turn = vectors_from_rotations(((between @ cameras.rotation[k]).T @ one.rotation)[None])[0]
+        errors.append(np.concatenate([step, turn]))
+    # Both have the same navigation and mounting, and other tie points of the same images.
+    live = np.sqrt(np.einsum("nii->ni", triangulated.live.last.cameras.covariances()))
+    assert (np.abs(errors) < 3.0 * np.maximum(sigma, live)).all()
+    assert float(np.sqrt(np.mean(np.square(errors / sigma)))) < 1.0
+    found = {(q["what"], q["axis"]): q for q in mountings_of(done)}
+    drifts = {one.name: one for one in triangulated.drifts}
+    for axis in ("x", "y", "z"):
+        own, other = found["boresight", axis], drifts[f"boresight about the camera's {axis}"]
+        assert own["value"] == pytest.approx(other.value, abs=2.0 * own["sigma"])
+        assert own["sigma"] == pytest.approx(other.sigma, rel=0.3)
 
 
 def test_lines_flown_there_and_back_tie_and_nothing_is_wrong(triangulated) -> None:
