@@ -27,10 +27,10 @@ from daemon.mission.layout import Mission
 from daemon.onboard.triangulation.mission_triangulation import MissionTriangulation
 from daemon.orientation.exterior_orientation import sealed_exposures
 from daemon.orientation.local_frame import LocalFrame
+from daemon.postflight.triangulation.matching_work import match_mission_block
 from daemon.postflight.triangulation.triangulation import (
     TriangulationSettings,
     block_of,
-    match_mission_block,
     project_of,
     weight_by_residuals,
 )
@@ -183,7 +183,7 @@ def after_landing(mission: Path, trajectory: Path) -> tuple[Orientations, dict[s
     begun = time.perf_counter()
     block = block_of(Mission.open(mission), trajectory_file=trajectory)
     settings = TriangulationSettings()
-    tied = match_mission_block(block, settings.matching, lambda _done: None)
+    tied = match_mission_block(block, settings.matching)
     project = weight_by_residuals(project_of(block, tied, settings), tied.points)
     done = adjust(completed(project.network), project.settings)
     cameras = camera_orientations(done)

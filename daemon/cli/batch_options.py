@@ -141,10 +141,12 @@ class ExecutorOptions:
             return Placement(self.cluster(), ProcessAllocation(0, self.threads or 1, "its workers"))
         plan = self._allocation(task_nbytes, tasks, tasks_per_process)
         if self.processes == 0 or (self.processes is None and plan.processes == 1):
+            from daemon.postflight.batch import capacity
             from daemon.postflight.batch.in_process import InProcessExecutor
             from daemon.products.pipeline_pool import usable_count
 
-            return Placement(InProcessExecutor(IN_PROCESS_COUNT, usable_count), plan)
+            fits = IN_PROCESS_COUNT * task_nbytes <= capacity.available_memory_nbytes()
+            return Placement(InProcessExecutor(IN_PROCESS_COUNT if fits else 1, usable_count), plan)
         from daemon.postflight.batch.local_processes import LocalProcessExecutor
 
         return Placement(LocalProcessExecutor(plan.processes), plan)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast
@@ -12,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 import typer
 from rich.progress import Progress
 
+from daemon.cli.batch_options import ExecutorOptions, takes_executor
 from daemon.cli.exit_status import ExitStatus, exit_if_failed
 from daemon.cli.options import (
     AsJson,
@@ -56,9 +58,12 @@ Examples: `syntopic triangulate MISSION --trajectory sbet.out`,
 `syntopic triangulate MISSION --set sensors-full --points points.csv --measured measured.csv`
 """
 
+IMAGES_PER_PROCESS = 12
+"""So many images take longer to match than the start of a process."""
 SETS = ("none", "radial", "sensors", "sensors-full")
 
 
+@takes_executor
 def triangulate(
     mission: Annotated[Path, typer.Argument(help="Mission folder with Level-2.")],
     set_name: Annotated[
@@ -131,11 +136,14 @@ def triangulate(
     live: Annotated[
         bool, typer.Option("--live", help="Triangulation exposure by exposure, as in flight.")
     ] = False,
+    *,
+    where: ExecutorOptions,
     as_json: AsJson = False,
 ) -> None:
     from daemon.mission.layout import Mission
 
     folder = Mission.open(mission)
+    where.check()
     if live:
         from daemon.cli.triangulate_live import triangulate_live
 
@@ -149,6 +157,7 @@ def triangulate(
     from daemon.postflight.adjustment.csv_tables import ProjectError
     from daemon.postflight.adjustment.summary import print_report, report_of
     from daemon.postflight.importers.photographs import is_photographs
+    from daemon.postflight.triangulation.matching_work import match_mission_block
     from daemon.postflight.triangulation.report import (
         print_triangulation,
         triangulation_of,
@@ -158,7 +167,6 @@ def triangulate(
         TriangulationError,
         TriangulationSettings,
         block_of,
-        match_mission_block,
         project_of,
         weight_by_residuals,
     )
@@ -203,19 +211,16 @@ def triangulate(
     block = block_of(
         folder, crs=crs, trajectory_file=trajectory, mount_file=mount, heads=head or ()
     )
-    with (
-        lock_for(folder, results),
-        Progress(console=Console(stderr=True), transient=True) as progress,
-    ):
-        task = progress.add_task("matching", total=len(block.names))
+    with lock_for(folder, results), ExitStack() as shown:
         try:
             tied = match_mission_block(
-                block, requirements.matching, lambda done: progress.update(task, completed=done)
+                block, requirements.matching, where.compute("matching", IMAGES_PER_PROCESS)
             )
         except NetworkError as error:
             raise TriangulationError(f"{folder.path}: {error}") from error
+        progress = shown.enter_context(Progress(console=Console(stderr=True), transient=True))
+        task = progress.add_task("starting values", total=None)
         project = project_of(block, tied, requirements, points_file=points, measured_file=measured)
-        progress.update(task, total=None, description="starting values")
         try:
 
             def show(what: str, number: int, squares: float) -> None:

@@ -70,6 +70,19 @@ class BlockTiePoints:
     matched: dict[tuple[int, int], int]
 
 
+@dataclass(frozen=True)
+class ImageMatches:
+    """Features of one image found in later ones.
+
+    `own` (n, 2) are their pixels; `places` by later image j: which of the features (m,), and where
+    they are in it (m, 2). `tried` counts patches by later image.
+    """
+
+    own: Array
+    places: dict[int, tuple[Indices, Array]]
+    tried: dict[int, int]
+
+
 def match_block(
     load: Callable[[int], Picture],
     image: VirtualImage,
@@ -97,61 +110,97 @@ def match_block(
     Source: docs/explanation/mathematics/matching.md#least-squares-matching.
     """
     settings = settings or BlockMatching()
-    half = settings.window_px // 2
-    cells = _cells(image, settings)
-    found: list[tuple[int, Indices, Array]] = []
-    tried: dict[tuple[int, int], int] = {}
-    matched: dict[tuple[int, int], int] = {}
-    count = 0
+    found = []
     for k in range(len(station_m)):
-        here = load(k)
-        chosen = select_features(here, cells, half, 2, False)
-        places = np.round(chosen[chosen[:, 2] > 0.0][:, :2]).astype(np.int64)
-        others = _overlapping(image, station_m, rotation, ground_m, k)
-        if not len(places) or not others:
-            progress(k + 1)
-            continue
-        own = places.astype(np.float64)
-        rays = rays_of(image, rotation[k], own)
-        ground = station_m[k] + rays * ((ground_m - station_m[k, 2]) / rays[:, 2:])
-        known = np.zeros(len(places), dtype=bool)
-        seen = np.zeros(len(places), dtype=np.int64)
-        parts: list[tuple[Indices, int, Array]] = []
-        for j in others:
-            poses = ((station_m[k], rotation[k]), (station_m[j], rotation[j]))
-            attempted, at = _matched_in(
-                here, _rectified(load(j), image, *poses, ground_m), image, rotation[j],
-                station_m[j], places, ground, known, settings,
-            )  # fmt: skip
-            tried[k, j] = attempted
-            rows = np.flatnonzero(np.isfinite(at[:, 0]))
-            matched[k, j] = len(rows)
-            if not len(rows):
-                continue
-            parts.append((rows, j, at[rows]))
-            seen[rows] += 1
-            new = rows[~known[rows]]
-            ground[new] = _intersected(
-                (station_m[k], rays[new]),
-                (station_m[j], rays_of(image, rotation[j], at[new])),
-                ground[new],
-            )
-            known[new] = True
-        used = np.flatnonzero(seen > 0)
-        number = np.full(len(places), -1, dtype=np.int64)
-        number[used] = count + np.arange(len(used))
-        count += len(used)
-        found.append((k, number[used], own[used]))
-        found += [(j, number[rows], at) for rows, j, at in parts]
+        found.append(match_image(k, load, image, station_m, rotation, ground_m, settings))
         progress(k + 1)
-    which = [np.full(len(p), k, dtype=np.int64) for k, p, _ in found]
+    return joined_matches(found)
+
+
+def match_image(
+    k: int,
+    load: Callable[[int], Picture],
+    image: VirtualImage,
+    station_m: Array,
+    rotation: Array,
+    ground_m: float,
+    settings: BlockMatching,
+) -> ImageMatches:
+    """Match one image with all later ones that overlap it; no other image's matches are needed.
+
+    Args:
+        k: index of the image.
+        load: an image's pixels, (h, w) float32, NaN without data.
+        image: their common geometry.
+        station_m: (n, 3) projection centres, any Cartesian frame with z up.
+        rotation: (n, 3, 3) from camera.
+        ground_m: height of the ground there, to begin with.
+        settings: grid, windows, searches and limits.
+
+    Source: docs/explanation/mathematics/matching.md#least-squares-matching.
+    """
+    here = load(k)
+    chosen = select_features(here, _cells(image, settings), settings.window_px // 2, 2, False)
+    pixels = np.round(chosen[chosen[:, 2] > 0.0][:, :2]).astype(np.int64)
+    others = _overlapping(image, station_m, rotation, ground_m, k)
+    own = pixels.astype(np.float64)
+    found = ImageMatches(own, {}, {})
+    if not len(pixels) or not others:
+        return found
+    rays = rays_of(image, rotation[k], own)
+    ground = station_m[k] + rays * ((ground_m - station_m[k, 2]) / rays[:, 2:])
+    known = np.zeros(len(pixels), dtype=bool)
+    for j in others:
+        poses = ((station_m[k], rotation[k]), (station_m[j], rotation[j]))
+        found.tried[j], at = _matched_in(
+            here, _rectified(load(j), image, *poses, ground_m), image, rotation[j],
+            station_m[j], pixels, ground, known, settings,
+        )  # fmt: skip
+        rows = np.flatnonzero(np.isfinite(at[:, 0]))
+        found.places[j] = rows, at[rows]
+        if not len(rows):
+            continue
+        new = rows[~known[rows]]
+        ground[new] = _intersected(
+            (station_m[k], rays[new]),
+            (station_m[j], rays_of(image, rotation[j], at[new])),
+            ground[new],
+        )
+        known[new] = True
+    return found
+
+
+def joined_matches(found: Sequence[ImageMatches]) -> BlockTiePoints:
+    """Tie points of a block from the matches of its images.
+
+    Args:
+        found: of every image, in order.
+
+    Returns:
+        Image points that at least two images share, numbered by image and feature.
+    """
+    which, points, px = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], [np.zeros((0, 2))]
+    count = 0
+    for k, one in enumerate(found):
+        seen = np.zeros(len(one.own), dtype=bool)
+        for rows, _ in one.places.values():
+            seen[rows] = True
+        number = np.where(seen, count + np.cumsum(seen) - 1, -1)
+        count += int(seen.sum())
+        for j, own, at in [
+            (k, np.flatnonzero(seen), one.own[seen]),
+            *((j, rows, at) for j, (rows, at) in one.places.items()),
+        ]:
+            which.append(np.full(len(own), j, dtype=np.int64))
+            points.append(number[own])
+            px.append(at)
     return BlockTiePoints(
-        np.concatenate([np.zeros(0, np.int64), *which]),
-        np.concatenate([np.zeros(0, np.int64), *(p for _, p, _ in found)]),
-        np.concatenate([np.zeros((0, 2)), *(at for _, _, at in found)]),
+        np.concatenate(which),
+        np.concatenate(points),
+        np.concatenate(px),
         count,
-        tried,
-        matched,
+        {(k, j): tried for k, one in enumerate(found) for j, tried in one.tried.items()},
+        {(k, j): len(rows) for k, one in enumerate(found) for j, (rows, _) in one.places.items()},
     )
 
 

@@ -7,8 +7,7 @@ and the orientations in the requested coordinate system. Matching is in
 
 from __future__ import annotations
 
-from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -19,7 +18,7 @@ from daemon import DaemonError
 from daemon.mission.exposure import Exposure
 from daemon.mission.exposure_batch import ExposureFailure, for_each_exposure
 from daemon.mission.layout import Mission
-from daemon.mission.store.level0 import check_tiff, read_description, read_tiff
+from daemon.mission.store.level0 import check_tiff
 from daemon.orientation.exterior_orientation import ExteriorOrientation, sealed_exposures
 from daemon.orientation.local_frame import LocalFrame
 from daemon.orientation.navigation_sigmas import NavigationSigmas
@@ -45,16 +44,13 @@ from processing.bundle.network import (
     Network,
     Points,
 )
-from processing.bundle.normal_equations import refuse_large_block
 from processing.bundle.self_calibration import SetName, parts_of, with_self_calibration
-from processing.matching.block_matching import BlockMatching, BlockTiePoints, image_mm, match_block
+from processing.matching.block_matching import BlockMatching, BlockTiePoints, image_mm
 from processing.pipelines.perspective import perspective_of
 from processing.rig import Rig, VirtualImage, load_rig
 
 Array = NDArray[np.float64]
-Picture = NDArray[np.float32]
 
-CACHED_IMAGES = 12
 TIE_SIGMA_PX = 0.03
 MEASURED_SIGMA_PX = 0.3
 GEODETIC = ("latitude_deg", "longitude_deg", "height_m")
@@ -212,43 +208,6 @@ def _common_image(rig: Rig, heads: Sequence[str]) -> VirtualImage:
             f"{', '.join(known) or 'stitched images, no heads'}"
         )
     return image
-
-
-def match_mission_block(
-    block: ImageBlock, settings: BlockMatching, progress: Callable[[int], None]
-) -> BlockTiePoints:
-    """Tie points of all overlapping images; a dozen of them are kept in memory.
-
-    Raises:
-        NetworkError: more images than are adjusted at once; nothing is matched.
-    """
-    refuse_large_block(6 * len(block.names))
-    cache: OrderedDict[int, Picture] = OrderedDict()
-
-    def load(k: int) -> Picture:
-        if k in cache:
-            cache.move_to_end(k)
-            return cache[k]
-        pixels = _image_pixels(block, block.oriented[k])
-        cache[k] = np.where(pixels == 0, np.nan, pixels).astype(np.float32)
-        if len(cache) > CACHED_IMAGES:
-            cache.popitem(last=False)
-        return cache[k]
-
-    return match_block(
-        load, block.image, block.station_m, block.rotation, block.ground_m, settings,
-        progress=progress,
-    )  # fmt: skip
-
-
-def _image_pixels(block: ImageBlock, eo: ExteriorOrientation) -> NDArray[np.uint16]:
-    """Pixels of an image: PAN, or of a head the green band, else the first."""
-    path = block.mission.level2(eo.exposure) / ("pan.tif" if eo.is_virtual else f"{eo.cone}.tif")
-    bands = [] if eo.is_virtual else read_description(path).get("bands", [])
-    plane = bands.index("green") if "green" in bands else 0 if len(bands) > 1 else None
-    return read_tiff(
-        path, width_px=block.image.width_px, height_px=block.image.height_px, plane=plane
-    )
 
 
 def project_of(

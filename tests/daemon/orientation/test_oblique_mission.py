@@ -38,10 +38,10 @@ from daemon.onboard.service.messages import (
 )
 from daemon.orientation.local_frame import LocalFrame
 from daemon.postflight.replay.flight_replay import ReplayResult
+from daemon.postflight.triangulation.matching_work import match_mission_block
 from daemon.postflight.triangulation.triangulation import (
     TriangulationError,
     block_of,
-    match_mission_block,
 )
 from processing.matching.block_matching import BlockMatching
 from processing.rig import load_rig, shipped_rigs
@@ -228,7 +228,7 @@ def test_obliques_of_the_same_direction_are_tied_where_both_see_the_same_ground(
     mission = Mission.open(folder / "mission")
     trajectory = folder / "trajectory.csv"
     block = block_of(mission, crs=CRS, trajectory_file=trajectory, heads=("5", "8"))
-    tied = match_mission_block(block, BlockMatching(cells=(14, 10)), lambda _done: None)
+    tied = match_mission_block(block, BlockMatching(cells=(14, 10)))
     assert len(block.names) == EXPOSURES * LINES * 2 and tied.points > 100
     first = EPOCH_GPS_NS + FIRST_AFTER_S * 1_000_000_000
     flight = world.flight.beginning_first_line_at(world.flight.distance_flown_m(first))

@@ -17,7 +17,8 @@ from daemon.postflight.adjustment.csv_tables import ProjectError
 from daemon.postflight.adjustment.project import CheckPoints
 from daemon.postflight.adjustment.project_file import CameraSection, ProjectFile
 from daemon.postflight.adjustment.project_writer import write_project
-from daemon.postflight.triangulation.triangulation import ImageBlock, match_mission_block
+from daemon.postflight.triangulation.matching_work import match_mission_block
+from daemon.postflight.triangulation.triangulation import ImageBlock
 from processing.bundle import normal_equations
 from processing.bundle.network import ImagePoints, NetworkError
 from processing.matching.block_matching import BlockMatching
@@ -98,9 +99,9 @@ def test_a_block_with_too_many_unknowns_ends_with_a_sentence(tmp_path, monkeypat
 
 
 def test_images_that_are_too_many_are_not_matched() -> None:
-    block = cast(ImageBlock, SimpleNamespace(names=tuple(f"i{k}" for k in range(2_501))))
-    with pytest.raises(NetworkError, match="about 2500 exposures: split the block"):
-        match_mission_block(block, BlockMatching(), lambda _done: None)
+    block = cast(ImageBlock, SimpleNamespace(names=tuple(f"i{k}" for k in range(25_001))))
+    with pytest.raises(NetworkError, match="about 25000 exposures: split the block"):
+        match_mission_block(block, BlockMatching())
 
 
 def test_a_datum_without_effect_is_refused_or_reported(tmp_path) -> None:
