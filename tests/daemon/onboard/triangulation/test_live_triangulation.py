@@ -28,11 +28,11 @@ from daemon.onboard.triangulation.live_record import live_json, summary_json, wr
 from daemon.onboard.triangulation.mission_triangulation import MissionTriangulation
 from daemon.orientation.exterior_orientation import sealed_exposures
 from daemon.orientation.local_frame import LocalFrame
+from daemon.postflight.triangulation.matching_work import match_mission_block
 from daemon.postflight.triangulation.report import mountings_of
 from daemon.postflight.triangulation.triangulation import (
     TriangulationSettings,
     block_of,
-    match_mission_block,
     project_of,
     weight_by_residuals,
 )
@@ -121,7 +121,7 @@ def test_the_triangulation_after_landing_shares_its_unknowns_with_that_in_flight
     trajectory = write_navigation(flown)
     block = block_of(Mission.open(flown.mission), trajectory_file=trajectory)
     matching = BlockMatching(cells=(10, 7))
-    tied = match_mission_block(block, matching, lambda _done: None)
+    tied = match_mission_block(block, matching)
     project = weight_by_residuals(project_of(block, tied, TriangulationSettings()), tied.points)
     done = adjust(completed(project.network), project.settings)
     cameras = camera_orientations(done)
