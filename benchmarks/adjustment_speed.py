@@ -4,7 +4,9 @@ Crosswise overlapping lines, 80 % along and 60 % across, of a camera of 100 mm w
 Observations have normal errors of 0.3 px, starting values errors of 1 m and 1 mrad. The datum is
 that of control points, or free. `--peer` adjusts the block around a building of `blunder_search`
 with three held points, here and by Ceres as pycolmap calls it (SPARSE_SCHUR, one thread, C++
-residuals), from the same starting values.
+residuals), from the same starting values. `--lines` adds antenna positions with shift and drift of
+every line and a free interior orientation, and `--robust` Huber weights before the adjustment;
+`--dense` adjusts once more with the dense reduced matrix and compares.
 """
 
 from __future__ import annotations
@@ -29,12 +31,14 @@ from processing.bundle.free_datum import FreeDatum
 from processing.bundle.network import (
     Attitudes,
     CameraModel,
+    Gnss,
     ImagePoints,
     Images,
     Network,
     Points,
     Stations,
 )
+from processing.bundle.normal_equations import MAX_COLUMNS
 from processing.geometry.rotation import rotations_from_vectors
 
 Array = NDArray[np.float64]
@@ -48,8 +52,8 @@ BASE_M: Final = 200.0
 DISTANCE_M: Final = 400.0
 
 
-def block_of(images: int, image_points: int, seed: int = 1) -> Network:
-    """A block of about that many image points."""
+def block_of(images: int, image_points: int, seed: int = 1) -> tuple[Network, Array]:
+    """A block of about that many image points, and its true projection centres."""
     random = np.random.default_rng(seed)
     along = max(2, math.ceil(math.sqrt(images * DISTANCE_M / BASE_M)))
     index = np.arange(images)
@@ -63,9 +67,13 @@ def block_of(images: int, image_points: int, seed: int = 1) -> Network:
     density = image_points / (images * (2.0 * half) ** 2)
     count = round(density * float(np.prod(high - low)))
     ground = np.column_stack([random.uniform(low, high, (count, 2)), random.uniform(0, 80, count)])
+    from_x = np.argsort(ground[:, 0])
+    by_x = ground[from_x, 0]
     image, point, xy = [], [], []
     for k in range(images):
-        near = np.flatnonzero((np.abs(ground[:, :2] - station[k, :2]) < 1.2 * half).all(axis=1))
+        low_x, high_x = np.searchsorted(by_x, station[k, 0] + np.array([-1.2, 1.2]) * half)
+        near = np.sort(from_x[low_x:high_x])
+        near = near[np.abs(ground[near, 1] - station[k, 1]) < 1.2 * half]
         ray = (ground[near] - station[k]) @ rotation[k]
         seen = -F_MM * ray[:, :2] / ray[:, 2:]
         own = (np.abs(seen) < HALF_MM).all(axis=1)
@@ -84,7 +92,7 @@ def block_of(images: int, image_points: int, seed: int = 1) -> Network:
     start[control] = ground[control] + random.normal(0.0, 0.02, (len(control), 3))
     turned = rotations_from_vectors(random.normal(0.0, 1e-3, (images, 3)))
     measured = np.concatenate(xy)[taken]
-    return Network(
+    network = Network(
         cameras=(CameraModel("c", F_MM, pixel_mm=PIXEL_MM),),
         stations=Stations(names, station + random.normal(0.0, 1.0, station.shape), none),
         attitudes=Attitudes(names, rotation @ turned, none),
@@ -99,15 +107,68 @@ def block_of(images: int, image_points: int, seed: int = 1) -> Network:
             np.full(measured.shape, NOISE_PX * PIXEL_MM),
         ),
     )
+    return network, station
 
 
-def measured(network: Network, datum: str) -> dict[str, Any]:
+def with_lines(network: Network, truth_m: Array, seed: int = 2) -> Network:
+    """Antenna positions of 5 and 8 cm with shift and drift of every line; free interior."""
+    random = np.random.default_rng(seed)
+    n = len(truth_m)
+    line = np.unique(np.round(truth_m[:, 1] / DISTANCE_M), return_inverse=True)[1].astype(np.int64)
+    time_s = 3.0 * np.arange(n, dtype=np.float64)
+    sigma = np.tile([0.05, 0.05, 0.08], (n, 1))
+    lines = int(line.max()) + 1
+    shift, drift = random.normal(0.0, 0.2, (lines, 3)), random.normal(0.0, 1e-4, (lines, 3))
+    since = time_s - (np.bincount(line, time_s) / np.bincount(line))[line]
+    position = truth_m + shift[line] + drift[line] * since[:, None] + random.normal(0.0, sigma)
+    camera = replace(
+        network.cameras[0], free=frozenset({"dx0", "dy0", "df", "k1", "k2", "p1", "p2"})
+    )
+    gnss = Gnss(
+        station=np.arange(n),
+        attitude=np.arange(n),
+        position_m=position,
+        sigma_m=sigma,
+        lever_m=np.zeros((n, 3)),
+        line=line,
+        time_s=time_s,
+        lines=tuple(f"line{k}" for k in range(lines)),
+        drift="linear",
+    )
+    return replace(network, cameras=(camera,), gnss=gnss)
+
+
+def difference(network: Network, settings: AdjustmentSettings) -> dict[str, Any]:
+    """Largest differences between results of the matrix in blocks and of the dense one."""
+    dense = adjust(network, replace(settings, dense_columns=MAX_COLUMNS))
+    blocks = adjust(network, replace(settings, dense_columns=0))
+    own = dense.layout.station[dense.layout.station[:, 0] >= 0]
+    sigma = np.sqrt(dense.cofactors.diagonal())
+    moved = (blocks.state.station - dense.state.station)[dense.layout.station[:, 0] >= 0]
+    points = np.isfinite(dense.point_cofactor).all(axis=(1, 2))
+    spread = np.sqrt(np.einsum("pii->pi", dense.point_cofactor[points]))
+    other = np.sqrt(np.einsum("pii->pi", blocks.point_cofactor[points]))
+    return {
+        "columns": dense.layout.columns,
+        "sigma0": abs(blocks.sigma0 - dense.sigma0),
+        "stations_in_sigmas": float(np.abs(moved / sigma[own]).max()),
+        "sigmas_relative": float(np.abs(np.sqrt(blocks.cofactors.diagonal()) / sigma - 1.0).max()),
+        "point_sigmas_relative": float(np.abs(other / spread - 1.0).max()),
+        "redundancy_numbers": float(
+            np.abs(blocks.redundancy_number - dense.redundancy_number).max()
+        ),
+    }
+
+
+def measured(
+    network: Network, datum: str, settings: AdjustmentSettings | None = None
+) -> dict[str, Any]:
     """One adjustment with all covariances."""
-    settings = AdjustmentSettings()
+    settings = settings or AdjustmentSettings()
     if datum != "control":
         nothing = np.full_like(network.points.sigma_m, np.nan)
         network = replace(network, points=replace(network.points, sigma_m=nothing))
-        settings = AdjustmentSettings(minimum_norm=True, free_datum=cast(FreeDatum, datum))
+        settings = replace(settings, minimum_norm=True, free_datum=cast(FreeDatum, datum))
     begun, cpu = time.perf_counter(), time.process_time()
     result = adjust(network, settings)
     return {
@@ -116,6 +177,8 @@ def measured(network: Network, datum: str) -> dict[str, Any]:
         "image_points": len(network.image_points.image),
         "object_points": len(network.points.names) - int(result.left_out.sum()),
         "unknowns": result.unknowns,
+        "columns": result.layout.columns,
+        "blocks": result.layout.order.blocks if result.layout.order else 1,
         "iterations": len(result.iterations) - 1,
         "sigma0": round(result.sigma0, 4),
         "cpu_s": round(time.process_time() - cpu, 1),
@@ -249,6 +312,9 @@ def main() -> None:
         default=("control",),
         help="Datum of each adjustment; memory is the largest so far (default: control).",
     )
+    parser.add_argument("--lines", action="store_true", help="GNSS lines and a free camera.")
+    parser.add_argument("--robust", action="store_true", help="Huber weights first.")
+    parser.add_argument("--dense", action="store_true", help="Comparison with a dense matrix.")
     parser.add_argument("--peer", action="store_true", help="Comparison with Ceres.")
     options = parser.parse_args()
     print(json.dumps({"machine": machine()}), flush=True)
@@ -256,9 +322,14 @@ def main() -> None:
         for found in compared(building()):
             print(json.dumps(found), flush=True)
         return
-    network = block_of(options.images, options.image_points)
+    network, truth_m = block_of(options.images, options.image_points)
+    if options.lines:
+        network = with_lines(network, truth_m)
+    settings = AdjustmentSettings(robust=options.robust)
     for datum in options.datum:
-        print(json.dumps(measured(network, datum)), flush=True)
+        print(json.dumps(measured(network, datum, settings)), flush=True)
+    if options.dense:
+        print(json.dumps(difference(network, settings)), flush=True)
 
 
 if __name__ == "__main__":

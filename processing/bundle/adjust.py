@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -37,6 +38,7 @@ from processing.bundle.gauss_newton import (
 )
 from processing.bundle.network import Network, NetworkError, validate
 from processing.bundle.normal_equations import (
+    Cofactor,
     ReducedEquations,
     cofactor_matrix,
     null_directions,
@@ -47,7 +49,13 @@ from processing.bundle.robust_weights import WeightFunction, robust_exclusions
 from processing.bundle.statistics import ObservationGroup, groups_of, spread_of
 from processing.bundle.step_control import points_in_front
 from processing.bundle.undetermined_points import undetermined_points
-from processing.bundle.unknowns import ParameterLayout, ParameterValues, initial_values, layout_of
+from processing.bundle.unknowns import (
+    ParameterLayout,
+    ParameterValues,
+    in_blocks,
+    initial_values,
+    layout_of,
+)
 from processing.bundle.variance_components import are_changing, estimable_factors, rescaled
 
 Array = NDArray[np.float64]
@@ -56,6 +64,7 @@ Flags = NDArray[np.bool_]
 _MIN_POINTS: Final = 4
 _MIN_SHARE: Final = 0.3
 _MAX_COMPONENT_ROUNDS: Final = 12
+_MAX_WHOLE: Final = 15_000
 
 
 @dataclass(frozen=True)
@@ -79,6 +88,8 @@ class AdjustmentSettings:
         free_datum: datum of a free network: `unknowns` is the shortest correction of the scaled
             unknowns, the others are inner constraints on object points, stations or all of them.
         datum_names: the points and stations of those inner constraints; empty: all.
+        dense_columns: with more unknowns in addition to the eliminated object points, the reduced
+            matrix is stored in blocks, and so is what is needed of its inverse.
         retained: object points that are not eliminated, so that `cofactor` of the result holds
             their covariances with each other and with all other unknowns.
     """
@@ -96,6 +107,7 @@ class AdjustmentSettings:
     free_datum: FreeDatum = "unknowns"
     datum_names: tuple[str, ...] = ()
     retained: tuple[str, ...] = ()
+    dense_columns: int = 6_000
 
     @property
     def is_snooping(self) -> bool:
@@ -118,7 +130,8 @@ class Adjustment:
         sigma0: a posteriori standard deviation of unit weight.
         redundancy, observations, unknowns: counts; constraints count as observations.
         iterations: weighted sum of squares before each iteration and at the end.
-        cofactor: (c, c) of the columns; times sigma0 squared it is the covariance.
+        cofactors: (c, c) of the columns; times sigma0 squared it is the covariance. Of a
+            large block (`dense_columns`) a `BandCofactor`, which is indexed alike.
         point_cofactor: (points, 3, 3) m squared, zero for held coordinates, NaN for points
             left out.
         equations: the last rows; `residual` (m,) in sigmas of each row, `redundancy_number` (m,).
@@ -145,7 +158,7 @@ class Adjustment:
     observations: int
     unknowns: int
     iterations: tuple[float, ...]
-    cofactor: Array
+    cofactors: Cofactor
     point_cofactor: Array
     equations: Equations
     residual: Array
@@ -162,6 +175,26 @@ class Adjustment:
     tests: int = 0
     problems: tuple[str, ...] = ()
     rank_defects: tuple[RankDefect, ...] = field(default=())
+
+    @cached_property
+    def cofactor(self) -> Array:
+        """The whole of `cofactors`, (c, c); for blocks of up to 15,000 columns.
+
+        Raises:
+            NetworkError: it would not fit into memory.
+        """
+        if isinstance(self.cofactors, np.ndarray):
+            return self.cofactors
+        columns = len(self.cofactors)
+        if columns > _MAX_WHOLE:
+            raise NetworkError(
+                [
+                    f"the covariance matrix of {columns} unknowns does not fit into memory; at "
+                    f"most {_MAX_WHOLE} have one. Standard deviations and covariances of single "
+                    "exposures and points are in the result"
+                ]
+            )
+        return np.asarray(self.cofactors @ np.eye(columns))
 
     @property
     def test_sigma0(self) -> float:
@@ -215,6 +248,8 @@ def adjust(
         if weak.any():
             _refuse_without_points(~undetermined_points(network, began), left_out)
         layout = layout_of(active, left_out, settings.retained)
+        if layout.columns > settings.dense_columns:
+            layout = in_blocks(network, layout)
         run = Run(
             active,
             layout,
@@ -338,7 +373,7 @@ class _Selection:
             self.given,
             result.equations,
             reduced,
-            result.cofactor,
+            result.cofactors,
             result.standardised,
             result.redundancy_number,
             result.test_sigma0,
@@ -374,7 +409,7 @@ class _Selection:
             result.state,
             candidates,
             reduced,
-            result.cofactor,
+            result.cofactors,
             result.test_sigma0,
             limit,
         )
@@ -399,9 +434,7 @@ def _figures(
         motions = free_motions(layout, run.state, reduced)
         expected = scaled_directions(motions, reduced)
         directions, _ = null_directions(reduced, layout.constraints, expected)
-        found = rank_defects(
-            run.network, layout, run.state, reduced, singular=False, directions=directions
-        )
+        found = rank_defects(run.network, layout, run.state, reduced, directions=directions)
     cofactor = cofactor_matrix(reduced, layout.constraints, directions=directions)
     own, leverage, influence = spread_of(rows, reduced, cofactor)
     free_points = layout.eliminated_points
@@ -450,7 +483,7 @@ def _figures(
         observations=observations,
         unknowns=unknowns,
         iterations=tuple(run.history),
-        cofactor=figures.cofactor,
+        cofactors=figures.cofactor,
         point_cofactor=figures.point_cofactor,
         equations=rows,
         residual=residual,

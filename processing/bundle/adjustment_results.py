@@ -110,7 +110,7 @@ def parameters_of(result: Adjustment) -> tuple[AdjustedParameter, ...]:
             UNITS[t.kind] for t in camera.terms
         ]
         free = np.flatnonzero(columns >= 0)
-        own = result.cofactor[np.ix_(columns[free], columns[free])]
+        own = result.cofactors[np.ix_(columns[free], columns[free])]
         spread = np.sqrt(np.clip(np.diag(own), 1e-300, None))
         correlation = own / spread[:, None] / spread
         for k, at in enumerate(free):
@@ -331,7 +331,7 @@ def systematic_residuals(
 def _sigmas(result: Adjustment, columns: NDArray[np.int64], by: Array) -> Array:
     if (columns < 0).any():
         return np.full(3, np.nan)
-    covariance = by @ result.cofactor[np.ix_(columns, columns)] @ by.T
+    covariance = by @ result.cofactors[np.ix_(columns, columns)] @ by.T
     return np.asarray(result.sigma0 * np.sqrt(np.clip(np.diag(covariance), 0.0, None)))
 
 

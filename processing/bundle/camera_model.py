@@ -61,8 +61,10 @@ def ideal_mm(camera: CameraModel, interior: Array, terms: Array, xy_mm: Array) -
         return forward_ideal_mm(camera, interior, xy_mm)
     xy_mm = _placed(camera, terms, xy_mm)
     if camera.model == "australis":
-        x, y = xy_mm[:, 0] - camera.xp_mm, xy_mm[:, 1] - camera.yp_mm
-        return np.asarray(np.stack([x, y], axis=1) + _ten(camera, x, y) @ interior)
+        about = _about_given(camera, xy_mm)
+        if not interior.any():
+            return about
+        return np.asarray(about + _ten(camera, about[:, 0], about[:, 1]) @ interior)
     x, y, _ = _centred(camera, interior, xy_mm)
     delta = np.einsum("nik,k->ni", _ten(camera, x, y)[:, :, 3:8], interior[3:8])
     return np.asarray(np.stack([x, y], axis=1) + delta)

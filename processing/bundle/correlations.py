@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.bundle.adjust import Adjustment
+from processing.bundle.block_band import BandCofactor
+from processing.bundle.normal_equations import Cofactor
 
 Array = NDArray[np.float64]
 
@@ -51,7 +53,8 @@ def high_correlations(
     """Pairs of unknowns whose correlation is beyond a limit.
 
     Args:
-        result: the adjustment; eliminated object points are not looked at.
+        result: the adjustment; eliminated object points are not looked at, nor, in a large block,
+            pairs of exposures without a common object point.
         limit: absolute value of a correlation.
         listed: largest number of named pairs of each group.
 
@@ -62,20 +65,14 @@ def high_correlations(
     Source: docs/explanation/mathematics/bundle.md#correlations.
     """
     unknowns = result.layout.unknowns
-    spread = np.sqrt(np.clip(np.diag(result.cofactor), 1e-300, None))
+    spread = np.sqrt(np.clip(result.cofactors.diagonal(), 1e-300, None))
     kinds = sorted({u.kind for u in unknowns})
     kind = np.array([kinds.index(u.kind) for u in unknowns], dtype=np.int64)
     owners = {name: k for k, name in enumerate(dict.fromkeys(u.owner for u in unknowns))}
     owner = np.array([owners[u.owner] for u in unknowns], dtype=np.int64)
-    found: list[tuple[NDArray[np.int64], NDArray[np.int64], Array]] = []
-    for low in range(0, len(unknowns), _ROWS_AT_ONCE):
-        part = result.cofactor[low : low + _ROWS_AT_ONCE, low:]
-        correlation = part / spread[low : low + _ROWS_AT_ONCE, None] / spread[low:]
-        rows, columns = np.nonzero(np.triu(np.abs(correlation) > limit, 1))
-        found.append((rows + low, columns + low, correlation[rows, columns]))
-    if not found:
+    if not unknowns:
         return ()
-    first, second, value = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    first, second, value = _beyond(result.cofactors, spread, limit)
     # A station and an attitude of the same name are of one exposure.
     is_of_one = owner[first] == owner[second]
     pair = np.sort(np.stack([kind[first], kind[second]], axis=1), axis=1)
@@ -99,3 +96,22 @@ def high_correlations(
     wide = [any(k in _BLOCK_WIDE for k in (g.first_kind, g.second_kind)) for g in groups]
     order = sorted(range(len(groups)), key=lambda k: (not wide[k], -groups[k].count))
     return tuple(groups[k] for k in order)
+
+
+def _beyond(
+    cofactors: Cofactor, spread: Array, limit: float
+) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
+    """Pairs of columns, the first before the second, and their correlations."""
+    if isinstance(cofactors, BandCofactor):
+        first, second, value = cofactors.stored()
+        correlation = value / spread[first] / spread[second]
+        own = (np.abs(correlation) > limit) & (first < second)
+        return first[own], second[own], correlation[own]
+    found = []
+    for low in range(0, len(cofactors), _ROWS_AT_ONCE):
+        part = cofactors[low : low + _ROWS_AT_ONCE, low:]
+        correlation = part / spread[low : low + _ROWS_AT_ONCE, None] / spread[low:]
+        rows, columns = np.nonzero(np.triu(np.abs(correlation) > limit, 1))
+        found.append((rows + low, columns + low, correlation[rows, columns]))
+    rows, columns, value = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    return rows, columns, value

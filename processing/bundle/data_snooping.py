@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from processing.bundle.critical_values import MIN_REDUNDANCY
 from processing.bundle.equations import BehindCameraError, Equations, equations
 from processing.bundle.network import Network
-from processing.bundle.normal_equations import ReducedEquations
+from processing.bundle.normal_equations import Cofactor, ReducedEquations
 from processing.bundle.statistics import observation_cofactors
 from processing.bundle.unknowns import ParameterLayout, ParameterValues
 
@@ -161,7 +161,7 @@ def contradicted(
     network: Network,
     rows: Equations,
     reduced: ReducedEquations,
-    cofactor: Array,
+    cofactor: Cofactor,
     standardised: Array,
     redundancy_number: Array,
     sigma0: float,
@@ -235,7 +235,7 @@ def fitting_again(
     state: ParameterValues,
     excluded: Excluded,
     reduced: ReducedEquations,
-    cofactor: Array,
+    cofactor: Cofactor,
     sigma0: float,
     limit: float,
 ) -> Excluded:
@@ -393,7 +393,7 @@ class _Largest:
 def _joint_sizes(
     rows: Equations,
     reduced: ReducedEquations,
-    cofactor: Array,
+    cofactor: Cofactor,
     chosen: Indices,
     count: int,
     sigma0: float,

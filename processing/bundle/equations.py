@@ -121,8 +121,8 @@ class _Builder:
         self.layout = layout
         self.derivatives = derivatives
         self.count = 0
-        self._rows: list[Indices] = []
-        self._columns: list[Indices] = []
+        self._entries: list[NDArray[np.int32]] = []
+        self._columns: list[NDArray[np.int32]] = []
         self._values: list[Array] = []
         self._tables: list[tuple[Array, Array, Indices, Array, Indices, Indices, Indices]] = []
 
@@ -154,21 +154,24 @@ class _Builder:
             (misclosure[taken] * factor, sigma, group[taken], part, who, source[taken], of_axis)
         )
         if self.derivatives:
-            rows = np.arange(self.count, self.count + n)
-            for every_column, every_value in entries:
-                columns, values = every_column[taken], every_value[taken]
-                there = columns >= 0
-                self._rows.append(np.broadcast_to(rows[:, None], columns.shape)[there])
-                self._columns.append(columns[there])
-                self._values.append((values * factor[:, None])[there])
+            # Nothing of what is held is copied.
+            free = [entry for entry in entries if entry[0].size and entry[0].max() >= 0]
+            none = (np.zeros((len(taken), 0), dtype=np.int32), np.zeros((len(taken), 0)))
+            columns = np.hstack([none[0], *(c.astype(np.int32) for c, _ in free)])[taken]
+            values = np.hstack([none[1], *(v for _, v in free)])[taken] * factor[:, None]
+            there = columns >= 0
+            self._entries.append(there.sum(axis=1, dtype=np.int32))
+            self._columns.append(columns[there])
+            self._values.append(values[there])
         self.count += n
 
     def equations(self) -> Equations:
         joined = [np.concatenate(part) for part in zip(*self._tables, strict=True)]
         shape = (self.count, self.layout.columns)
-        if self._rows:
-            where = (np.concatenate(self._rows), np.concatenate(self._columns))
-            reduced = sparse.coo_array((np.concatenate(self._values), where), shape=shape).tocsr()
+        if self._entries:
+            begin = np.concatenate([[0], np.cumsum(np.concatenate(self._entries))])
+            content = np.concatenate(self._values), np.concatenate(self._columns)
+            reduced = sparse.csr_array((*content, begin.astype(np.int32)), shape=shape)
         else:
             reduced = sparse.csr_array(shape)
         misclosure, sigma, group, part, point, source, axis = joined
@@ -242,17 +245,21 @@ def _image_rows(
             by_station = -by_point * scale[:, None, None]
             if not is_straight:
                 by_point, by_station = by_point @ ray_by_point, by_point @ ray_by_station
-            by_interior = -interior_derivatives(camera, interior, state.terms[index], measured_mm)
-            if camera.model == "centred":
-                by_interior[:, :, 2] = -projected / c
-            elif camera.model != "australis":
-                by_interior[:, :, 2] -= projected / c
             blocks = [
                 (layout.station[station], by_station),
                 (layout.attitude[attitude], by_exposure @ skew(at_exposure)),
-                (np.broadcast_to(layout.interior[index], (len(rows), 10)), by_interior),
                 (layout.retained_points[point], by_point),
             ]
+            if (layout.interior[index] >= 0).any():
+                by_interior = -interior_derivatives(
+                    camera, interior, state.terms[index], measured_mm
+                )
+                if camera.model == "centred":
+                    by_interior[:, :, 2] = -projected / c
+                elif camera.model != "australis":
+                    by_interior[:, :, 2] -= projected / c
+                columns = np.broadcast_to(layout.interior[index], (len(rows), 10))
+                blocks.append((columns, by_interior))
             if camera.terms:
                 columns = np.broadcast_to(layout.terms[index], (len(rows), len(camera.terms)))
                 by_term = -term_derivatives(camera, interior, state.terms[index], measured_mm)

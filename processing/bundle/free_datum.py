@@ -13,7 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.bundle.network import Network, NetworkError
-from processing.bundle.normal_equations import MIN_INFORMATION, ReducedEquations, constrained_matrix
+from processing.bundle.normal_equations import (
+    MIN_INFORMATION,
+    Cofactor,
+    ReducedEquations,
+    constrained_matrix,
+    with_product,
+)
 from processing.bundle.unknowns import ParameterLayout, ParameterValues
 from processing.geometry.rotation import rotations_from_vectors
 
@@ -100,7 +106,7 @@ def free_motions(
     # Orthonormal directions in the scaled space, as combinations of the seven.
     basis, triangle = np.linalg.qr((unit.T @ scaled).T)
     matrix, _ = constrained_matrix(reduced, layout.constraints)
-    values, vectors = np.linalg.eigh(basis.T @ matrix @ basis)
+    values, vectors = np.linalg.eigh(basis.T @ (matrix @ basis))
     null = vectors[:, values < MIN_INFORMATION]
     combinations = (unit @ np.linalg.solve(triangle, null)).T
     ground = state.points - centre
@@ -134,7 +140,7 @@ def scaled_directions(motions: Motions, reduced: ReducedEquations) -> Array:
 class DatumFigures:
     """Cofactors in a datum; shapes as in `Adjustment`."""
 
-    cofactor: Array
+    cofactor: Cofactor
     point_cofactor: Array
     influence: Array
 
@@ -250,8 +256,11 @@ def in_datum(
         "pij,pjd->pid", factor, by_point.transpose(0, 2, 1) - coupled.reshape(-1, 3, d)
     )
     columns = motions.columns
-    cofactor = figures.cofactor - with_t @ columns.T - columns @ with_t.T
-    cofactor += columns @ of_t @ columns.T
+    cofactor = with_product(
+        figures.cofactor,
+        np.hstack([-with_t, -columns, columns @ of_t]),
+        np.hstack([columns, with_t, columns]),
+    )
     point_cofactor = figures.point_cofactor.copy()
     eliminated = layout.eliminated_points
     g = motions.points[eliminated]

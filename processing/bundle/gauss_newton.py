@@ -166,7 +166,7 @@ def solved(run: Run, reduced: ReducedEquations) -> GaussNewtonStep:
         return solve(reduced, run.layout.constraints, directions=directions)
     except SingularError as error:
         raise RankDefectError(
-            rank_defects(run.network, run.layout, run.state, error.reduced, singular=True)
+            rank_defects(run.network, run.layout, run.state, error.reduced)
         ) from None
 
 
@@ -180,15 +180,15 @@ def _refuse_unseparated_times(run: Run, reduced: ReducedEquations) -> None:
     try:
         cofactor = cofactor_matrix(reduced, layout.constraints)
     except SingularError as error:
-        raise RankDefectError(
-            rank_defects(run.network, layout, run.state, error.reduced, singular=True)
-        ) from None
-    lost = times[np.sqrt(np.diag(cofactor)[times]) > _USELESS_TIME_S]
+        raise RankDefectError(rank_defects(run.network, layout, run.state, error.reduced)) from None
+    lost = times[np.sqrt(cofactor.diagonal()[times]) > _USELESS_TIME_S]
     if not lost.size:
         return
-    directions = np.linalg.qr(cofactor[:, lost] * reduced.scale[:, None])[0]
+    unit = np.zeros((layout.columns, len(lost)))
+    unit[lost, np.arange(len(lost))] = 1.0
+    directions = np.linalg.qr((cofactor @ unit) * reduced.scale[:, None])[0]
     raise RankDefectError(
-        rank_defects(run.network, layout, run.state, reduced, singular=True, directions=directions)
+        rank_defects(run.network, layout, run.state, reduced, directions=directions)
     )
 
 

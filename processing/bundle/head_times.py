@@ -57,7 +57,7 @@ def head_times(adjusted: Adjustment) -> tuple[HeadTime, ...]:
         rig.
     """
     network, layout, state = adjusted.network, adjusted.layout, adjusted.state
-    variance = adjusted.sigma0**2 * np.clip(np.diag(adjusted.cofactor), 0.0, None)
+    variance = adjusted.sigma0**2 * np.clip(adjusted.cofactors.diagonal(), 0.0, None)
 
     def sigma(column: int) -> float:
         return float(np.sqrt(variance[column])) if column >= 0 else np.nan

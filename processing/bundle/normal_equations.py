@@ -2,19 +2,23 @@
 
 Each point's three columns are first made orthonormal within the point (its own Cholesky factor), so
 that eliminating it needs a product and no inverse. Columns that most rows touch (interior
-orientation) are stored dense, all others sparse; the reduced matrix itself is dense.
+orientation) are stored dense, all others sparse. The reduced matrix is dense, of a large block in
+blocks near its diagonal (`block_order`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, sparse
 
 from processing import ProcessingError
+from processing.bundle.block_band import BandCofactor, BandFactor, BandMatrix
+from processing.bundle.eliminated_products import add_products
 from processing.bundle.equations import Equations
 from processing.bundle.network import NetworkError
 from processing.bundle.unknowns import ParameterLayout
@@ -22,11 +26,15 @@ from processing.bundle.unknowns import ParameterLayout
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-MAX_COLUMNS = 15_000
-"""Beyond this the reduced matrix takes more than 1.7 GiB."""
+Matrix = Array | BandMatrix
+Cofactor = Array | BandCofactor
+
+MAX_COLUMNS = 150_000
+"""Beyond this even the equations of the object points do not fit into 16 GiB."""
 
 _DENSE_FILL = 0.04
 _HELD_WEIGHT = 1e6
+_SUBSPACE, _SUBSPACE_STEPS = 16, 6
 MIN_INFORMATION = 1e-11
 """Of the reduced matrix over the diagonal it had before points were eliminated; a datum defect
 leaves 1e-14."""
@@ -45,13 +53,13 @@ class ReducedEquations:
     """Normal equations of the columns after elimination of the points.
 
     Attributes:
-        matrix, right: (c, c), (c,): reduced normal equations.
+        matrix, right: (c, c), (c,): reduced normal equations; in the blocks of `layout.order`.
         scale: (c,) square roots of the diagonal before elimination.
         point_factor: (p, 3, 3) inverse transposed Cholesky factor of each point: point rows times
             it are orthonormal.
         point_rows: (m, 3) those rows.
-        coupling_sparse, coupling_dense: (3p, sparse columns), (3p, dense columns) products of
-            `point_rows` with the columns, transposed.
+        row_point: (m,) point of each row, -1 where there is none.
+        coupling_dense: (3p, dense columns) products of `point_rows` with the columns, transposed.
         point_right: (3p,) right-hand side of the orthonormal point unknowns.
         sparse_columns, dense_columns: which columns are which.
         design_sparse, design_dense: the rows themselves, split.
@@ -59,12 +67,12 @@ class ReducedEquations:
         point_diagonal: (p, 3) that diagonal of the points.
     """
 
-    matrix: Array
+    matrix: Matrix
     right: Array
     scale: Array
     point_factor: Array
     point_rows: Array
-    coupling_sparse: sparse.csr_array
+    row_point: Indices
     coupling_dense: Array
     point_right: Array
     sparse_columns: Indices
@@ -73,6 +81,12 @@ class ReducedEquations:
     design_dense: Array
     damping: float
     point_diagonal: Array
+
+    @cached_property
+    def coupling_sparse(self) -> sparse.csr_array:
+        """Products of `point_rows` with the sparse columns, (3p, sparse columns)."""
+        rows = _orthonormal_rows(self.point_rows, self.row_point, len(self.point_factor))
+        return sparse.csr_array(rows.T @ self.design_sparse)
 
 
 @dataclass(frozen=True)
@@ -135,14 +149,7 @@ def reduced_equations(
     """
     columns, points = layout.columns, len(layout.eliminated_points)
     refuse_large_block(columns)
-    design = equations.reduced
-    fill = np.bincount(design.indices, minlength=columns) / max(design.shape[0], 1)
-    dense = np.flatnonzero(fill > _DENSE_FILL)
-    thin = np.flatnonzero(fill <= _DENSE_FILL)
-    by_column = design.tocsc()
-    design_sparse = by_column[:, thin].tocsr()
-    design_dense = by_column[:, dense].toarray()
-
+    thin, dense, design_sparse, design_dense = _split(equations.reduced, layout)
     normals = point_normals(equations, layout)
     of_points = normals[:, range(3), range(3)].copy()
     normals[:, range(3), range(3)] += damping * of_points
@@ -150,35 +157,68 @@ def reduced_equations(
         normals += _HELD_WEIGHT * held[:, :, None] * held[:, None, :]
     factor = np.linalg.inv(np.linalg.cholesky(normals))
     factor = np.swapaxes(factor, 1, 2)
-    at = np.clip(equations.point, 0, None)
     if points:
+        at = np.clip(equations.point, 0, None)
         own = np.einsum("mi,mij->mj", equations.point_part, factor[at])
     else:
         own = np.zeros_like(equations.point_part)
-    there = equations.point >= 0
-    wide = (3 * equations.point[there, None] + np.arange(3)).ravel()
-    begin = np.concatenate([[0], np.cumsum(3 * there)])
-    orthonormal = sparse.csr_array((own[there].ravel(), wide, begin), shape=(len(at), 3 * points))
-    coupling_sparse = (orthonormal.T @ design_sparse).tocsr()
+    orthonormal = _orthonormal_rows(own, equations.point, points)
     coupling_dense = np.asarray(orthonormal.T @ design_dense)
     point_right = np.asarray(orthonormal.T @ equations.misclosure)
 
-    matrix = np.zeros((columns, columns))
-    cross = np.asarray(design_sparse.T @ design_dense)
-    own_sparse = (design_sparse.T @ design_sparse).toarray()
+    # Products of sparse columns with dense ones and with the misclosures.
+    across = np.empty((len(thin), len(dense) + 1))
+    across[:, :-1] = design_sparse.T @ design_dense
+    across[:, -1] = design_sparse.T @ equations.misclosure
+    order = layout.order
+    if order is None:
+        place, row_offset = np.arange(columns), columns * np.arange(columns)
+        values = np.zeros(columns**2)
+    else:
+        place, row_offset = order.place, order.row_offset
+        values = np.zeros(int(order.block_offset[-1]))
+    rows = np.argsort(equations.point, kind="stable")
+    add_products(
+        rows,
+        np.searchsorted(equations.point[rows], np.arange(points + 1)),
+        design_sparse.indptr,
+        design_sparse.indices,
+        design_sparse.data,
+        own,
+        coupling_dense.reshape(points, 3, len(dense)),
+        point_right.reshape(points, 3),
+        place[thin],
+        row_offset,
+        values,
+        across,
+    )
     own_dense = design_dense.T @ design_dense
     diagonal = np.zeros(columns)
-    diagonal[thin], diagonal[dense] = own_sparse.diagonal(), own_dense.diagonal()
-    own_sparse -= (coupling_sparse.T @ coupling_sparse).toarray()
-    cross -= np.asarray(coupling_sparse.T @ coupling_dense)
+    diagonal[thin] = np.bincount(
+        design_sparse.indices, weights=design_sparse.data**2, minlength=len(thin)
+    )
+    diagonal[dense] = own_dense.diagonal()
     own_dense -= coupling_dense.T @ coupling_dense
-    matrix[np.ix_(thin, thin)] = own_sparse
-    matrix[np.ix_(thin, dense)] = cross
-    matrix[np.ix_(dense, thin)] = cross.T
-    matrix[np.ix_(dense, dense)] = own_dense
-    matrix[range(columns), range(columns)] += damping * diagonal
+    matrix: Matrix
+    if order is None:
+        matrix = values.reshape(columns, columns)
+        matrix += np.tril(matrix, -1).T
+        matrix[np.ix_(thin, dense)] = across[:, :-1]
+        matrix[np.ix_(dense, thin)] = across[:, :-1].T
+        matrix[np.ix_(dense, dense)] = own_dense
+        matrix[range(columns), range(columns)] += damping * diagonal
+    else:
+        matrix = BandMatrix(order, values)
+        matrix.mirrored()
+        border, of_thin, of_dense = matrix.border(), place[thin], place[dense]
+        border[np.ix_(of_dense - order.local, of_thin)] += across[:, :-1].T
+        tied = np.flatnonzero(of_thin >= order.local)
+        border[np.ix_(of_thin[tied] - order.local, of_dense)] += across[tied, :-1]
+        border[np.ix_(of_dense - order.local, of_dense)] += own_dense
+        if damping > 0.0:
+            matrix = matrix.diagonal_added(damping * diagonal)
     right = np.zeros(columns)
-    right[thin] = design_sparse.T @ equations.misclosure - coupling_sparse.T @ point_right
+    right[thin] = across[:, -1]
     right[dense] = design_dense.T @ equations.misclosure - coupling_dense.T @ point_right
     return ReducedEquations(
         matrix=matrix,
@@ -186,7 +226,7 @@ def reduced_equations(
         scale=np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0)),
         point_factor=factor,
         point_rows=own,
-        coupling_sparse=coupling_sparse,
+        row_point=equations.point,
         coupling_dense=coupling_dense,
         point_right=point_right,
         sparse_columns=thin,
@@ -198,8 +238,40 @@ def reduced_equations(
     )
 
 
+def _split(
+    design: sparse.csr_array, layout: ParameterLayout
+) -> tuple[Indices, Indices, sparse.csr_array, Array]:
+    """Sparse and dense columns, and the rows split by them."""
+    rows, columns = design.shape
+    fill = np.bincount(design.indices, minlength=columns) / max(rows, 1)
+    is_dense = fill > _DENSE_FILL
+    if layout.order is not None:
+        is_dense &= layout.order.place >= layout.order.local
+    thin, dense = np.flatnonzero(~is_dense), np.flatnonzero(is_dense)
+    number = np.empty(columns, dtype=np.int32)
+    number[thin], number[dense] = np.arange(len(thin)), np.arange(len(dense))
+    of_dense = is_dense[design.indices]
+    begin = np.concatenate([[0], np.cumsum(~of_dense)])[design.indptr].astype(np.int32)
+    at = number[design.indices]
+    design_sparse = sparse.csr_array(
+        (design.data[~of_dense], at[~of_dense], begin), shape=(rows, len(thin))
+    )
+    design_dense = np.zeros((rows, len(dense)))
+    row = np.repeat(np.arange(rows), np.diff(design.indptr))
+    design_dense[row[of_dense], at[of_dense]] = design.data[of_dense]
+    return thin, dense, design_sparse, design_dense
+
+
+def _orthonormal_rows(own: Array, point: Indices, points: int) -> sparse.csr_array:
+    """Point parts of rows as a sparse matrix, (m, 3p)."""
+    there = point >= 0
+    wide = (3 * point[there, None] + np.arange(3)).ravel()
+    begin = np.concatenate([[0], np.cumsum(3 * there)])
+    return sparse.csr_array((own[there].ravel(), wide, begin), shape=(len(point), 3 * points))
+
+
 def refuse_large_block(columns: int) -> None:
-    """Refuse a block whose reduced normal matrix would not fit into memory.
+    """Refuse a block that would not fit into memory.
 
     Args:
         columns: unknowns in addition to the object points; six of an exposure that is free.
@@ -216,7 +288,7 @@ def refuse_large_block(columns: int) -> None:
         )
 
 
-def constrained_matrix(reduced: ReducedEquations, constraints: Array) -> tuple[Array, Array]:
+def constrained_matrix(reduced: ReducedEquations, constraints: Array) -> tuple[Matrix, Array]:
     """The scaled reduced matrix with constraints added, and the scaled constraint rows of norm 1.
 
     Adding C'C leaves the solution under C dx = 0 as it is and gives its directions information.
@@ -229,12 +301,34 @@ def constrained_matrix(reduced: ReducedEquations, constraints: Array) -> tuple[A
         Matrix, shape (c, c), of unknowns multiplied by `reduced.scale`, and rows, shape (k, c), of
         the same.
     """
-    scaled = reduced.matrix / reduced.scale[:, None] / reduced.scale
+    matrix = reduced.matrix
+    if isinstance(matrix, BandMatrix):
+        scaled: Matrix = matrix.scaled(1.0 / reduced.scale)
+    else:
+        scaled = matrix / reduced.scale[:, None] / reduced.scale
     if not len(constraints):
         return scaled, constraints
     rows = constraints / reduced.scale
     rows = rows / np.linalg.norm(rows, axis=1, keepdims=True)
+    if isinstance(scaled, BandMatrix):
+        return scaled.with_border_rows(rows), rows
     return scaled + rows.T @ rows, rows
+
+
+def weak_directions(matrix: Matrix) -> Array:
+    """Directions of a scaled matrix with less information than `MIN_INFORMATION`.
+
+    Args:
+        matrix: from `constrained_matrix`.
+
+    Returns:
+        Orthonormal, shape (c, n); at least the weakest.
+    """
+    if isinstance(matrix, BandMatrix):
+        values, vectors = _weakest(matrix)
+    else:
+        values, vectors = linalg.eigh(matrix)
+    return np.asarray(vectors[:, : max(1, int((values < MIN_INFORMATION).sum()))])
 
 
 def null_directions(
@@ -252,6 +346,10 @@ def null_directions(
         only then no eigenvalues were needed.
     """
     matrix, _ = constrained_matrix(reduced, constraints)
+    if isinstance(matrix, BandMatrix):
+        if _held(matrix, expected).factor(MIN_INFORMATION) is None:
+            raise SingularError(reduced)
+        return expected, True
     if len(matrix) and _cholesky(matrix + expected @ expected.T) is not None:
         return expected, True
     values, vectors = linalg.eigh(matrix)
@@ -286,9 +384,12 @@ def solve(
         dx = dx / reduced.scale
     else:
         dx = np.zeros(0)
+    moved = reduced.design_sparse @ dx[reduced.sparse_columns]
+    orthonormal = _orthonormal_rows(
+        reduced.point_rows, reduced.row_point, len(reduced.point_factor)
+    )
     back = reduced.point_right - (
-        reduced.coupling_sparse @ dx[reduced.sparse_columns]
-        + reduced.coupling_dense @ dx[reduced.dense_columns]
+        orthonormal.T @ moved + reduced.coupling_dense @ dx[reduced.dense_columns]
     )
     dpoints = np.einsum("pij,pj->pi", reduced.point_factor, back.reshape(-1, 3))
     predicted_decrease = float(reduced.right @ dx + reduced.point_right @ reduced.point_right)
@@ -301,7 +402,7 @@ def solve(
 
 def cofactor_matrix(
     reduced: ReducedEquations, constraints: Array, *, directions: Array | None = None
-) -> Array:
+) -> Cofactor:
     """Cofactors of the columns, constraints and eliminated points taken into account.
 
     Args:
@@ -311,7 +412,8 @@ def cofactor_matrix(
             they have no variance. None: an error where there are any.
 
     Returns:
-        Shape (c, c); times sigma0 squared it is the covariance.
+        Shape (c, c); times sigma0 squared it is the covariance. Of a matrix in blocks, what is
+        stored of it.
 
     Raises:
         SingularError: directions without information.
@@ -319,6 +421,8 @@ def cofactor_matrix(
     if not len(reduced.right):
         return np.zeros((0, 0))
     matrix, rows = constrained_matrix(reduced, constraints)
+    if isinstance(matrix, BandMatrix):
+        return _band_cofactor(matrix, reduced, rows, directions)
     if directions is not None:
         matrix = matrix + directions @ directions.T
     factor = _factor(matrix, reduced)
@@ -332,6 +436,67 @@ def cofactor_matrix(
         spread = inverse @ rows.T
         inverse -= spread @ np.linalg.pinv(rows @ spread) @ spread.T
     return np.asarray(inverse / reduced.scale[:, None] / reduced.scale)
+
+
+def with_product(cofactor: Cofactor, left: Array, right: Array) -> Cofactor:
+    """Cofactors with a product of few columns added.
+
+    Args:
+        cofactor: shape (c, c).
+        left, right: shape (c, k); left @ right.T is symmetric.
+
+    Returns:
+        The sum.
+    """
+    if isinstance(cofactor, BandCofactor):
+        return cofactor.added(left, right)
+    return np.asarray(cofactor + left @ right.T)
+
+
+def _band_cofactor(
+    matrix: BandMatrix, reduced: ReducedEquations, rows: Array, directions: Array | None
+) -> BandCofactor:
+    if directions is not None:
+        matrix = _held(matrix, directions)
+    factor = matrix.factor(MIN_INFORMATION)
+    if factor is None:
+        raise SingularError(reduced)
+    result = factor.inverse(reduced.scale)
+    if directions is not None:
+        # P Z P with P = 1 - G G', in scaled unknowns; then back to columns.
+        spread = factor.solve(directions)
+        middle = directions.T @ spread
+        left = np.hstack([-directions, -spread, directions @ middle])
+        right = np.hstack([spread, directions, directions])
+        result = result.added(left / reduced.scale[:, None], right / reduced.scale[:, None])
+    if len(rows):
+        of_columns = (rows * reduced.scale).T
+        spread = result @ of_columns
+        result = result.added(-spread @ np.linalg.pinv(of_columns.T @ spread), spread)
+    return result
+
+
+def _held(matrix: BandMatrix, directions: Array) -> BandMatrix:
+    """The matrix with as many unknowns held as there are directions without information."""
+    if not directions.shape[1]:
+        return matrix
+    _, _, pivots = linalg.qr(directions.T, pivoting=True, mode="economic")
+    hold = np.zeros(len(directions))
+    hold[pivots[: directions.shape[1]]] = 1.0
+    return matrix.diagonal_added(hold)
+
+
+def _weakest(matrix: BandMatrix) -> tuple[Array, Array]:
+    """The smallest eigenvalues and their vectors, by subspace iteration."""
+    columns = len(matrix.order.columns)
+    factor = matrix.diagonal_added(np.full(columns, 10.0 * MIN_INFORMATION)).factor(0.0)
+    basis = np.random.default_rng(1).normal(size=(columns, min(_SUBSPACE, columns)))
+    if factor is None:
+        raise ProcessingError("the reduced matrix has negative eigenvalues")
+    for _ in range(_SUBSPACE_STEPS):
+        basis = np.linalg.qr(factor.solve(basis))[0]
+    values, vectors = np.linalg.eigh(basis.T @ (matrix @ basis))
+    return values, basis @ vectors
 
 
 def _factor(matrix: Array, reduced: ReducedEquations) -> Array:
@@ -350,8 +515,10 @@ def _cholesky(matrix: Array) -> Array | None:
 
 
 def _inverse_action(
-    matrix: Array, reduced: ReducedEquations, directions: Array | None
+    matrix: Matrix, reduced: ReducedEquations, directions: Array | None
 ) -> Callable[[Array], Array]:
+    if isinstance(matrix, BandMatrix):
+        return _band_action(matrix, reduced, directions)
     if directions is None:
         factor = _factor(matrix, reduced)
         return lambda right: np.asarray(linalg.cho_solve((factor, True), right, check_finite=False))
@@ -368,3 +535,22 @@ def _inverse_action(
     known = values > MIN_INFORMATION
     eigenvectors, weights = vectors[:, known], 1.0 / values[known]
     return lambda right: np.asarray(eigenvectors @ ((weights * (eigenvectors.T @ right).T).T))
+
+
+def _band_action(
+    matrix: BandMatrix, reduced: ReducedEquations, directions: Array | None
+) -> Callable[[Array], Array]:
+    if directions is not None:
+        matrix = _held(matrix, directions)
+    factor: BandFactor | None = matrix.factor(MIN_INFORMATION)
+    if factor is None:
+        raise SingularError(reduced)
+    if directions is None:
+        return factor.solve
+
+    def across(right: Array) -> Array:
+        right = right - directions @ (directions.T @ right)
+        found = factor.solve(right)
+        return np.asarray(found - directions @ (directions.T @ found))
+
+    return across

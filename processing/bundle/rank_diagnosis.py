@@ -18,7 +18,11 @@ from scipy import linalg
 from processing import ProcessingError
 from processing.bundle.free_datum import motion_columns
 from processing.bundle.network import Network
-from processing.bundle.normal_equations import MIN_INFORMATION, ReducedEquations, constrained_matrix
+from processing.bundle.normal_equations import (
+    ReducedEquations,
+    constrained_matrix,
+    weak_directions,
+)
 from processing.bundle.unknowns import ParameterLayout, ParameterValues, Unknown
 
 Array = NDArray[np.float64]
@@ -62,7 +66,6 @@ def rank_defects(
     state: ParameterValues,
     reduced: ReducedEquations,
     *,
-    singular: bool,
     directions: Array | None = None,
 ) -> tuple[RankDefect, ...]:
     """Name every direction of the unknowns that has no information.
@@ -73,21 +76,16 @@ def rank_defects(
         state: its values.
         reduced: its reduced equations.
         directions: what has no information, orthonormal in the scaled unknowns, shape (c, k); None:
-            found here.
-        singular: they could not be solved; the weakest direction is reported at least.
+            found here, the weakest at least.
 
     Returns:
-        Datum motions of the whole block first, then the other directions; empty where there are
-        none and `singular` is False.
+        Datum motions of the whole block first, then the other directions.
 
     Source: docs/explanation/mathematics/bundle.md#rank-and-free-networks.
     """
     if directions is None:
         matrix, _ = constrained_matrix(reduced, layout.constraints)
-        values, vectors = linalg.eigh(matrix)
-        directions = vectors[:, values < MIN_INFORMATION]
-        if singular and not directions.shape[1]:
-            directions = vectors[:, :1]
+        directions = weak_directions(matrix)
     none = directions
     if not none.shape[1]:
         return ()

@@ -8,19 +8,23 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from processing.bundle.block_band import BandCofactor
+from processing.bundle.eliminated_products import add_spread
 from processing.bundle.equations import Equations
-from processing.bundle.normal_equations import ReducedEquations
+from processing.bundle.normal_equations import Cofactor, ReducedEquations
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 _PART_BYTES = 64_000_000
-_PART_ROWS = 200_000
+_PART_ROWS = 100_000
+_WINDOW_COLUMNS = 6_000
 
 
 @dataclass(frozen=True)
@@ -40,7 +44,7 @@ class ObservationGroup:
 
 
 def spread_of(
-    equations: Equations, reduced: ReducedEquations, cofactor: Array
+    equations: Equations, reduced: ReducedEquations, cofactor: Cofactor
 ) -> tuple[Array, Array, Array]:
     """Cofactors of the eliminated points, and how errors of observations pass into unknowns.
 
@@ -56,117 +60,120 @@ def spread_of(
         part b has the leverage b b' + (a - b W) Q (a - b W)', W being the point's coupling with the
         columns.
     """
-    leverage = np.einsum("mi,mi->m", reduced.point_rows, reduced.point_rows)
-    leverage += _own_products(reduced, cofactor)
+    dense, design = reduced.dense_columns, reduced.design_dense
     points = len(reduced.point_factor)
+    among_dense = cofactors_between(cofactor, dense)
+    leverage = np.einsum("mi,mi->m", reduced.point_rows, reduced.point_rows)
+    leverage += np.einsum("md,md->m", design @ among_dense, design)
     influence = np.zeros((len(equations.point), 3))
     through = np.zeros((points, 3, 3))
-    order = np.argsort(equations.point, kind="stable")
-    begin = np.searchsorted(equations.point[order], np.arange(points + 1))
-    for low, high in _point_ranges(begin):
-        rows = order[begin[low] : begin[high]]
-        local = equations.point[rows] - low
-        part, mixed = _through_columns(reduced, cofactor, rows, local, low, high)
-        through[low:high] = part
-        b = reduced.point_rows[rows]
-        back = np.einsum("mij,mj->mi", part[local], b)
-        leverage[rows] += np.einsum("mi,mi->m", b, back - 2.0 * mixed)
-        factor = reduced.point_factor[equations.point[rows]]
-        influence[rows] = np.einsum("mij,mj->mi", factor, b + back - mixed)
+    for part in _parts(equations, reduced, cofactor):
+        add_spread(
+            part.rows,
+            part.begin,
+            equations.point,
+            reduced.design_sparse.indptr,
+            reduced.design_sparse.indices,
+            reduced.design_sparse.data,
+            design,
+            reduced.point_rows,
+            reduced.coupling_dense.reshape(points, 3, len(dense)),
+            (reduced.coupling_dense @ among_dense).reshape(points, 3, len(dense)),
+            reduced.point_factor,
+            part.window,
+            part.at_sparse,
+            part.at_dense,
+            leverage,
+            influence,
+            through,
+        )
     inner = through + np.eye(3)
     factor = reduced.point_factor
     cofactors = np.einsum("pij,pjk,plk->pil", factor, inner, factor)
     return np.asarray(cofactors), np.asarray(np.clip(leverage, 0.0, 1.0)), influence
 
 
-def _point_ranges(begin: Indices) -> Iterator[tuple[int, int]]:
-    """Ranges of points of about `_PART_ROWS` rows; row `begin[k]` is the first of point k."""
-    low, points = 0, len(begin) - 1
-    while low < points:
+def cofactors_between(cofactor: Cofactor, columns: Indices) -> Array:
+    """Cofactors between columns; of a large block only those of exposures with common points.
+
+    Args:
+        cofactor: of the columns.
+        columns: shape (k,).
+
+    Returns:
+        Shape (k, k).
+    """
+    if isinstance(cofactor, BandCofactor):
+        return cofactor.window(columns)
+    return np.asarray(cofactor[np.ix_(columns, columns)])
+
+
+class _Part(NamedTuple):
+    """Rows by point (single ones without), first of each, and cofactors of their columns."""
+
+    rows: Indices
+    begin: Indices
+    window: Array
+    at_sparse: Indices
+    at_dense: Indices
+
+
+def _parts(equations: Equations, reduced: ReducedEquations, cofactor: Cofactor) -> Iterator[_Part]:
+    """All rows at once where all cofactors are there; else such as are near each other."""
+    thin, dense = reduced.sparse_columns, reduced.dense_columns
+    points, rows = len(reduced.point_factor), len(equations.point)
+    loose = equations.point < 0
+    group = np.where(loose, points + np.arange(rows), equations.point)
+    if not isinstance(cofactor, BandCofactor):
+        order = np.argsort(group, kind="stable")
+        yield _Part(order, _begin(group[order]), cofactor, thin, dense)
+        return
+    place = _first_places(reduced.design_sparse, cofactor.order.place[thin])
+    nearest = np.full(points + rows, len(cofactor), dtype=np.int64)
+    np.minimum.at(nearest, group, place)
+    order = np.lexsort((group, nearest[group]))
+    begin = _begin(group[order])
+    for low, high in _group_ranges(begin):
+        own = order[begin[low] : begin[high]]
+        taken = reduced.design_sparse[own].indices
+        columns = np.concatenate([thin[np.unique(taken)], dense])
+        at = np.full(len(cofactor), -1, dtype=np.int64)
+        at[columns] = np.arange(len(columns))
+        yield _Part(
+            own,
+            begin[low : high + 1] - begin[low],
+            cofactor.window(columns),
+            at[thin],
+            at[dense],
+        )
+
+
+def _begin(group: Indices) -> Indices:
+    """First of each run of equal numbers, and the end."""
+    return np.concatenate([np.flatnonzero(np.diff(group, prepend=-1)), [len(group)]])
+
+
+def _first_places(design: sparse.csr_array, place: Indices) -> Indices:
+    """Smallest place of the columns of each row; beyond the last where it has none."""
+    result = np.full(design.shape[0], len(place), dtype=np.int64)
+    filled = np.flatnonzero(np.diff(design.indptr))
+    if len(filled):
+        result[filled] = np.minimum.reduceat(place[design.indices], design.indptr[filled])
+    return result
+
+
+def _group_ranges(begin: Indices) -> Iterator[tuple[int, int]]:
+    """Ranges of groups of about `_PART_ROWS` rows; row `begin[k]` is the first of group k."""
+    low, groups = 0, len(begin) - 1
+    while low < groups:
         high = int(np.searchsorted(begin, begin[low] + _PART_ROWS, side="right")) - 1
-        high = min(max(high, low + 1), points)
+        high = min(max(high, low + 1), groups)
         yield low, high
         low = high
 
 
-def _through_columns(
-    reduced: ReducedEquations, cofactor: Array, rows: Indices, local: Indices, low: int, high: int
-) -> tuple[Array, Array]:
-    """W Q W' of the points low..high (n, 3, 3), and W Q a' of their rows (m, 3).
-
-    Only cofactors between a point's own columns are needed: those of the images that see it, and
-    dense ones.
-    """
-    thin, dense = reduced.sparse_columns, reduced.dense_columns
-    n, design, b = high - low, reduced.design_sparse[rows], reduced.point_rows[rows]
-    row = np.repeat(np.arange(len(rows)), np.diff(design.indptr))
-    width = max(len(thin), 1)
-    keys, place = np.unique(local[row] * width + design.indices, return_inverse=True)
-    coupling = np.stack(
-        [
-            np.bincount(place, weights=b[row, axis] * design.data, minlength=len(keys))
-            for axis in range(3)
-        ],
-        axis=1,
-    ).astype(np.float64)
-    columns = thin[keys % width]
-    first = np.searchsorted(keys // width, np.arange(n + 1))
-    count = np.diff(first)
-    of_dense = reduced.coupling_dense[3 * low : 3 * high].reshape(n, 3, -1)
-    among_dense = cofactor[np.ix_(dense, dense)]
-    spread, spread_dense = np.zeros((len(keys), 3)), np.zeros((n, 3, len(dense)))
-    through = np.zeros((n, 3, 3))
-    for size in np.unique(count):
-        of_size = np.flatnonzero(count == size)
-        step = max(1, _PART_BYTES // (8 * max(int(size), 1) * (int(size) + len(dense) + 1)))
-        for begin in range(0, len(of_size), step):
-            own = of_size[begin : begin + step]
-            at = first[own][:, None] + np.arange(size)
-            c, d, its = coupling[at].transpose(0, 2, 1), of_dense[own], columns[at]
-            across = cofactor[its[:, :, None], dense]
-            s = c @ cofactor[its[:, :, None], its[:, None, :]] + d @ across.transpose(0, 2, 1)
-            s_dense = c @ across + d @ among_dense
-            spread[at], spread_dense[own] = s.transpose(0, 2, 1), s_dense
-            through[own] = s @ c.transpose(0, 2, 1) + s_dense @ d.transpose(0, 2, 1)
-    mixed = np.stack(
-        [
-            np.bincount(row, weights=design.data * spread[place, axis], minlength=len(rows))
-            for axis in range(3)
-        ],
-        axis=1,
-    ).astype(np.float64)
-    if len(dense):
-        mixed += np.einsum("md,mid->mi", reduced.design_dense[rows], spread_dense[local])
-    return through, mixed
-
-
-def _own_products(reduced: ReducedEquations, cofactor: Array) -> Array:
-    """a Q a' of every row's columns a, (m,): rows with as many sparse entries go together."""
-    thin, dense = reduced.sparse_columns, reduced.dense_columns
-    rows, among_dense = reduced.design_sparse, cofactor[np.ix_(dense, dense)]
-    result = np.einsum("md,md->m", reduced.design_dense @ among_dense, reduced.design_dense)
-    entries = np.diff(rows.indptr)
-    for count in np.unique(entries):
-        if count == 0:
-            continue
-        of_count = np.flatnonzero(entries == count)
-        step = max(1, _PART_BYTES // (8 * int(count) * (int(count) + len(dense))))
-        for first in range(0, len(of_count), step):
-            own = of_count[first : first + step]
-            at = rows.indptr[own][:, None] + np.arange(count)
-            columns, values = thin[rows.indices[at]], rows.data[at]
-            between = cofactor[columns[:, :, None], columns[:, None, :]]
-            result[own] += np.einsum("mi,mij,mj->m", values, between, values)
-            if len(dense):
-                across = cofactor[columns[:, :, None], dense]
-                result[own] += 2.0 * np.einsum(
-                    "mi,mid,md->m", values, across, reduced.design_dense[own]
-                )
-    return np.asarray(result)
-
-
 def observation_cofactors(
-    equations: Equations, rows: Indices, reduced: ReducedEquations, cofactor: Array
+    equations: Equations, rows: Indices, reduced: ReducedEquations, cofactor: Cofactor
 ) -> Array:
     """Cofactors of adjusted or predicted observations.
 
@@ -184,9 +191,15 @@ def observation_cofactors(
     result = np.zeros((count, width, width))
     thin, dense = reduced.sparse_columns, reduced.dense_columns
     points = 3 * len(reduced.point_factor)
-    step = max(1, _PART_BYTES // (8 * width * max(len(cofactor), 1)))
+    columns, near = equations.reduced.shape[1], np.arange(count)
+    if isinstance(cofactor, BandCofactor):
+        columns = min(columns, _WINDOW_COLUMNS)
+        place = _first_places(equations.reduced, cofactor.order.place)
+        near = np.argsort(place[rows[:, 0]], kind="stable")
+    step = max(1, _PART_BYTES // (8 * width * max(columns, 1)))
     for low in range(0, count, step):
-        flat = rows[low : low + step].ravel()
+        chosen = near[low : low + step]
+        flat = rows[chosen].ravel()
         part, at = np.zeros((len(flat), 3)), np.clip(equations.point[flat], 0, None)
         if points:
             part = np.einsum("mi,mij->mj", equations.point_part[flat], reduced.point_factor[at])
@@ -197,13 +210,13 @@ def observation_cofactors(
         design = equations.reduced[flat]
         own = (design[:, thin] - through @ reduced.coupling_sparse).tocsr()
         own_dense = design[:, dense].toarray() - through @ reduced.coupling_dense
-        spread = own @ cofactor[thin] + own_dense @ cofactor[dense]
+        used = np.unique(own.indices)
+        own = sparse.hstack([own[:, used], sparse.csr_array(own_dense)], format="csr")
+        spread = own @ cofactors_between(cofactor, np.concatenate([thin[used], dense]))
         for i in range(width):
             for j in range(width):
-                result[low : low + step, i, j] = (
-                    _row_products(own[i::width], spread[j::width][:, thin])
-                    + np.einsum("md,md->m", own_dense[i::width], spread[j::width][:, dense])
-                    + np.einsum("mi,mi->m", part[i::width], part[j::width])
+                result[chosen, i, j] = _row_products(own[i::width], spread[j::width]) + np.einsum(
+                    "mi,mi->m", part[i::width], part[j::width]
                 )
     return result
 

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.bundle.block_order import LOCAL_KINDS, BlockOrder, block_order
 from processing.bundle.network import INTERIOR, LinearConstraint, Network, NetworkError
 from processing.geometry.rotation import rotations_from_vectors
 
@@ -51,6 +52,7 @@ class ParameterLayout:
         locked: (points, 3) coordinates that are held.
         unknowns: what each column is.
         constraints: (c, columns) rows; corrections summed over all iterations obey them.
+        order: places of the columns of a large block; None: the reduced matrix is dense.
     """
 
     station: Indices
@@ -70,6 +72,7 @@ class ParameterLayout:
     locked: NDArray[np.bool_]
     unknowns: tuple[Unknown, ...]
     constraints: Array
+    order: BlockOrder | None = None
 
     @property
     def columns(self) -> int:
@@ -244,6 +247,26 @@ def layout_of(
         unknowns=tuple(columns),
         constraints=_constraints(network, columns),
     )
+
+
+def in_blocks(network: Network, layout: ParameterLayout) -> ParameterLayout:
+    """The layout with an order in which the reduced matrix has blocks near its diagonal.
+
+    Args:
+        network: which image sees which object point.
+        layout: columns.
+
+    Returns:
+        The same columns, with `order`.
+
+    Raises:
+        NetworkError: there is no such order that fits into memory.
+    """
+    local = np.array([u.kind in LOCAL_KINDS for u in layout.unknowns], dtype=bool)
+    tied = ~local | (layout.constraints != 0.0).any(axis=0)
+    of_images = np.column_stack([layout.jitter, layout.pattern])
+    order = block_order(network, layout.station, layout.attitude, of_images, layout.columns, tied)
+    return replace(layout, order=order)
 
 
 def apply_corrections(

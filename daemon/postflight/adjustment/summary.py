@@ -339,7 +339,7 @@ def _areas(result: Adjustment) -> dict[str, Any]:
 
 def _lines(result: Adjustment) -> list[dict[str, Any]]:
     gnss, layout = result.network.gnss, result.layout
-    spread = result.sigma0 * np.sqrt(np.clip(np.diag(result.cofactor), 0.0, None))
+    spread = result.sigma0 * np.sqrt(np.clip(result.cofactors.diagonal(), 0.0, None))
 
     def sigma(columns: NDArray[np.int64]) -> list[float]:
         return [float(spread[c]) if c >= 0 else math.nan for c in columns]
