@@ -92,6 +92,14 @@ def test_the_planned_line_is_on_the_map_with_the_holes_in_what_was_flown(
     service: Service, browser: Browser
 ) -> None:
     browser.wait_for("document.querySelector('.line-label')?.innerText === 'A1'", WITHIN_S)
+    # Planned positions are thousands in a large plan: pixels of one canvas, no elements.
+    browser.wait_for(
+        """(({ width, height }, context) => context.getImageData(0, 0, width, height).data
+            .some((value, k) => k % 4 === 3 && value))
+            (...[document.querySelector("#map .leaflet-places-pane canvas")]
+                .flatMap((canvas) => [canvas, canvas.getContext("2d")]))""",
+        WITHIN_S,
+    )
     assert browser.evaluate("document.querySelectorAll('#segments tr').length") == 0
     # An image covers 169 m along the line; between 340 m and 640 m none was made.
     for number, north_m in enumerate((0, 68, 136, 204, 272, 340, 640, 708, 776), start=4):

@@ -8,6 +8,7 @@ import { fetchJson, fetchOk } from "./http.js";
 const FILES = { "fly-again.geojson": "GeoJSON", "fly-again.kml": "KML", "fly-again.waypoints": "MAVLink", "fly-again.csv": "CSV" };
 const ACTIONS = ["verify", "copy", "report", "shutdown"];
 const REFRESH_MS = 5000;
+const REFRESH_IN_FLIGHT_MS = 60000;
 const GPS_EPOCH_UNIX_S = 315964800;
 
 // The last advice and its files, since the service may have ended when they are wanted.
@@ -21,8 +22,8 @@ function followMission(id) {
   temperatureRange = null;
 }
 
-async function keep() {
-  if (Date.now() - kept.atMs < REFRESH_MS) return;
+async function keep(hasLanded) {
+  if (Date.now() - kept.atMs < (hasLanded ? REFRESH_MS : REFRESH_IN_FLIGHT_MS)) return;
   kept.atMs = Date.now();
   const { mission } = kept;
   const advice = await fetchJson("/api/v1/advice");
@@ -166,7 +167,7 @@ export function start(root, feed) {
       kept.atMs = 0;
       feed.showTab("flight");
     }
-    if (record && feed.isLinked && (hasLanded || record.exposures)) await keep();
+    if (record && feed.isLinked && (hasLanded || record.exposures)) await keep(hasLanded);
     draw();
   });
   by("landing").hidden = true;

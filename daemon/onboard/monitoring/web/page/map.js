@@ -8,6 +8,8 @@ import { isMeasuring, startMeasuring } from "./map_measure.js";
 import { startNoData } from "./map_no_data.js";
 
 const COLOURS = { good: "--good", usable: "--caution", refly: "--warning", lost: "--warning" };
+// Of a line with more positions only the line is drawn.
+const PLACES_MAX = 200;
 const DASHES = { good: null, usable: "6 3", refly: "2 4", lost: "1 7" };
 
 // Leaflet parses a string as HTML.
@@ -59,6 +61,11 @@ export const footprintCount = () => footprints.size + flight.older.size;
 export const footprintLayers = () => [...footprints.values()];
 
 const plan = L.layerGroup().addTo(map);
+// Planned exposure positions, thousands of them, on one canvas below the lines.
+map.createPane("places").style.zIndex = 390;
+map.getPane("places").style.pointerEvents = "none";
+const places = L.layerGroup().addTo(map);
+const placesCanvas = L.canvas({ pane: "places" });
 const gaps = L.layerGroup().addTo(map);
 let planBounds = null;
 
@@ -90,35 +97,44 @@ function drawRetakes(retakes) {
   }
 }
 
-// The planned lines with their ids, states and planned exposure positions, and retakes.
-export function drawPlan(received) {
+// The lines with their ids and states, and retakes.
+function drawLines() {
   plan.clearLayers();
-  planBounds = null;
-  planned = received;
   drawnState = lineState();
-  const lines = received?.lines || [];
-  if (!lines.length) return;
-  planBounds = L.latLngBounds(lines.flatMap((line) => line.at));
-  for (const line of lines) {
+  for (const line of planned?.lines || []) {
     L.polyline(line.at, { ...styleOfLine(line.id), interactive: false }).addTo(plan);
     L.circleMarker(line.at[0], { radius: 2, color: colour("--soft"), interactive: false })
       .bindTooltip(label(line.id), { permanent: true, direction: behind(line.at), className: "line-label" }).addTo(plan);
-    if (line.places_m.length > 200) continue;
-    const [[lat0, lon0], [lat1, lon1]] = line.at;
-    const scale = Math.cos(lat0 * Math.PI / 180);
-    const length = 111320 * Math.hypot(lat1 - lat0, (lon1 - lon0) * scale) || 1;
-    for (const place of line.places_m) {
-      const share = place / length;
-      L.circleMarker([lat0 + share * (lat1 - lat0), lon0 + share * (lon1 - lon0)],
-        { radius: 2, weight: 1, color: colour("--soft"), interactive: false }).addTo(plan);
-    }
   }
-  drawRetakes(received.retakes || []);
+  drawRetakes(planned?.retakes || []);
 }
 
-// Redraw the lines when their state, the theme or the retakes changed.
+function drawPlaces() {
+  places.clearLayers();
+  const style = { pane: "places", renderer: placesCanvas, radius: 2, weight: 1, color: colour("--soft"), interactive: false };
+  for (const { at: [[lat0, lon0], [lat1, lon1]], places_m: placesM } of planned?.lines || []) {
+    if (placesM.length > PLACES_MAX) continue;
+    const scale = Math.cos(lat0 * Math.PI / 180);
+    const length = 111320 * Math.hypot(lat1 - lat0, (lon1 - lon0) * scale) || 1;
+    for (const place of placesM) {
+      const share = place / length;
+      L.circleMarker([lat0 + share * (lat1 - lat0), lon0 + share * (lon1 - lon0)], style).addTo(places);
+    }
+  }
+}
+
+// Draw a plan: lines, planned exposure positions, and retakes.
+export function drawPlan(received) {
+  planned = received;
+  const lines = received?.lines || [];
+  planBounds = lines.length ? L.latLngBounds(lines.flatMap((line) => line.at)) : null;
+  drawLines();
+  drawPlaces();
+}
+
+// Redraw the lines when their state changed.
 function updateLines() {
-  if (planned && drawnState !== lineState()) drawPlan(planned);
+  if (planned && drawnState !== lineState()) drawLines();
 }
 
 // Ground covered by too few images, and the line segments to re-fly for it.
