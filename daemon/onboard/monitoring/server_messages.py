@@ -34,7 +34,8 @@ NUMBERS: Final = frozenset(
         *("expected", "exposures", "factor", "first", "gap", "gb", "height", "height_limit"),
         *("k", "last", "level", "limit", "lines", "m", "ms", "n", "noise", "number", "planned"),
         *("ppm", "present", "px", "ratio", "received", "right", "row", "s", "share", "step"),
-        *("db", "top", "triggers", "undecided", "us", "used", "valid", "value"),
+        *("db", "high", "longer", "low", "mb", "mbps", "measured", "required"),
+        *("top", "triggers", "undecided", "us", "used", "valid", "value"),
     )
 )
 """Parameters that are numbers. A text where one is expected belongs to another message."""
