@@ -94,6 +94,14 @@ def triangulate(
     gnss: Annotated[
         str, typer.Option(help="Model of GNSS errors per line: none, shift or linear.")
     ] = "none",
+    patterns: Annotated[
+        bool,
+        typer.Option(
+            "--patterns/--no-patterns",
+            help="Unknowns for what stitching may have left in each image, at most eight, as "
+            "recorded by `syntopic process`.",
+        ),
+    ] = True,
     position_sigma: Annotated[
         tuple[float, float, float] | None,
         typer.Option(
@@ -205,6 +213,7 @@ def triangulate(
         interior=interior,
         sigmas=_sigmas(folder, position_sigma, attitude_sigma, boresight_sigma, lever_sigma),
         drift=cast("GnssDrift", gnss),
+        patterns=patterns,
         reject_beyond=reject,
         matching=BlockMatching(first_search_px=search),
     )

@@ -16,6 +16,11 @@ from daemon.products.product_files import FramesRead, ProductFiles, report_json
 from processing.mosaic.mosaic_plots import residuals_svg
 from processing.mosaic.residual_vectors import residual_vectors
 from processing.mosaic.stitch_record import stitch_record, stitch_record_json
+from processing.mosaic.stitching_patterns import (
+    PATTERNS_KEY,
+    patterns_json,
+    stitching_patterns,
+)
 from processing.pipelines.stitched import Conditions, Pipeline
 
 
@@ -45,7 +50,7 @@ def build_stitched(
                 bands=product.bands,
                 height_m=conditions.height_above_ground_m,
             )
-        )
+        ) | {PATTERNS_KEY: patterns_json(stitching_patterns(rig, product.mosaic))}
     report = report_json(product.report, exposure.number, product.timings_s, product.valid_area)
     contents = level2.level2_contents(
         exposure.number,

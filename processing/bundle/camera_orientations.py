@@ -55,10 +55,10 @@ class CameraOrientations:
         Returns:
             Shape (n, 6, 6), m and rad.
         """
-        own = [
-            block @ self.result.cofactor[np.ix_(at, at)] @ block.T
-            for at, block in zip(self.columns, self.design, strict=True)
-        ]
+        own = []
+        for columns, block in zip(self.columns, self.design, strict=True):
+            at, design = columns[columns >= 0], block[:, columns >= 0]
+            own.append(design @ self.result.cofactors[np.ix_(at, at)] @ design.T)
         factor = variance_factor(self.result.sigma0)
         return np.asarray(factor * np.array(own).reshape(-1, 6, 6))
 

@@ -88,7 +88,7 @@ def patterns_of(
     parts: tuple[Part, ...],
     part: NDArray[np.int64],
     xy_mm: Array,
-    covariance_mm2: Array,
+    factor_mm: Array,
     half_size_mm: float,
 ) -> FramePatterns:
     """The fewest patterns, eight at most, that hold 99 % of a covariance.
@@ -97,7 +97,8 @@ def patterns_of(
         parts: rectangles of the image.
         part: which of them each place belongs to, shape (n,); six places or more of each part.
         xy_mm: places evenly over the parts, shape (n, 2), mm.
-        covariance_mm2: of x and y of the first place, of the second, ..., shape (2n, 2n).
+        factor_mm: shape (2n, r), of x and y of the first place, of the second, ...: times its own
+            transpose it is the covariance.
         half_size_mm: of the image.
 
     Returns:
@@ -105,7 +106,8 @@ def patterns_of(
 
     Source: docs/explanation/mathematics/bundle.md#patterns-of-stitched-images.
     """
-    values, vectors = np.linalg.eigh(covariance_mm2)
+    # The covariance has the eigenvalues of this small matrix, and the factor carries its vectors.
+    values, vectors = np.linalg.eigh(factor_mm.T @ factor_mm)
     values, vectors = np.clip(values[::-1], 0.0, None), vectors[:, ::-1]
     total = float(values.sum())
     held = np.cumsum(values) / max(total, 1e-300)
@@ -113,7 +115,7 @@ def patterns_of(
     powers = monomials(xy_mm / half_size_mm)
     coefficients = np.zeros((count, len(parts), _POWERS, 2))
     for k in range(count):
-        pattern = (vectors[:, k] * np.sqrt(values[k])).reshape(-1, 2)
+        pattern = (factor_mm @ vectors[:, k]).reshape(-1, 2)
         for p in range(len(parts)):
             own = part == p
             if own.any():

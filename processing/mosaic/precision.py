@@ -145,8 +145,30 @@ def placed_covariance_px(
         temperature of the master cone), each (2 n, 2 n), px squared: x and y (up) of the first
         point, of the second, and so on, sensor by sensor.
     """
-    model = mosaic.model
-    rows, datum = [], []
+    jacobian = placed_design_px(mosaic, points)
+    similarity = np.concatenate(
+        [
+            moved_datum_design(rig, mosaic, vip_mm_from_raw(mosaic.placements[name], colrow))
+            for name, colrow in points.items()
+        ]
+    )
+    return (
+        jacobian @ mosaic.covariance @ jacobian.T,
+        similarity @ datum_covariance(rig, mosaic, measured_c) @ similarity.T,
+    )
+
+
+def placed_design_px(mosaic: Mosaic, points: Mapping[str, Array]) -> Array:
+    """Derivatives of the positions of raw pixels in the virtual image by the mosaic's unknowns.
+
+    Args:
+        mosaic: what the image was made with.
+        points: raw pixels (n, 2) by sensor name.
+
+    Returns:
+        (2 n, unknowns), px: x and y (up) of the first point, of the second, sensor by sensor.
+    """
+    model, rows = mosaic.model, []
     for name, colrow in points.items():
         start = mosaic.start[name]
         corrected = corrected_mm_from_raw(start, colrow)
@@ -154,14 +176,7 @@ def placed_covariance_px(
         row = np.zeros((2 * len(colrow), len(model.names)))
         row[:, columns] = design.transpose(2, 1, 0).reshape(2 * len(colrow), len(columns))
         rows.append(row)
-        datum.append(
-            moved_datum_design(rig, mosaic, vip_mm_from_raw(mosaic.placements[name], colrow))
-        )
-    jacobian, similarity = np.concatenate(rows), np.concatenate(datum)
-    return (
-        jacobian @ mosaic.covariance @ jacobian.T,
-        similarity @ datum_covariance(rig, mosaic, measured_c) @ similarity.T,
-    )
+    return np.concatenate(rows)
 
 
 def disturbance_covariance_px(

@@ -63,6 +63,7 @@ def test_the_mission_and_its_log_say_that_it_is_simulated(flown: DemoMission) ->
     for name in ("residuals.json", "mosaic.json"):
         product_json = json.loads((flown.mission / "L2/000001" / name).read_text())
         assert product_json["simulated"] is True, name
+    assert 1 <= len(product_json["patterns"]["coefficients"]) <= 8
     (log,) = (flown.mission / "log").glob("*.mcap")
     with log.open("rb") as file:
         about = next(one for one in StreamReader(file).records if isinstance(one, Metadata))

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from daemon.mission.foreign_files import ForeignFileError, within
 from daemon.postflight.adjustment.csv_tables import CsvTable, ProjectError, read_table
 from daemon.postflight.adjustment.heads_and_motion import KNOWN, NEEDED, head_of, motion_of
+from daemon.postflight.adjustment.patterns_file import patterns_of_project
 from daemon.postflight.adjustment.plausibility import (
     check_control,
     check_distances,
@@ -124,6 +125,7 @@ def read_project(path: Path) -> Project:
         constraints=tuple(LinearConstraint(dict(c.coefficients)) for c in file.constraint),
         motion=_motion(folder, file, build),
         rays=RayModel(file.adjust.earth_radius_m, file.adjust.refraction, file.adjust.ground_m),
+        patterns=patterns_of_project(folder, file.files.patterns, build.image_names, problems),
     )
     build.check(network)
     problems += [p for table in build.tables for p in table.problems]

@@ -72,6 +72,7 @@ class FilesSection(_ProjectSection):
     gnss: str | None = None
     attitudes: str | None = None
     motion: str | None = None
+    patterns: str | None = None
 
 
 class CameraSection(_ProjectSection):

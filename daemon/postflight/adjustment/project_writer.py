@@ -21,6 +21,7 @@ from daemon.postflight.adjustment.adjusted_project import (
 from daemon.postflight.adjustment.csv_tables import ProjectError, write_table
 from daemon.postflight.adjustment.heads_and_motion import timing_values, write_motion
 from daemon.postflight.adjustment.html_report import report_page
+from daemon.postflight.adjustment.patterns_file import PATTERNS_FILE, write_patterns
 from daemon.postflight.adjustment.project import (
     ANGLES,
     AXIS_SIGMAS,
@@ -135,6 +136,9 @@ def _write_project(
     if network.motion is not None:
         tables["motion"] = "motion.csv"
         write_motion(folder / "motion.csv", network)
+    if network.patterns:
+        tables["patterns"] = PATTERNS_FILE
+        write_patterns(folder / PATTERNS_FILE, network)
     if len(network.measured_attitudes.attitude):
         tables["attitudes"] = "attitudes.csv"
         b = network.measured_attitudes

@@ -86,12 +86,24 @@ def triangulation_of(
         "image_sigma_px": [float(v) for v in sigma_px],
         "systematic_most_um": float(worst) if math.isfinite(worst) else None,
         "mounting": mountings_of(result),
+        "patterns": _patterns(result),
         "control": _agreement(control.names, control.difference_m, block.gsd_m),
         "checks": _agreement(against.names, against.difference_m, block.gsd_m)
         | {
             "predicted_m": [float(v) for v in against.predicted_m] if against.names else [],
             "squares": against.squares if against.names else None,
         },
+    }
+
+
+def _patterns(result: Adjustment) -> dict[str, Any]:
+    """How many images have patterns of stitching, the most of one, and the least share of the
+    variance that they hold."""
+    own = [one for one in result.network.patterns if one is not None]
+    return {
+        "images": len(own),
+        "most": max((one.count for one in own), default=0),
+        "share": min((one.share for one in own), default=None),
     }
 
 
@@ -111,7 +123,8 @@ def mountings_of(result: Adjustment) -> list[dict[str, Any]]:
         for what, unit, value, factor, columns in quantities:
             if (columns < 0).any():
                 continue
-            variance = variance_factor(result.sigma0) * np.diag(result.cofactor)[columns]
+            cofactor = result.cofactors[np.ix_(columns, columns)]
+            variance = variance_factor(result.sigma0) * np.diag(cofactor)
             found += [
                 {"head": head.name, "what": what, "axis": axis, "unit": unit, "value": float(v),
                  "sigma": factor * math.sqrt(max(float(s), 0.0))}
@@ -215,6 +228,12 @@ def print_triangulation(console: Console, found: Mapping[str, Any]) -> None:
         console.print(
             f"Systematic image residuals: at most {found['systematic_most_um']:.3f} um "
             f"(means of {CELLS[0]} x {CELLS[1]} cells)",
+            highlight=False,
+        )
+    if found["patterns"]["images"]:
+        console.print(
+            f"{found['patterns']['images']} images with patterns of stitching, at most "
+            f"{found['patterns']['most']} each",
             highlight=False,
         )
     if found["mounting"]:

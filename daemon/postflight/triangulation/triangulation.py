@@ -26,6 +26,7 @@ from daemon.orientation.orientation_inputs import read_orientation_inputs
 from daemon.postflight.adjustment.csv_tables import CsvTable, read_table
 from daemon.postflight.adjustment.project import CheckPoints, Project
 from daemon.postflight.adjustment.project_file import ProjectFile
+from daemon.postflight.triangulation.stitching_of_exposures import stitching_patterns_of
 from processing.bundle.adjust import AdjustmentSettings, adjust
 from processing.bundle.flown_network import (
     MOUNTING,
@@ -67,13 +68,15 @@ class TriangulationSettings:
 
     `parameters` is the set of additional parameters, `interior` whether it holds the interior
     orientation. `sigmas` are those of navigation and mounting. `drift`: what is unknown of the GNSS
-    positions of each line.
+    positions of each line. `patterns`: what stitching may have left in each image is an unknown of
+    it.
     """
 
     parameters: SetName = "none"
     interior: bool = False
     sigmas: NavigationSigmas = field(default_factory=NavigationSigmas)
     drift: GnssDrift = "none"
+    patterns: bool = True
     reject_beyond: float = 4.0
     matching: BlockMatching = field(default_factory=BlockMatching)
 
@@ -269,6 +272,7 @@ def project_of(
         heads=flown.heads,
         gnss=flown.gnss,
         measured_attitudes=flown.measured_attitudes,
+        patterns=stitching_patterns_of(block.mission, block.oriented) if options.patterns else (),
     )
     settings = AdjustmentSettings(
         robust=True, reject_beyond=options.reject_beyond, variance_components=True

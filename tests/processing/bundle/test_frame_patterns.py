@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +16,11 @@ from processing.bundle.network import Network, NetworkError
 from processing.bundle.unknowns import apply_corrections, initial_values, layout_of
 from processing.geometry.placement import vip_mm_from_raw
 from processing.mosaic.precision import placed_covariance_px
-from processing.mosaic.stitching_patterns import stitching_patterns
+from processing.mosaic.stitching_patterns import (
+    patterns_from_json,
+    patterns_json,
+    stitching_patterns,
+)
 from tests.processing.bundle.simulated_networks import PARTS, aerial, with_everything
 from tests.processing.mosaic.test_precision import mosaic_of
 
@@ -58,12 +63,12 @@ def test_the_fewest_patterns_that_hold_99_percent_are_taken() -> None:
         fields[k, part == 1, k % 2] = size * powers[part == 1, power]
     flat = fields.reshape(3, -1)
     covariance = flat.T @ flat
-    found = patterns_of(PARTS, part, xy, covariance, HALF_MM)
+    found = patterns_of(PARTS, part, xy, flat.T, HALF_MM)
     assert found.count == 2 and 0.99 < found.share < 1.0
     again = found.at(xy).reshape(160, 2)
     assert again @ again.T == pytest.approx(covariance, abs=2e-10)
-    assert patterns_of(PARTS, part, xy, np.zeros((160, 160)), HALF_MM).count == 0
-    many = patterns_of(PARTS, part, xy, np.eye(160) * 1e-6, HALF_MM)
+    assert patterns_of(PARTS, part, xy, np.zeros((160, 4)), HALF_MM).count == 0
+    many = patterns_of(PARTS, part, xy, np.eye(160) * 1e-3, HALF_MM)
     assert many.count == 8 and many.share == pytest.approx(8 / 160)
 
 
@@ -72,6 +77,9 @@ def test_patterns_hold_the_covariance_of_a_mosaic(rig_name: str) -> None:
     rig, mosaic = mosaic_of(rig_name)
     patterns = stitching_patterns(rig, mosaic)
     assert 1 <= patterns.count <= 8
+    again = patterns_from_json(json.loads(json.dumps(patterns_json(patterns))))
+    assert again.parts == patterns.parts and again.share == pytest.approx(patterns.share)
+    assert again.coefficients == pytest.approx(patterns.coefficients, rel=1e-6)
     name = rig.pan_cones[1].sensors[0].name
     sensor = next(s for s in rig.sensors if s.name == name)
     own = np.array([[0.3, 0.4], [0.6, 0.7]]) * [sensor.width_px, sensor.height_px]
