@@ -92,11 +92,30 @@ def _tdi_shifts(exposure: Exposure, rig: Rig) -> dict[str, int]:
 
 
 def _frame_settings(settings: Mapping[str, float | int | str]) -> FrameSettings:
-    gain, black = settings.get("Gain", 1.0), settings.get("BlackLevel")
+    black = settings.get("BlackLevel")
     return FrameSettings(
-        gain=float(gain) if isinstance(gain, float | int) else 1.0,
+        gain=gain_factor(settings),
         black=float(black) if isinstance(black, float | int) else None,
     )
+
+
+def gain_factor(settings: Mapping[str, float | int | str]) -> float:
+    """The gain of a frame as a factor.
+
+    Args:
+        settings: of the frame; `GainUnit` states the unit of `Gain`, a factor without it.
+
+    Returns:
+        The factor; 1 if the gain or its unit is not known.
+
+    Example:
+        >>> gain_factor({"Gain": 20.0, "GainUnit": "dB"}), gain_factor({"Gain": 4.0})
+        (10.0, 4.0)
+    """
+    gain, unit = settings.get("Gain"), settings.get("GainUnit", "factor")
+    if not isinstance(gain, float | int) or unit not in ("dB", "factor"):
+        return 1.0
+    return float(10.0 ** (gain / 20.0)) if unit == "dB" else float(gain)
 
 
 def capture_flags(exposure: Exposure, rig: Rig) -> Flag:

@@ -171,13 +171,15 @@ class DescribedRegisters:
                 for high, low in itertools.permutations(parts, 2)
             ]
             for choice in (*whole, *halves):
-                try:
+                before = [(part, self.nodes.number(part)) for part, _ in choice]
+                with contextlib.suppress(NodeError, OverflowError, ValueError):
                     for part, number in choice:
                         self.nodes.write(part, number)
                     if self.nodes.integer(name) == value:
                         return
-                except (NodeError, OverflowError, ValueError):
-                    continue
+                for part, old in before:
+                    with contextlib.suppress(NodeError, OverflowError, ValueError):
+                        self.nodes.write(part, old)
 
     def number_or(self, name: str, default: float) -> float:
         """The value of a feature; `default` where the camera has none."""
@@ -412,6 +414,8 @@ class DescribedRegisters:
                     nodes.entry_value(entry) == value and nodes.is_implemented(entry)
                     for entry in node.entries
                 )
+            if not _is_in_set(node, nodes.number(feature)):
+                return False
             limits = nodes.limits(feature)
             slack = _TOLERANCE * max(abs(limits.minimum), abs(limits.maximum))
             if node.kind == "Integer":
@@ -458,3 +462,9 @@ class DescribedRegisters:
             (at.XML_URL, self._url(), 512),
         ):
             memory.write(address, text.encode("utf-8")[: length - 1].ljust(length, b"\0"))
+
+
+def _is_in_set(node: Node, value: float) -> bool:
+    """Whether a value is one of those that the description lists, if it lists any."""
+    listed = node.text("ValidValueSet")
+    return not listed or value in {int(item, 0) for item in listed.split(";") if item.strip()}

@@ -144,7 +144,8 @@ def test_a_raw_gain_that_was_chosen_is_kept_and_recorded() -> None:
 
 
 def test_a_gain_in_decibels_returns_to_zero() -> None:
-    text = without("Gain").replace("GainRaw", "Gain").replace("<Min>3</Min>", "<Min>0</Min>")
+    text = without("Gain").replace("GainRaw", "Gain")
+    text = text.replace("<Min>3</Min>", "<Min>0</Min><Unit>dB</Unit>")
     with head(text, gain_db=6.0) as (emulated, driver, _):
         driver.bind()
         with running(driver):

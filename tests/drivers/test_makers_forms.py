@@ -56,7 +56,6 @@ def of_maker(text: str, maker: str) -> str:
         ("JAI Corporation", "", 6.0206, 200),
         ("Emergent", "x", 12.0412, 400),
         ("JAI Corporation", "dB", 6.0, 600),
-        ("Other", "", 6.0, 600),
     ],
 )
 def test_a_gain_that_is_a_factor_is_converted(

@@ -256,7 +256,7 @@ def test_it_is_refused_with_the_true_reason(text: str | bytes, expected: str) ->
 
 def test_a_gain_that_is_fixed_is_refused_with_its_value_and_accepted_at_it() -> None:
     text = without("Gain").replace('Name="GainRaw"', 'Name="Gain"').replace("GainRaw", "Gain")
-    text = text.replace("</pIsLocked><pValue>GainReg", "</pIsLocked><pValue>GainReg")
+    text = text.replace('<Integer Name="Gain">', '<Integer Name="Gain"><Unit>dB</Unit>')
     text = text.replace(
         "0x1001C</Address><Length>4</Length><AccessMode>RW",
         "0x1001C</Address><Length>4</Length><AccessMode>RO",

@@ -37,7 +37,7 @@ SENSOR_BITS = 12
 EXPOSURE_TIME_US = 1000.0
 NO_EXPOSURE_TIME: Final = (
     "no feature that sets its exposure time (none of ExposureTime, ExposureTimeAbs, "
-    "ExposureTimeRaw, ExposureValue)"
+    "ExposureTimeRaw, ExposureValue, Exposure)"
 )
 MODULE: Final = (
     "the head is the {} module of a frame grabber, which is no camera and has no command "

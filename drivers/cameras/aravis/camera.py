@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import math
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -47,6 +48,7 @@ CLOCKS: Final = (
     ("GevTimestampControlLatch", "GevTimestampValue", False),
 )
 ENDLESS_NAMES_MAX: Final = 4
+PACKET_SIZE: Final = "GevSCPSPacketSize"
 
 
 @dataclass(frozen=True)
@@ -259,6 +261,17 @@ class AravisCamera:
                 return settings
         return self.frame_settings
 
+    def reported_gain(self, gain: float) -> Mapping[str, float | int | str]:
+        """A gain in the chunk data of a frame, as frames record it.
+
+        Args:
+            gain: in the unit of the head's gain.
+
+        Returns:
+            The gain and its unit.
+        """
+        return self._configuration.gain.reported(gain)
+
     def software_trigger(self) -> None:
         """Fire the software trigger; raises the error of Aravis."""
         self._camera.software_trigger()
@@ -375,6 +388,8 @@ class AravisCamera:
             packing=packing,
             payload_nbytes=payload_nbytes,
         )
+        if not (width > 0 and height > 0):
+            return [f"the head announces frames of {width} x {height} pixels; set its size in it"]
         wrong = [packing_problem(packing, width)]
         needed_nbytes = packed_nbytes(packing, width * height) if wrong == [None] else 0
         if payload_nbytes < needed_nbytes:
@@ -391,8 +406,14 @@ class AravisCamera:
             if size == 0:
                 # Quirk: the size that Aravis finds may exceed what the path transports. The
                 # setting packet_size_limit bounds it. Upstream: AravisProject/aravis#1065.
-                size = min(int(camera.gv_auto_packet_size()), settings.packet_size_limit)
-            camera.gv_set_packet_size(size)
+                size = self._packet_size_of_head(self._passing_packet_size(settings))
+            elif size != (allowed := self._packet_size_of_head(size)):
+                refusals.append(
+                    f"packet_size is {size}; the head takes at most {allowed}, or set 0"
+                )
+                return
+            if size != int(camera.gv_get_packet_size()):
+                camera.gv_set_packet_size(size)
             size = int(camera.gv_get_packet_size())
         except aravis_error() as error:
             refusals.append(
@@ -409,6 +430,28 @@ class AravisCamera:
         held, problems = write_pacing(self._features, settings, size, self._read_tick_frequency())
         self._pacing = held
         refusals += problems
+
+    def _passing_packet_size(self, settings: AravisSettings) -> int:
+        """The largest size that test packets show to pass; a fixed size is taken as it is."""
+        try:
+            return min(int(self._camera.gv_auto_packet_size()), settings.packet_size_limit)
+        except aravis_error():
+            if self._features.is_writable(PACKET_SIZE):
+                raise
+            return int(self._camera.gv_get_packet_size())
+
+    def _packet_size_of_head(self, size: int) -> int:
+        """The next smaller size that the head's description allows."""
+        # Quirk: Aravis writes the size through a feature of its own, without the head's limits.
+        # Upstream: no report known (2026-11-28); arv_camera_gv_set_packet_size in src/arvcamera.c.
+        features = self._features
+        if features.kind(PACKET_SIZE) != "integer" or not features.is_writable(PACKET_SIZE):
+            return size
+        low, high = features.bounds(PACKET_SIZE)
+        if not (math.isfinite(low) and low <= size):
+            return size
+        start, step = int(low), features.increment(PACKET_SIZE)
+        return start + (min(size, int(min(high, 65535))) - start) // step * step
 
     def _read_tick_frequency(self) -> int:
         if not self._camera.is_gv_device():
@@ -435,11 +478,7 @@ class AravisCamera:
             "ExposureTime": self.exposure_time_us,
             "PixelFormat": self.geometry.pixel_format,
         }
-        gain = features.number(self._configuration.gain_feature or "Gain")
-        if gain is not None and self._configuration.gain_feature == "GainRaw":
-            found["GainRaw"] = int(gain)
-        elif gain is not None:
-            found["Gain"] = gain
+        found.update(self._configuration.gain.settings())
         shifts = features.number("TdiShifts")
         if shifts is not None:
             found["TdiShifts"] = int(shifts)

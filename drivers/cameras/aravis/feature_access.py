@@ -7,6 +7,7 @@ exception with the reason.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any, Final
 
@@ -16,8 +17,14 @@ from drivers.cameras.aravis.presets import FeatureValue
 
 RELATIVE_TOLERANCE: Final = 1e-3
 """Between a number that was written and the number read back; heads round to their steps."""
-UNITS_US: Final[Mapping[str, float]] = {"s": 1e6, "ms": 1e3, "ns": 1e-3}
-"""Units of durations other than microseconds, in microseconds."""
+UNITS_US: Final[Mapping[str, float]] = {
+    **dict.fromkeys(("s", "sec", "second", "seconds"), 1e6),
+    **dict.fromkeys(("ms", "msec", "millisecond", "milliseconds"), 1e3),
+    **dict.fromkeys(("us", "usec", "microsecond", "microseconds"), 1.0),
+    **dict.fromkeys(("ns", "nsec", "nanosecond", "nanoseconds"), 1e-3),
+}
+"""Units of durations in lower case, in microseconds."""
+DURATION: Final = re.compile(r"[\[(]?(?P<count>\d+(?:\.\d+)?)?\s*(?P<unit>[a-z]+)[\])]?")
 CHAIN_MAX: Final = 50
 """Nodes between a feature and its register; a longer chain refers to itself."""
 
@@ -134,18 +141,38 @@ class Features:
         except self._failed:
             return False
 
-    def unit_us(self, name: str) -> float:
+    def unit_us(self, name: str) -> float | None:
         """The unit of a duration.
 
         Args:
             name: GenICam name.
 
         Returns:
-            The unit that the description states, us; 1 if it states none.
+            The unit that the description states, us, such as 10 for `10 us`; 1 if it states none,
+            None if it states one that is no time, such as rows.
         """
         # Quirk: the standard has microseconds; some heads state seconds or milliseconds.
         # Upstream: manual: GenICam description of Hamamatsu C16240-20UP, ExposureTime.
-        return UNITS_US.get(self.unit(name), 1.0)
+        # Whatever stands for the letter mu, in whatever encoding, is no ASCII.
+        stated = re.sub(r"[^\x00-\x7f]+", "u", self.unit(name)).lower()
+        if not stated:
+            return 1.0
+        found = DURATION.fullmatch(stated)
+        unit_us = UNITS_US.get(found["unit"]) if found else None
+        return None if found is None or unit_us is None else float(found["count"] or 1) * unit_us
+
+    def description(self, name: str) -> str:
+        """The text of the head's description of a feature.
+
+        Args:
+            name: GenICam name.
+
+        Returns:
+            Its tool tip, description and displayed name; empty if it has none.
+        """
+        node = None if name in self.endless else self._device.get_feature(name)
+        texts = ("get_tooltip", "get_description", "get_display_name")
+        return "\n".join(filter(None, (getattr(node, text, str)() for text in texts)))
 
     def unit(self, name: str) -> str:
         """The unit that the head's description states.
@@ -306,7 +333,12 @@ class Features:
             return ""
 
     def set(
-        self, name: str, value: FeatureValue, *, tolerance: float = RELATIVE_TOLERANCE
+        self,
+        name: str,
+        value: FeatureValue,
+        *,
+        tolerance: float = RELATIVE_TOLERANCE,
+        within: float = 0.0,
     ) -> FeatureValue:
         """Write a feature and read it back.
 
@@ -316,6 +348,7 @@ class Features:
             name: GenICam name.
             value: in the type of the feature; any value executes a command.
             tolerance: relative, between a number and the one that the head then holds.
+            within: the same, absolute, in the unit of the feature.
 
         Returns:
             The value the head holds afterwards; a number may be rounded to the head's step.
@@ -345,7 +378,7 @@ class Features:
         except self._failed as error:
             raise FeatureError(f"{name} = {converted} is refused: {message_of(error)}") from None
         found = self.get(name)
-        if not _is_close(found, converted, tolerance):
+        if not _is_close(found, converted, tolerance, within):
             raise FeatureError(f"{name} was set to {converted}, and the head holds {found}")
         return found
 
@@ -447,7 +480,7 @@ def _converted(name: str, kind: str | None, value: FeatureValue) -> FeatureValue
     raise FeatureError(f"{name} = {value!r}; {needed.get(kind, 'a text')} is needed")
 
 
-def _is_close(found: FeatureValue, wanted: FeatureValue, tolerance: float) -> bool:
+def _is_close(found: FeatureValue, wanted: FeatureValue, tolerance: float, within: float) -> bool:
     if isinstance(found, str) or isinstance(wanted, str | bool):
         return found == wanted
-    return math.isclose(found, wanted, rel_tol=tolerance, abs_tol=1e-9)
+    return math.isclose(found, wanted, rel_tol=tolerance, abs_tol=max(within, 1e-9))

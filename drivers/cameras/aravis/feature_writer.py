@@ -37,6 +37,7 @@ class FeatureWriter:
         hint: str,
         *,
         tolerance: float = RELATIVE_TOLERANCE,
+        within: float = 0.0,
     ) -> bool:
         """Write a feature.
 
@@ -46,12 +47,13 @@ class FeatureWriter:
             value: in the type of the feature.
             hint: what to do if it is refused.
             tolerance: relative, between a number and the one that the head then holds.
+            within: the same, absolute, in the unit of the feature.
 
         Returns:
             Whether the head holds the value.
         """
         try:
-            self.written[name] = self.features.set(name, value, tolerance=tolerance)
+            self.written[name] = self.features.set(name, value, tolerance=tolerance, within=within)
         except FeatureError as error:
             wanted = f"{key} = {value!r}" if isinstance(value, int | float) else key
             self.refusals.append(f"{wanted} is refused ({error}); {hint}")

@@ -87,16 +87,17 @@ def frame_record(
         temperature_c=temperature_c
         if received.chunk_temperature_c is None
         else received.chunk_temperature_c,
-        settings=_exposure_settings(camera.settings_of(exposure_us), received),
+        settings=_exposure_settings(camera, received),
     )
 
 
 def _exposure_settings(
-    settings: Mapping[str, float | int | str], received: ReceivedFrame
+    camera: AravisCamera, received: ReceivedFrame
 ) -> Mapping[str, float | int | str]:
     """The head's settings, updated with the chunk data of this frame."""
-    reported_settings = {"ExposureTime": received.chunk_exposure_us, "Gain": received.chunk_gain}
-    return {
-        **settings,
-        **{key: value for key, value in reported_settings.items() if value is not None},
-    }
+    found = dict(camera.settings_of(received.chunk_exposure_us))
+    if received.chunk_exposure_us is not None:
+        found["ExposureTime"] = received.chunk_exposure_us
+    if received.chunk_gain is not None:
+        found.update(camera.reported_gain(received.chunk_gain))
+    return found

@@ -16,28 +16,30 @@ from typing import Final
 from drivers.cameras.aravis.feature_access import FeatureError, Features
 from drivers.cameras.aravis.feature_writer import FeatureWriter
 from drivers.cameras.aravis.formats import usual_format
+from drivers.cameras.aravis.head_gain import GAINS, HeadGain
 from drivers.cameras.aravis.neutral_features import switch_off
 from drivers.cameras.aravis.presets import FeatureValue, preset_features
 from drivers.cameras.aravis.settings import AravisSettings
-from drivers.cameras.aravis.trigger_configuration import write_strobe, write_trigger
+from drivers.cameras.aravis.trigger_configuration import (
+    switch_triggers_off,
+    write_strobe,
+    write_trigger,
+)
 
-EXPOSURE_TIMES: Final = ("ExposureTime", "ExposureTimeAbs", "ExposureTimeRaw", "ExposureValue")
+EXPOSURE_TIMES: Final = (
+    *("ExposureTime", "ExposureTimeAbs", "ExposureTimeRaw", "ExposureValue"),
+    # Quirk: Emergent heads. Upstream: manual: examples of their eSDK, "Exposure" in microseconds.
+    "Exposure",
+)
 """Exposure time, in microseconds unless the head states another unit; the raw one in units of
 `ExposureTimeBaseAbs`."""
 EXPOSURE_TOLERANCE: Final = 0.05
 """Heads round an exposure time to rows of their sensor; what they hold is recorded."""
 PULSE_WIDTH_MODES: Final = ("Off", "TriggerWidth", "TriggerControlled")
 """Modes of exposure in which no exposure time is used."""
-GAINS_DB: Final = ("Gain", "GainAbs")
-"""Gain, in dB unless the head states another unit."""
-FACTORS: Final = ("x", "times", "factor")
-"""Units of a gain that is a factor."""
-MAKERS_OF_FACTORS: Final = ("JAI",)
-# Quirk: JAI heads state no unit; their gain is a factor, 1 for 0 dB.
-# Upstream: manual: JAI GO-2401M-PGE user manual, "Gain control" (setting value 16.0 is 24 dB).
 OWN_FEATURES: Final[Mapping[str, str]] = {
     **dict.fromkeys(EXPOSURE_TIMES, "exposure_time_us"),
-    **dict.fromkeys(GAINS_DB, "gain_db"),
+    **dict.fromkeys(GAINS, "gain_db and gain_unit"),
     **dict.fromkeys(("Width", "Height"), "width_px and height_px"),
     **dict.fromkeys(("TriggerSource", "TriggerMode", "TriggerSelector"), "trigger_source"),
     "PixelFormat": "pixel_format",
@@ -68,11 +70,12 @@ class HeadConfiguration:
         self.written, self.refusals = self._writer.written, self._writer.refusals
         self.missing = self._writer.missing
         self.exposure_feature = ""
-        self.gain_feature = ""
+        self.gain = HeadGain(self._writer, settings.gain_unit)
 
     def write(self) -> None:
         """Write everything that precedes packets and chunks."""
         self._stop()
+        switch_triggers_off(self._features)
         # A preset is for a family; what this head does not have is skipped.
         preset = {
             name: value
@@ -80,8 +83,9 @@ class HeadConfiguration:
             if self._offers(name, value)
         }
         chosen = {**preset, **self._settings.features}
+        own = {name for name in chosen if name in OWN_FEATURES and not self.gain.is_stated_by(name)}
         for name in chosen:
-            if name in OWN_FEATURES:
+            if name in own:
                 self.refusals.append(
                     f"features has {name}, which the driver writes itself; set {OWN_FEATURES[name]}"
                 )
@@ -89,14 +93,14 @@ class HeadConfiguration:
         self.written.update(held)
         self.refusals += refusals
         for name, value in chosen.items():
-            if name not in OWN_FEATURES:
+            if name not in own:
                 self._writer.set(
                     f"features.{name}", name, value, "choose a value that the head has"
                 )
         self._write_format()
         self._write_size()
         self._write_exposure_time()
-        self._write_gain()
+        self.gain.write(self._settings.gain_db)
         self._write_tdi()
         self._write_acquisition_mode()
         write_trigger(self._writer, self._settings)
@@ -125,10 +129,7 @@ class HeadConfiguration:
             FeatureError: the head refuses one.
         """
         features = self._features
-        if self.gain_feature in GAINS_DB:
-            features.set(self.gain_feature, self._gain_value(gain_db))
-        elif gain_db:
-            raise FeatureError(self._no_gain_in_db(gain_db))
+        self.gain.adjust(gain_db)
         if tdi_shifts or features.is_available("TdiShifts"):
             features.set("TdiShifts", tdi_shifts)
         value = self._exposure_value(exposure_time_us)
@@ -206,15 +207,20 @@ class HeadConfiguration:
     def _write_exposure_time(self) -> None:
         features, wanted_us = self._features, self._settings.exposure_time_us
         self._write_exposure_mode()
-        name = features.first_available(EXPOSURE_TIMES)
+        offered = [name for name in EXPOSURE_TIMES if features.is_available(name)]
+        name = next((name for name in offered if features.unit_us(name) is not None), None)
         if name is None:
-            self.missing.append(
-                f"no feature that sets its exposure time (none of {', '.join(EXPOSURE_TIMES)})"
-            )
+            found = f"none of {', '.join(EXPOSURE_TIMES)}"
+            if offered:
+                found = f"{offered[0]} is in {features.unit(offered[0])!r}"
+            self.missing.append(f"no feature that sets its exposure time ({found})")
             return
         self.exposure_feature = name
         unit_us = self._exposure_unit_us()
         low, high = (bound * unit_us for bound in features.bounds(name))
+        if low == high == 0.0:
+            # A limit that the head computes from what it does not have yet.
+            low, high = -math.inf, math.inf
         if not low <= wanted_us <= high:
             self.refusals.append(
                 f"exposure_time_us is {wanted_us:g}; the head takes {low:g} to {high:g}"
@@ -251,9 +257,10 @@ class HeadConfiguration:
         )
 
     def _exposure_unit_us(self) -> float:
-        if self.exposure_feature != "ExposureTimeRaw":
-            return self._features.unit_us(self.exposure_feature)
-        return self._features.number("ExposureTimeBaseAbs") or 1.0
+        base_us = None
+        if self.exposure_feature == "ExposureTimeRaw":
+            base_us = self._features.number("ExposureTimeBaseAbs")
+        return base_us or self._features.unit_us(self.exposure_feature) or 1.0
 
     def _exposure_value(self, exposure_time_us: float) -> FeatureValue:
         """The time in the feature's unit, on its step if it is an integer."""
@@ -264,69 +271,6 @@ class HeadConfiguration:
         step = self._features.increment(self.exposure_feature)
         start = int(low) if abs(low) < 1 << 31 else 0
         return start + round((value - start) / step) * step
-
-    def _write_gain(self) -> None:
-        features, gain_db = self._features, self._settings.gain_db
-        selector = features.first_entry("GainSelector", ("All", "AnalogAll"))
-        for digital in ("DigitalAll",):
-            if digital in features.entries("GainSelector"):
-                with contextlib.suppress(FeatureError):
-                    features.set("GainSelector", digital)
-                    name = features.first_available((*GAINS_DB, "GainRaw"))
-                    if name is not None and features.is_writable(name):
-                        features.set(name, self._lowest_gain(name))
-        if selector is not None:
-            self._writer.set("gain_db", "GainSelector", selector, "the head's gain cannot be set")
-        name = features.first_available(GAINS_DB)
-        if name is not None:
-            self.gain_feature = name
-            hint, held = "choose a gain within the head's bounds", features.number(name)
-            if not features.is_writable(name):
-                hint = "its gain cannot be set"
-                if held is not None:
-                    held_db = 20.0 * math.log10(held) if self._has_gain_factor() else held
-                    hint += f"; set gain_db = {held_db:g}"
-            is_factor = self._has_gain_factor()
-            key = f"gain_db = {gain_db:g}, as the factor {name}" if is_factor else "gain_db"
-            self._writer.set(key, name, self._gain_value(gain_db), hint)
-            return
-        if features.is_available("GainRaw"):
-            self.gain_feature = "GainRaw"
-        if gain_db:
-            self.refusals.append(self._no_gain_in_db(gain_db))
-        elif self.gain_feature and "GainRaw" not in self.written:
-            if features.is_writable("GainRaw"):
-                self._writer.set(
-                    "gain_db", "GainRaw", self._lowest_gain("GainRaw"), "set it in the head"
-                )
-            else:
-                self.written["GainRaw"] = features.get("GainRaw")
-
-    def _no_gain_in_db(self, gain_db: float) -> str:
-        raw = (
-            f"; it has {self.gain_feature} in steps of its own, which features sets"
-            if self.gain_feature
-            else ""
-        )
-        return f"gain_db is {gain_db:g}; the head has no gain in dB{raw}; set gain_db = 0"
-
-    def _gain_value(self, gain_db: float) -> FeatureValue:
-        """The gain in dB, raised to the head's lowest if 0 dB is below it."""
-        low, high = self._features.bounds(self.gain_feature)
-        wanted = 10.0 ** (gain_db / 20.0) if self._has_gain_factor() else gain_db
-        value = low if gain_db == 0 and 0 < low <= high else wanted
-        return round(value) if self._features.kind(self.gain_feature) == "integer" else value
-
-    def _has_gain_factor(self) -> bool:
-        """Whether the gain is a factor, not in dB."""
-        unit = self._features.unit(self.gain_feature)
-        maker = self._features.text("DeviceVendorName")
-        return unit.lower() in FACTORS or (not unit and maker.startswith(MAKERS_OF_FACTORS))
-
-    def _lowest_gain(self, name: str) -> FeatureValue:
-        low, _ = self._features.bounds(name)
-        value = 0.0 if low == float("-inf") else max(low, 0.0) if name in GAINS_DB else low
-        return int(value) if self._features.kind(name) == "integer" else value
 
     def _write_tdi(self) -> None:
         wanted = self._settings.tdi_shifts

@@ -33,6 +33,26 @@ def is_plausible(temperature_c: float) -> bool:
     return low <= temperature_c <= high
 
 
+def in_celsius(value: float, unit: str) -> float:
+    """A temperature in degC.
+
+    Args:
+        value: temperature.
+        unit: as the description states it; one that is neither kelvin nor Fahrenheit is degC.
+
+    Returns:
+        Temperature, degC.
+
+    Example:
+        >>> round(in_celsius(300.0, "K"), 2), in_celsius(104.0, "degF"), in_celsius(41.5, "")
+        (26.85, 40.0, 41.5)
+    """
+    name = "".join(character for character in unit.lower() if "a" <= character <= "z")
+    if name in ("k", "kelvin"):
+        return value - 273.15
+    return (value - 32.0) / 1.8 if name in ("f", "degf", "fahrenheit") else value
+
+
 class HeadThermometer:
     """The thermometer of one head; the sensor's where there are several.
 
@@ -61,6 +81,7 @@ class HeadThermometer:
         value = None if self.feature is None else self._features.number(self.feature)
         if value is None:
             return None
+        value = in_celsius(value, self._features.unit(self.feature or ""))
         if not is_plausible(value):
             self.implausible += 1
             return None

@@ -7,7 +7,9 @@ radiometry; mirroring, binning, decimation, offsets and test patterns change geo
 Source: GenICam SFNC 2.7 for the standard names; the descriptions of Allied Vision, Basler,
 FLIR and Point Grey heads for the others. Names of JAI: roboception/rc_genicam_camera#4, and the
 GO-X series manual. Names of Hikrobot: its MVS client, "GigE Area Scan Camera User Manual", section
-12.2. `flatfieldCorrectionMode`: Teledyne DALSA Linea manual, "Flat Field Category".
+12.2. `flatfieldCorrectionMode`: Teledyne DALSA Linea manual, "Flat Field Category";
+`turboTransferEnable`: Genie Nano manual, "TurboDrive". `AutoGain`: examples of Emergent's eSDK.
+Names of Daheng: enumeration of features in examples of its Galaxy SDK for MERCURY GigE heads.
 """
 
 from __future__ import annotations
@@ -21,6 +23,10 @@ from drivers.cameras.aravis.presets import FeatureValue
 NEUTRAL: Final[tuple[tuple[str, FeatureValue], ...]] = (
     ("SequencerMode", "Off"),
     ("SequenceEnable", False),
+    ("TransferControlMode", "Basic"),
+    ("GenDCStreamingMode", "Off"),
+    ("turboTransferEnable", False),
+    ("HDRMode", "Off"),
     ("pgrHDRModeEnabled", False),
     ("HDREnable", False),
     ("MultiRoiMode", "Off"),
@@ -31,25 +37,32 @@ NEUTRAL: Final[tuple[tuple[str, FeatureValue], ...]] = (
     ("BalanceWhiteAuto", "Off"),
     ("BalanceRatioAuto", "Off"),
     ("SharpnessAuto", "Off"),
+    ("ContrastAuto", "Off"),
     ("HueAuto", "Off"),
     ("SaturationAuto", "Off"),
     ("IrisAuto", "Off"),
+    ("AutoGain", False),
     ("pgrExposureCompensationAuto", "Off"),
     ("AcquisitionFrameRateAuto", "Off"),
     ("AcquisitionFrameRateEnable", False),
     ("AcquisitionFrameRateEnabled", False),
+    ("AcquisitionFrameRateMode", "Off"),
     ("GammaEnable", False),
     ("GammaEnabled", False),
     ("Gamma", 1.0),
     ("SharpeningEnable", False),
     ("SharpnessEnable", False),
     ("SharpnessEnabled", False),
+    ("SharpnessMode", "Off"),
+    ("ContrastEnable", False),
     ("HueEnabled", False),
     ("SaturationEnable", False),
     ("SaturationEnabled", False),
+    ("SaturationMode", "Off"),
     ("NoiseReductionEnable", False),
     ("DenoisingEnable", False),
     ("DigitalNoiseReductionMode", "Off"),
+    ("NoiseReductionMode", "Off"),
     ("LUTEnable", False),
     ("LUTMode", "Off"),
     ("GradationCompressionMode", "Off"),
@@ -80,6 +93,9 @@ NEUTRAL: Final[tuple[tuple[str, FeatureValue], ...]] = (
     ("DefectMaskEnable", False),
     ("BlemishEnable", False),
     ("PixelDefectControl", "Off"),
+    ("DeadPixelCorrect", "Off"),
+    ("StaticDefectCorrection", "Off"),
+    ("FixedPatternNoiseCorrectMode", "Off"),
     ("BSLPixelDefectCorrectionMode", "Off"),
     ("BslStaticDefectPixelCorrectionMode", "Off"),
     ("pgrDefectPixelCorrectionEnable", False),
@@ -100,10 +116,16 @@ NEUTRAL: Final[tuple[tuple[str, FeatureValue], ...]] = (
     ("BinningVertical", 1),
     ("DecimationHorizontal", 1),
     ("DecimationVertical", 1),
+    ("CenterX", False),
+    ("CenterY", False),
     ("OffsetX", 0),
     ("OffsetY", 0),
 )
 """Feature and its neutral value, in the order in which they are written."""
+OFF: Final = ("Off", "OFF", "False", "Disable", "Disabled", "None", "Manual")
+"""Entries that switch a feature off."""
+ENTRIES: Final[Mapping[str, tuple[str, ...]]] = {"TransferControlMode": ("Basic", "Automatic")}
+"""Entries of other features; with one that is not among them, frames wait for a command."""
 PASSES: Final = 2
 # Quirk: heads lock the processing of colour images while they send monochrome or Bayer images. It
 # has no effect then, so a locked feature is no refusal.
@@ -186,15 +208,19 @@ def _neutral(features: Features, name: str, value: FeatureValue) -> FeatureValue
     """The neutral value in the type of this head's feature; None if it has none."""
     kind = features.kind(name)
     if kind == "enumeration":
-        wanted = (
-            ["Off", "False", "Disable", "Disabled", "None"]
-            if value in (False, "Off")
-            else [str(value), f"X{value}", f"{name}{value}"]
-        )
-        return features.first_entry(name, wanted)
+        numbered = (str(value), f"X{value}", f"{name}{value}")
+        wanted = OFF if value in (False, "Off") else ENTRIES.get(name, numbered)
+        found = features.first_entry(name, wanted)
+        if found is None and features.text(name) == "Continuous":
+            offered = ", ".join(features.entries(name))
+            raise FeatureError(
+                f"{name} is Continuous and cannot be switched off (it has {offered})"
+            )
+        return found
     if kind == "boolean":
         return False if value in (False, "Off") else None
     if kind in ("integer", "float") and not isinstance(value, str):
         low, high = features.bounds(name)
-        return value if low <= value <= high else None
+        neutral = float(value) if kind == "float" else int(value)
+        return neutral if low <= neutral <= high else None
     return None

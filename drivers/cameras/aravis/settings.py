@@ -34,6 +34,11 @@ class AravisSettings(Configured):
     )
     exposure_time_us = Setting(1000.0, minimum=1, maximum=60e6, help="exposure time, us")
     gain_db = Setting(0.0, minimum=-20, maximum=60, help="gain, dB")
+    gain_unit = Setting(
+        "",
+        choices=("", "dB", "factor"),
+        help="unit of the head's gain as its manual states it; empty reads it from the head",
+    )
     temperature_probe = Setting(
         "", help="name of the rig's probe that the head's own thermometer is; empty: none"
     )

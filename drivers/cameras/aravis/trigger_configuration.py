@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 from typing import Final
 
-from drivers.cameras.aravis.feature_access import FeatureError
+from drivers.cameras.aravis.feature_access import FeatureError, Features
 from drivers.cameras.aravis.feature_writer import FeatureWriter
 from drivers.cameras.aravis.settings import AravisSettings
 
@@ -41,7 +41,10 @@ def write_trigger(writer: FeatureWriter, settings: AravisSettings) -> None:
     if not features.is_implemented("TriggerMode") and not features.entries("TriggerSelector"):
         writer.missing.append("no feature TriggerMode")
         return
-    if settings.trigger_source == "software" and features.kind("TriggerSoftware") != "command":
+    has_command = features.kind("TriggerSoftware") == "command"
+    if settings.trigger_source == "software" and not (
+        has_command and features.is_implemented("TriggerSoftware")
+    ):
         writer.refusals.append(
             'trigger_source is "software"; the head has no command TriggerSoftware, set '
             'trigger_source = "line"'
@@ -51,12 +54,7 @@ def write_trigger(writer: FeatureWriter, settings: AravisSettings) -> None:
     frame_trigger = _frame_trigger(writer, selectors)
     if selectors and frame_trigger is None:
         return
-    for other in selectors:
-        if other != frame_trigger:
-            with contextlib.suppress(FeatureError):
-                features.set("TriggerSelector", other)
-                if features.text("TriggerMode") == "On":
-                    features.set("TriggerMode", "Off")
+    switch_triggers_off(features)
     hint = "choose one that the head has"
     if frame_trigger is not None:
         writer.set("trigger_source", "TriggerSelector", frame_trigger, hint)
@@ -65,8 +63,6 @@ def write_trigger(writer: FeatureWriter, settings: AravisSettings) -> None:
         of = f" for its trigger {frame_trigger}" if frame_trigger is not None else ""
         writer.missing.append(f"no feature TriggerMode{of}")
         return
-    with contextlib.suppress(FeatureError):
-        features.set("TriggerMode", "Off")
     key, source = {
         "software": ("trigger_source", "Software"),
         "line": ("trigger_line", settings.trigger_line),
@@ -78,26 +74,39 @@ def write_trigger(writer: FeatureWriter, settings: AravisSettings) -> None:
     with contextlib.suppress(FeatureError):
         features.set("TriggerSource", source)
     writer.set("trigger_source", "TriggerMode", "On", "the head cannot be triggered")
-    offered = ", ".join(features.entries("TriggerSource")) or "no trigger source"
     held = features.text("TriggerSource")
     is_fixed = held != source and held and not features.is_writable("TriggerSource")
-    hint = f"its trigger source is fixed at {held}" if is_fixed else f"the head has {offered}"
+    if is_fixed:
+        hint = f"its trigger source is fixed at {held}"
     writer.set(key, "TriggerSource", source, hint)
     if settings.trigger_source == "line":
         _write_line(writer, settings)
     delay = features.first_available(TRIGGER_DELAYS)
     if delay is not None:
-        wanted = settings.trigger_delay_us / features.unit_us(delay)
         low, high = features.bounds(delay)
         # Heads that cannot start without any delay have a lowest one.
-        wanted = low if wanted == 0 and 0 < low <= high else wanted
-        writer.set("trigger_delay_us", delay, wanted, "choose another delay")
+        lowest = low if 0 < low <= high else 0.0
+        _write_duration(writer, "trigger_delay_us", delay, settings.trigger_delay_us, lowest)
     elif settings.trigger_delay_us:
         writer.refusals.append(
             f"trigger_delay_us is {settings.trigger_delay_us:g}; the head has no trigger delay"
         )
     if settings.trigger_source == "action":
         _write_action(writer, settings)
+
+
+def switch_triggers_off(features: Features) -> None:
+    """Switch every trigger of a head off; some heads lock other features while one is on.
+
+    Args:
+        features: the head's features.
+    """
+    for trigger in features.entries("TriggerSelector") or [""]:
+        with contextlib.suppress(FeatureError):
+            if trigger:
+                features.set("TriggerSelector", trigger)
+            if features.text("TriggerMode") == "On":
+                features.set("TriggerMode", "Off")
 
 
 def _frame_trigger(writer: FeatureWriter, selectors: list[str]) -> str | None:
@@ -147,8 +156,25 @@ def _write_line(writer: FeatureWriter, settings: AravisSettings) -> None:
                 f"debounce_us is {settings.debounce_us:g}; the head has no debouncer"
             )
         else:
-            wanted = settings.debounce_us / features.unit_us(name)
-            writer.set("debounce_us", name, wanted, "choose another time")
+            _write_duration(writer, "debounce_us", name, settings.debounce_us, 0.0)
+
+
+def _write_duration(
+    writer: FeatureWriter, key: str, name: str, wanted_us: float, lowest: float
+) -> None:
+    """Write a duration; 0 is the head's lowest, whatever its unit is."""
+    unit_us = writer.features.unit_us(name)
+    if wanted_us and unit_us is None:
+        stated = writer.features.unit(name)
+        writer.refusals.append(
+            f"{key} is {wanted_us:g}; the head has {name} in {stated!r}, which is no time; set "
+            f"{key} = 0 and {name} under features"
+        )
+        return
+    value = wanted_us / unit_us if unit_us else wanted_us
+    is_integer = writer.features.kind(name) == "integer"
+    value = value or lowest
+    writer.set(key, name, round(value) if is_integer else value, "choose another time")
 
 
 def _write_action(writer: FeatureWriter, settings: AravisSettings) -> None:

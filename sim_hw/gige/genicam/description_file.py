@@ -112,15 +112,16 @@ def read_description(data: bytes) -> Description:
 
 
 def _root_of(xml: bytes) -> ElementTree.Element:
-    """The root; bytes that are no UTF-8 are read as Windows-1252, as some editors write."""
+    """The root; what is not in the encoding it states is read as UTF-8, else as Windows-1252."""
     try:
         return ElementTree.fromstring(xml)
     except ElementTree.ParseError:
         try:
-            xml.decode("utf-8")
+            text = xml.decode("utf-8")
         except UnicodeDecodeError:
-            return ElementTree.fromstring(xml.decode("cp1252", "replace"))
-        raise
+            text = xml.decode("cp1252", "replace")
+        # A text is read without regard to the encoding that it states.
+        return ElementTree.fromstring(text)
 
 
 def _version(root: ElementTree.Element, attribute: str) -> int:

@@ -302,6 +302,8 @@ def _write_factory_value(nodes: NodeMap, name: str) -> None:
         current = nodes.number(name)
     except NodeError:
         return
+    if node.text("ValidValueSet"):
+        wanted = int(node.text("ValidValueSet").split(";")[0], 0)
     if wanted is None:
         if limits.minimum <= current <= limits.maximum:
             return
