@@ -51,17 +51,48 @@ def converted_camera(
     """
     if camera.terms:
         raise NetworkError([f"camera {camera.name}: additional parameters cannot be converted"])
-    axes = [np.linspace(-half, half, _SIDE) for half in half_size_mm]
-    measured = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
-    measured = measured + np.array([camera.xp_mm, camera.yp_mm])
-    none = np.zeros(0)
-    wanted = ideal_mm(camera, camera.interior, none, measured)
+    measured = frame_grid(camera, half_size_mm)
+    wanted = ideal_mm(camera, camera.interior, np.zeros(0), measured)
     wanted = wanted / principal_distance_mm(camera, camera.interior)
-    target = replace(camera, model=model, interior=np.zeros(10))
-    own = np.array([k for k in range(10) if not (model == "fisheye" and k == 7)])
-    reach = float(np.hypot(*half_size_mm))
-    scale = _scales(model, reach, camera.f_mm)[own]
     to_image = measured_by_ideal(camera, camera.interior, measured)
+    return fitted_camera(replace(camera, model=model), measured, wanted, to_image)
+
+
+def frame_grid(camera: CameraModel, half_size_mm: tuple[float, float]) -> Array:
+    """Image points over the frame of a camera.
+
+    Args:
+        camera: its principal point.
+        half_size_mm: half width and half height of the frame.
+
+    Returns:
+        Shape (n, 2), mm.
+    """
+    axes = [np.linspace(-half, half, _SIDE) for half in half_size_mm]
+    grid = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
+    return np.asarray(grid + np.array([camera.xp_mm, camera.yp_mm]))
+
+
+def fitted_camera(
+    camera: CameraModel, measured: Array, wanted: Array, to_image: Array | None = None
+) -> ConvertedCamera:
+    """The camera with the ten that best place directions where they were measured.
+
+    Args:
+        camera: model, f and principal point; its `interior` is replaced.
+        measured: image points, shape (n, 2), mm.
+        wanted: their ideal coordinates over the principal distance, shape (n, 2), y up.
+        to_image: derivatives of measured by ideal coordinates, shape (n, 2, 2), where residuals of
+            a model that corrects measured coordinates are to be those of the image; None: one.
+
+    Returns:
+        The camera and its residuals.
+    """
+    model, none = camera.model, np.zeros(0)
+    target = replace(camera, interior=np.zeros(10))
+    own = np.array([k for k in range(10) if not (model == "fisheye" and k == 7)])
+    about = measured - np.array([camera.xp_mm, camera.yp_mm])
+    scale = _scales(model, float(np.linalg.norm(about, axis=1).max()), camera.f_mm)[own]
 
     def residuals(values: Array) -> Array:
         interior = np.zeros(10)

@@ -15,6 +15,9 @@ these are defined here:
 What all CCDs have in common cannot be separated from the orientation and the lens. Of each kind,
 the sum over the CCDs of the master cone is zero, as in the datum of the mosaic. This removes one
 parameter of each kind.
+
+Two sets of polynomials belong to images of one frame camera: `ebner` (12) and `gruen` (44), on a
+square grid of `base_mm` about the principal point.
 """
 
 from __future__ import annotations
@@ -23,12 +26,13 @@ from dataclasses import replace
 from typing import Final, Literal
 
 from processing.bundle.network import CameraModel
+from processing.bundle.polynomial_sets import EBNER, GRUEN
 from processing.bundle.terms import Kind, Part, Term
 from processing.geometry.placement import nominal_placements
 from processing.geometry.topology import footprint
 from processing.rig import Rig
 
-SetName = Literal["none", "radial", "sensors", "sensors-full"]
+SetName = Literal["none", "radial", "sensors", "sensors-full", "ebner", "gruen"]
 SETS: Final[tuple[SetName, ...]] = ("none", "radial", "sensors", "sensors-full")
 
 _RADIAL: Final = frozenset({"k1", "k2"})
@@ -78,6 +82,7 @@ def with_self_calibration(
     *,
     master_cone: str | None = "",
     interior: bool = False,
+    base_mm: float | None = None,
 ) -> CameraModel:
     """The camera with a set of additional parameters to be estimated.
 
@@ -87,12 +92,15 @@ def with_self_calibration(
         parts: the CCDs of its image; needed for `sensors` and `sensors-full`.
         master_cone: whose CCDs carry the datum.
         interior: whether dx0, dy0 and df can be separated from the images' orientation.
+        base_mm: half the side of the grid of `ebner` and `gruen`; usually the base of a stereo pair
+            in the image.
 
     Returns:
         The camera with `free`, `terms` and `gauges` of the set; `none` leaves it as it is.
 
     Raises:
-        ValueError: a set of CCDs for an image that is not made of several.
+        ValueError: a set of CCDs for an image that is not made of several, or polynomials without
+            a positive base.
 
     Source: docs/explanation/mathematics/bundle.md#additional-parameters.
 
@@ -113,6 +121,15 @@ def with_self_calibration(
     free = set(camera.free)
     if name == "none":
         return camera
+    if name in ("ebner", "gruen"):
+        if base_mm is None or base_mm <= 0.0:
+            raise ValueError(
+                f"set {name} needs base_mm above 0; camera {camera.name} has {base_mm}"
+            )
+        square = (Part("image", "", -base_mm, -base_mm, base_mm, base_mm),)
+        kinds = EBNER if name == "ebner" else GRUEN
+        terms_of = tuple(Term(kind, kind, ("image",), square) for kind in kinds)
+        return replace(camera, terms=terms_of)
     free |= _RADIAL
     if name == "radial":
         return replace(camera, free=frozenset(free))

@@ -1,7 +1,7 @@
-"""Additional parameters of a stitched image: corrections of image coordinates by one CCD or cone.
+"""Additional parameters: corrections of image coordinates of one CCD or cone, or of whole images.
 
-Each term is a correction of measured coordinates, linear in its parameter, that acts on a part of
-the image only. Which terms make up a set is in `self_calibration`.
+Each term is a correction of measured coordinates, linear in its parameter. Which terms make up a
+set is in `self_calibration`; polynomials of whole images are in `polynomial_sets`.
 """
 
 from __future__ import annotations
@@ -13,13 +13,15 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.bundle.polynomial_sets import POLYNOMIALS
+
 Array = NDArray[np.float64]
 
 Kind = Literal[
     "shift-x", "shift-y", "rotation", "scale", "affinity", "shear", "perspective-x", "perspective-y"
 ]
 
-UNITS: Final[Mapping[Kind, tuple[str, float]]] = {
+UNITS: Final[Mapping[str, tuple[str, float]]] = {
     "shift-x": ("um", 1e3),
     "shift-y": ("um", 1e3),
     "rotation": ("urad", 1e6),
@@ -28,6 +30,7 @@ UNITS: Final[Mapping[Kind, tuple[str, float]]] = {
     "shear": ("urad", 1e6),
     "perspective-x": ("ppm/mm", 1e6),
     "perspective-y": ("ppm/mm", 1e6),
+    **dict.fromkeys(POLYNOMIALS, ("um", 1000.0)),
 }
 """What a parameter is printed in, and how many of it make one of the internal unit (mm, rad, 1)."""
 
@@ -53,11 +56,12 @@ class Part:
 class Term:
     """One additional parameter: `kind` on the CCDs `sensors` of an image made of `parts`.
 
-    Corrections are taken about the centre of each part. `name` is unique within a camera.
+    Corrections are taken about the centre of each part. `name` is unique within a camera. Of a
+    polynomial the only part is the square of its grid.
     """
 
     name: str
-    kind: Kind
+    kind: str
     sensors: tuple[str, ...]
     parts: tuple[Part, ...]
     value: float = 0.0
@@ -117,6 +121,9 @@ def term_design(term: Term, xy_mm: Array) -> Array:
     chosen = np.isin(own, [names.index(s) for s in term.sensors])
     centres = np.array([part.centre_mm for part in term.parts])
     u, v = (xy_mm - centres[own]).T
+    if term.kind in POLYNOMIALS:
+        half = 0.5 * (term.parts[0].x_max_mm - term.parts[0].x_min_mm)
+        return np.stack(POLYNOMIALS[term.kind].at(u / half, v / half), axis=1)
     one, none = np.ones_like(u), np.zeros_like(u)
     x, y = {
         "shift-x": (one, none),

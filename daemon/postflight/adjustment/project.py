@@ -361,6 +361,7 @@ def _camera(section: CameraSection, folder: Path, problems: list[str]) -> Camera
             () if rig is None else parts_of(rig),
             master_cone="" if rig is None else rig.master_cone,
             interior=section.interior,
+            base_mm=section.base_mm,
         )
     except RigError as error:
         problems += list(error.problems)

@@ -99,6 +99,7 @@ class CameraSection(_ProjectSection):
     free: tuple[str, ...] = ()
     sigma: dict[str, float] = {}
     parameters: SetName = "none"
+    base_mm: float | None = Field(default=None, gt=0.0)
     interior: bool = False
     rig: str | None = None
     without: tuple[str, ...] = ()

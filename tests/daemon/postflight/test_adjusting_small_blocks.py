@@ -118,3 +118,24 @@ def test_a_datum_without_effect_is_refused_or_reported(tmp_path) -> None:
     refused = CliRunner().invoke(app, ["adjust", str(folder)])
     assert isinstance(refused.exception, ProjectError)
     assert "datum_names has no effect" in str(refused.exception)
+
+
+def test_polynomials_of_a_project_need_a_base_and_are_written(tmp_path) -> None:
+    folder = pair(tmp_path / "pair", 8)
+    project = folder / "project.toml"
+    plain = project.read_text()
+    project.write_text(plain.replace('name = "c"', 'name = "c"\nparameters = "ebner"'))
+    refused = CliRunner().invoke(app, ["adjust", str(folder)])
+    assert "set ebner needs base_mm above 0; camera c has None" in str(refused.exception)
+    dropped = [f"ebner {k}" for k in range(1, 13) if k != 7]
+    project.write_text(
+        plain.replace(
+            'name = "c"',
+            f'name = "c"\nparameters = "ebner"\nbase_mm = 20.0\nwithout = {json.dumps(dropped)}',
+        )
+    )
+    outcome = run(str(folder), "--json", "--out", str(tmp_path / "adjusted"))
+    (estimated,) = json.loads(outcome.stdout)["parameters"]
+    assert (estimated["name"], estimated["unit"]) == ("ebner 7", "um")
+    written = (tmp_path / "adjusted" / "project.toml").read_text()
+    assert "base_mm = 20.0" in written and '"ebner 7" =' in written
