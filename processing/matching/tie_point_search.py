@@ -6,7 +6,7 @@ What is found there is matched in `processing.matching.tie_points`.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -41,10 +41,14 @@ class TiePointSettings:
 
     Window and search of P/C are in pixels of the colour master, of P/P in PAN pixels; so are the
     sigmas. `floor_sigma_px` is the error besides noise: rotation within the patch, interpolation.
-    Where an area is too small for the requested number, windows still do not overlap.
+    Where an area is too small for the requested number, windows still do not overlap. An overlap
+    has `points_per_supported_overlap` where both sensors have `supporting_points` P/C points: then
+    more P/P points hardly improve the mosaic.
     """
 
     points_per_overlap: int = 850
+    points_per_supported_overlap: int = 425
+    supporting_points: int = 950
     points_per_sensor: int = 1900
     window_pp_px: int = 19
     window_pc_px: int = 15
@@ -95,6 +99,8 @@ def pan_searches(
     placements: Mapping[str, SensorPlacement],
     frames: Mapping[str, Frame],
     settings: TiePointSettings,
+    *,
+    supported: Collection[str] = (),
 ) -> list[PairSearch]:
     """Search positions of the overlaps of PAN sensors.
 
@@ -103,6 +109,7 @@ def pan_searches(
         placements: predictions by sensor name.
         frames: Level-1 frames by sensor name, (h, w).
         settings: number of points and windows.
+        supported: sensors with `supporting_points` P/C points, by name.
 
     Returns:
         One for each overlap of the rig, in its order; without positions where a frame is missing.
@@ -115,12 +122,14 @@ def pan_searches(
         at_a = at_b = np.empty((0, 2), dtype=np.int64)
         expected = np.empty((0, 2))
         region = None
+        both = a in supported and b in supported
+        wanted = settings.points_per_supported_overlap if both else settings.points_per_overlap
         if (
             a in frames
             and b in frames
             and not _differ_by_shift_only(placements[a], placements[b], overlap.rectangle)
         ):
-            at_b, region = _seen_searches(placements, frames, overlap, settings, margin_px)
+            at_b, region = _seen_searches(placements, frames, overlap, settings, wanted)
             at_a, expected = at_b, at_b.astype(np.float64)
         elif a in frames and b in frames:
             area = _shrunk(
@@ -128,7 +137,7 @@ def pan_searches(
                 usable_pixels(placements[a]),
                 margin_px,
             )
-            cells = _cells(area, settings.points_per_overlap, settings.window_pp_px + 3)
+            cells = _cells(area, wanted, settings.window_pp_px + 3)
             at_a = _features(frames[a], cells, half, settings.window_pp_px)
             predicted = raw_from_vip_mm(
                 placements[b], vip_mm_from_raw(placements[a], at_a.astype(np.float64))
@@ -162,12 +171,13 @@ def _seen_searches(
     frames: Mapping[str, Frame],
     overlap: Overlap,
     settings: TiePointSettings,
-    margin_px: int,
+    wanted: int,
 ) -> tuple[NDArray[np.int64], tuple[int, int, int, int] | None]:
     """Positions in b where a sees the same, and the region of b that holds their windows."""
+    margin_px = settings.window_pp_px // 2 + MARGIN_PX + 1
     a, b = placements[overlap.sensor_a], placements[overlap.sensor_b]
     area = _shrunk(_raw_areas(b, [overlap.rectangle])[0], usable_pixels(b), margin_px)
-    cells = _cells(area, settings.points_per_overlap, settings.window_pp_px + 3)
+    cells = _cells(area, wanted, settings.window_pp_px + 3)
     at_b = _features(
         frames[overlap.sensor_b], cells, settings.window_pp_px // 2, settings.window_pp_px
     )

@@ -20,6 +20,7 @@ from processing.image.rectification import rectify_to_sensor
 from processing.matching.tie_point_search import (
     PAN_TO_COLOUR,
     PAN_TO_PAN,
+    PairSearch,
     TiePointSettings,
     colour_searches,
     pan_searches,
@@ -112,48 +113,30 @@ def match_tie_points(
     settings = settings or TiePointSettings()
     _check_frames(rig, frames)
     ratio = exact_colour_ratio(rig) or 1.0
-    searches = pan_searches(rig, placements, frames, settings)
-    searches += colour_searches(rig, placements, frames, settings, ratio)
+    coloured = colour_searches(rig, placements, frames, settings, ratio)
+    to_colour = [_matched(search, placements, frames, settings) for search in coloured]
+    # Sensors that P/C points tie need few P/P points; the others have nothing else.
+    supported = {
+        search.pair[0]
+        for search, (_, reached) in zip(coloured, to_colour, strict=True)
+        if np.count_nonzero(reached) >= settings.supporting_points
+    }
+    to_pan = pan_searches(rig, placements, frames, settings, supported=supported)
+    searches = to_pan + coloured
+    matches = [_matched(search, placements, frames, settings) for search in to_pan] + to_colour
     names = tuple(sensor.name for sensor in rig.sensors)
     index = {name: i for i, name in enumerate(names)}
     rows = []
     unmatched, unmatched_overlap = [np.zeros((0, 2), np.int64)], [np.zeros(0, np.int64)]
-    for number, search in enumerate(searches):
+    for number, (search, (found, reached)) in enumerate(zip(searches, matches, strict=True)):
         a, b = search.pair
-        to_pan = search.kind == PAN_TO_PAN
-        if not len(search.at_a):
-            continue
-        window = settings.window_pp_px if to_pan else settings.window_pc_px
-        frame_a, at_a, seen, step = frames[a], search.at_a, None, search.step
-        if search.region is not None:
-            seen = rectify_to_sensor(
-                placements[a], placements[b], frame_a, region=search.region, step=step
-            )
-            frame_a, at_a = seen.pixels, seen.at(search.at_b)
-        found, matched = match_and_mark(
-            frame_a,
-            frames[b],
-            Positions(at_a, search.at_b, search.expected_b),
-            np.array(usable_pixels(placements[b]), dtype=np.int64),
-            ratio=step,
-            window_px=window,
-            search_px=settings.search_pp_px if to_pan else settings.search_pc_px,
-            limits=MatchLimits(
-                settings.max_sigma_pp_px if to_pan else settings.max_sigma_pc_px,
-                settings.min_correlation,
-                settings.min_peak_margin,
-            ),
-        )
-        if not to_pan:
-            unmatched.append(search.at_b[~matched])
+        if search.kind == PAN_TO_COLOUR:
+            unmatched.append(search.at_b[~reached])
             unmatched_overlap.append(np.full(len(unmatched[-1]), number))
-        found = found[matched]
         columns = np.empty((len(found), 10))
         columns[:, 0], columns[:, 1] = index[a], index[b]
         columns[:, 2:6] = found[:, :4]
-        if seen is not None:
-            columns[:, 2:4] = seen.raw_a(found[:, :2])
-        unit = 1.0 if to_pan else ratio
+        unit = 1.0 if search.kind == PAN_TO_PAN else ratio
         columns[:, 6] = np.hypot(found[:, 4], settings.floor_sigma_px) * unit
         columns[:, 7] = found[:, 5]
         columns[:, 8], columns[:, 9] = search.kind, number
@@ -174,6 +157,43 @@ def match_tie_points(
         unmatched_b=np.concatenate(unmatched),
         unmatched_overlap=np.concatenate(unmatched_overlap),
     )
+
+
+def _matched(
+    search: PairSearch,
+    placements: Mapping[str, SensorPlacement],
+    frames: Mapping[str, Frame],
+    settings: TiePointSettings,
+) -> tuple[Array, NDArray[np.bool_]]:
+    """The accepted rows of `match_patches` of a pair, in raw pixels; which positions they are."""
+    a, b = search.pair
+    to_pan = search.kind == PAN_TO_PAN
+    if not len(search.at_a):
+        return np.empty((0, 8)), np.zeros(0, np.bool_)
+    frame_a, at_a, seen = frames[a], search.at_a, None
+    if search.region is not None:
+        seen = rectify_to_sensor(
+            placements[a], placements[b], frame_a, region=search.region, step=search.step
+        )
+        frame_a, at_a = seen.pixels, seen.at(search.at_b)
+    result, reached = match_and_mark(
+        frame_a,
+        frames[b],
+        Positions(at_a, search.at_b, search.expected_b),
+        np.array(usable_pixels(placements[b]), dtype=np.int64),
+        ratio=search.step,
+        window_px=settings.window_pp_px if to_pan else settings.window_pc_px,
+        search_px=settings.search_pp_px if to_pan else settings.search_pc_px,
+        limits=MatchLimits(
+            settings.max_sigma_pp_px if to_pan else settings.max_sigma_pc_px,
+            settings.min_correlation,
+            settings.min_peak_margin,
+        ),
+    )
+    found = result[reached]
+    if seen is not None:
+        found[:, :2] = seen.raw_a(found[:, :2])
+    return found, reached
 
 
 def _check_frames(rig: Rig, frames: Mapping[str, Frame]) -> None:

@@ -139,6 +139,32 @@ def test_a_missing_frame_has_no_points_and_leaves_the_others_theirs() -> None:
     assert len(match_tie_points(rig, start, {})) == 0
 
 
+def test_overlaps_have_fewer_points_only_where_green_ties_both_sensors() -> None:
+    rig, start, _, frames = scene()
+    settings = TiePointSettings(points_per_supported_overlap=30, supporting_points=100)
+    full = match_tie_points(rig, start, frames).counts()
+    seen = match_tie_points(rig, start, frames, settings=settings).counts()
+    to_pan = [pair for pair in full if "G" not in pair]
+    assert all(0 < seen[pair] <= 30 < full[pair] for pair in to_pan)
+    assert all(seen[pair] == full[pair] for pair in full if "G" in pair)
+    without_green = {name: frame for name, frame in frames.items() if name != "G"}
+    alone = match_tie_points(rig, start, without_green, settings=settings).counts()
+    assert all(alone[pair] == full[pair] for pair in to_pan)
+
+
+def test_an_overlap_has_all_points_where_green_ties_one_sensor_alone() -> None:
+    rig, start, _, frames = scene()
+    full = match_tie_points(rig, start, frames).counts()
+    tied = {pair[0]: count for pair, count in full.items() if "G" in pair}
+    least = min(tied, key=lambda name: tied[name])
+    settings = TiePointSettings(points_per_supported_overlap=30, supporting_points=tied[least] + 1)
+    seen = match_tie_points(rig, start, frames, settings=settings).counts()
+    for pair in (pair for pair in full if "G" not in pair):
+        few = all(tied[name] > tied[least] for name in pair)
+        assert seen[pair] <= 30 if few else seen[pair] == full[pair], pair
+    assert any(seen[pair] == full[pair] for pair in full if least in pair and "G" not in pair)
+
+
 def test_water_has_few_points_and_states_how_many_were_sought() -> None:
     rig, start, _, frames = scene()
     rng = np.random.default_rng(3)
