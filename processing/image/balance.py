@@ -234,18 +234,25 @@ class _Level:
 def _levels(a: int, b: int, light_a: Array, light_b: Array) -> list[_Level]:
     """The overlap cut into levels of equal numbers of samples, from dark to light."""
     middle = 0.5 * (light_a + light_b)
-    difference = light_a - light_b
     order = np.argsort(middle)
+    signals, differences = middle[order], (light_a - light_b)[order]
+    count = min(_LEVELS, max(1, len(order) // _MIN_SAMPLES))
+    size, longer = divmod(len(order), count)
+    split = longer * (size + 1)
     found = []
-    for part in np.array_split(order, min(_LEVELS, max(1, len(order) // _MIN_SAMPLES))):
-        off = difference[part]
-        median = float(np.median(off))
-        spread = 1.4826 * float(np.median(np.abs(off - median)))
-        signal = float(np.median(middle[part]))
-        sigma = 1.2533 * max(spread, 1.0) / np.sqrt(len(part))
-        found.append(
-            _Level(a, b, signal, median, float(np.hypot(sigma, _PAIR_DIFFERENCE_SIGMA * signal)))
-        )
+    # As `numpy.array_split`: the first levels have one sample more.
+    for rows, part in ((longer, slice(split)), (count - longer, slice(split, None))):
+        if not rows:
+            continue
+        of_level, off = signals[part].reshape(rows, -1), differences[part].reshape(rows, -1)
+        medians = np.median(off, axis=1)
+        spreads = 1.4826 * np.median(np.abs(off - medians[:, None]), axis=1)
+        for signal, median, spread in zip(
+            np.median(of_level, axis=1).tolist(), medians.tolist(), spreads.tolist(), strict=True
+        ):
+            sigma = 1.2533 * max(spread, 1.0) / np.sqrt(off.shape[1])
+            sigma = float(np.hypot(sigma, _PAIR_DIFFERENCE_SIGMA * signal))
+            found.append(_Level(a, b, signal, median, sigma))
     return found
 
 

@@ -280,8 +280,7 @@ def _boxes(cells: Mask) -> list[Box]:
     """Runs along the rows, those of successive rows joined where they are the same."""
     boxes: list[Box] = []
     open_runs: dict[tuple[int, int], int] = {}
-    for row in range(cells.shape[0] + 1):
-        runs = set(_runs(cells[row])) if row < cells.shape[0] else set()
+    for row, runs in enumerate([*_runs(cells), set()]):
         for (left, right), top in list(open_runs.items()):
             if (left, right) not in runs:
                 boxes.append((left, top, right, row))
@@ -291,9 +290,15 @@ def _boxes(cells: Mask) -> list[Box]:
     return sorted(boxes, key=lambda box: (box[1], box[0]))
 
 
-def _runs(row: Mask) -> list[tuple[int, int]]:
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], row.astype(np.int8), [0]])))
-    return [(int(a), int(b)) for a, b in zip(edges[0::2], edges[1::2], strict=True)]
+def _runs(cells: Mask) -> list[set[tuple[int, int]]]:
+    """First and end column of each run of true cells, row by row."""
+    runs: list[set[tuple[int, int]]] = [set() for _ in range(len(cells))]
+    steps = np.diff(np.pad(cells.astype(np.int8), ((0, 0), (1, 1))), axis=1)
+    rows, begins = np.nonzero(steps > 0)
+    ends = np.nonzero(steps < 0)[1]
+    for row, begin, end in zip(rows.tolist(), begins.tolist(), ends.tolist(), strict=True):
+        runs[row].add((begin, end))
+    return runs
 
 
 def _coarser(cells: Mask) -> Mask:
