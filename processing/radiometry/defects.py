@@ -23,32 +23,40 @@ _EVEN_COUNTS: Final = 32.0
 """Level-1 counts (4 DN of 12 bits), a half of the noise: gradients this small are alike."""
 
 
-def spread_defects(defect: Array, shifts: int, sign: int) -> tuple[Array, Array]:
-    """The defect map after so many TDI shifts, and its places.
+def spread_defects(
+    defects: Array, shape: tuple[int, int], shifts: int, sign: int
+) -> tuple[Array, Array]:
+    """The defects after so many TDI shifts, as a map of bits and as places.
 
     Args:
-        defect: (h, w) uint8, not 0 at defects.
+        defects: (row, column) of the sensor's defects, (m, 2).
+        shape: height and width of the frame.
         shifts: TDI shifts.
         sign: `tdi_row_sign` of the sensor.
 
     Returns:
-        The map (h, w) uint8, and (row, column) of its defects, (n, 2) int32.
+        The map, (h, ceil(w / 8)) uint8: bit c % 8 of byte c // 8 marks column c. (row, column) of
+        its defects, row by row, (n, 2) int32.
 
     Example:
         Two shifts towards higher rows: a defect in row 0 spoils rows 0 to 2.
 
-        >>> defect = np.array([[1], [0], [0], [0]], np.uint8)
-        >>> mask, places = spread_defects(defect, 2, 1)
+        >>> mask, places = spread_defects(np.array([[0, 1]]), (4, 3), 2, 1)
         >>> mask.ravel(), places.tolist()
-        (array([1, 1, 1, 0], dtype=uint8), [[0, 0], [1, 0], [2, 0]])
+        (array([2, 2, 2, 0], dtype=uint8), [[0, 1], [1, 1], [2, 1]])
     """
-    mask = defect.copy()
-    for k in range(1, shifts + 1):
-        if sign > 0:
-            mask[k:] |= defect[:-k]
-        else:
-            mask[:-k] |= defect[k:]
-    return mask, np.argwhere(mask).astype(np.int32)
+    height, width = shape
+    rows = defects[:, :1].astype(np.int64) + sign * np.arange(shifts + 1)
+    spoilt = np.sort((rows * width + defects[:, 1:])[(rows >= 0) & (rows < height)])
+    row, column = np.divmod(spoilt[np.diff(spoilt, prepend=-1) > 0], width)
+    mask = np.zeros((height, -(-width // 8)), np.uint8)
+    np.bitwise_or.at(mask, (row, column // 8), np.uint8(1) << (column % 8).astype(np.uint8))
+    return mask, np.column_stack([row, column]).astype(np.int32)
+
+
+@compiled_kernel(inline="always")
+def _is_marked(mask, row, column):
+    return (mask[row, column >> 3] >> (column & 7)) & 1 != 0
 
 
 @compiled_kernel(parallel=True)
@@ -64,7 +72,7 @@ def interpolate_defects(level1, mask, places, period):
 
     Args:
         level1: Level-1 words, shape (h, w), uint16; filled in place, 0 where nothing is in reach.
-        mask: defects, shape (h, w), uint8.
+        mask: defects, bits as of `spread_defects`.
         places: (row, column) of the defects, shape (n, 2), int32.
         period: pixels so far apart in row or column are of one colour; no others are compared.
 
@@ -95,7 +103,7 @@ def interpolate_defects(level1, mask, places, period):
                     c = column + way * reach * step_column
                     if r < 0 or c < 0 or r >= height or c >= width:
                         break
-                    if mask[r, c] == 0 and level1[r, c] != 0:
+                    if not _is_marked(mask, r, c) and level1[r, c] != 0:
                         value = np.float64(level1[r, c] & 0xFFFE)
                         saturated |= level1[r, c] & 1
                         if side == 0:
@@ -113,7 +121,9 @@ def interpolate_defects(level1, mask, places, period):
                     c2 = c + step_column
                     if r2 >= height or c2 < 0 or c2 >= width:
                         continue
-                    if mask[r, c] or mask[r2, c2] or level1[r, c] == 0 or level1[r2, c2] == 0:
+                    if _is_marked(mask, r, c) or _is_marked(mask, r2, c2):
+                        continue
+                    if level1[r, c] == 0 or level1[r2, c2] == 0:
                         continue
                     gradient += abs(np.float64(level1[r, c]) - np.float64(level1[r2, c2]))
                     chords += 1
@@ -129,7 +139,8 @@ def interpolate_defects(level1, mask, places, period):
                 and r2 < height
                 and min(c, c2) >= 0
                 and max(c, c2) < width
-                and not (mask[r, c] or mask[r2, c2] or level1[r, c] == 0 or level1[r2, c2] == 0)
+                and not (_is_marked(mask, r, c) or _is_marked(mask, r2, c2))
+                and not (level1[r, c] == 0 or level1[r2, c2] == 0)
             ):
                 outer = np.float64(level1[r, c] & 0xFFFE) + np.float64(level1[r2, c2] & 0xFFFE)
                 filled = _NEAR_TAP * (before + after) + (0.5 - _NEAR_TAP) * outer

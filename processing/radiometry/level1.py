@@ -46,6 +46,8 @@ SATURATED_BIT: Final = 1
 _RESPONSE_UNIT: Final = 16384
 """Fixed-point word of a response of one. Integer running sums are exact, so the result does not
 depend on how many threads shared the rows."""
+_KEPT_SHIFTS: Final = 8
+"""Numbers of TDI shifts whose defects are kept: in flight they change with speed and height."""
 _AT_A_TIME: Final = 2
 """Calibrations as floating-point maps, which are four times what is kept of them."""
 _BIAS_STEP_DN: Final = 1.0 / 32.0
@@ -83,8 +85,9 @@ class Corrector:
     is flat.
 
     `bias` and `dark` count in units above their least value, `response` is one over gain; they are
-    None together, where the calibration is the same for all pixels. `defects_by_shifts` keeps the
-    defect map as spread by so many TDI shifts.
+    None together, where the calibration is the same for all pixels. `defects` are (row, column) of
+    the defects, (n, 2) int32; `defects_by_shifts` keeps them as spread by so many TDI shifts, a few
+    numbers of shifts at a time.
     """
 
     sensor: Sensor
@@ -99,7 +102,7 @@ class Corrector:
     doubling_k: float
     reference_c: float
     response_per_k: float
-    defect: Array | None
+    defects: Array
     defects_by_shifts: dict[int, tuple[Array, Array]] = field(default_factory=dict)
 
 
@@ -181,7 +184,7 @@ def corrector_for(sensor: Sensor, calibration: RadiometricCalibration | None) ->
         doubling_k=calibration.doubling_k,
         reference_c=calibration.reference_c,
         response_per_k=calibration.response_per_k,
-        defect=(calibration.defect != 0).astype(np.uint8) if np.any(calibration.defect) else None,
+        defects=np.argwhere(calibration.defect != 0).astype(np.int32),
     )
 
 
@@ -298,12 +301,8 @@ def level1_from_level0(
             by_column,
             marks,
         )
-    if corrector.defect is not None:
-        if shifts not in corrector.defects_by_shifts:
-            corrector.defects_by_shifts[shifts] = spread_defects(
-                corrector.defect, shifts, sensor.tdi_row_sign
-            )
-        mask, places = corrector.defects_by_shifts[shifts]
+    if len(corrector.defects):
+        mask, places = _spread(corrector, shifts)
         period = 1 if sensor.colour_filter_array == "none" else 2
         add_pixels(out, places, first, -1, by_row, by_column)
         interpolate_defects(out, mask, places, period)
@@ -321,6 +320,19 @@ def level1_from_level0(
         unread / compared if least > 0 else None,
         means_of_sums(by_row, by_column, first) if by_row.size else None,
     )
+
+
+def _spread(corrector: Corrector, shifts: int) -> tuple[Array, Array]:
+    """Defects after so many shifts, kept for the next frame; pipelines at work share them."""
+    sensor, known = corrector.sensor, corrector.defects_by_shifts
+    found = known.get(shifts)
+    if found is None:
+        shape = (sensor.height_px, sensor.width_px)
+        found = spread_defects(corrector.defects, shape, shifts, sensor.tdi_row_sign)
+        if len(known) >= _KEPT_SHIFTS:
+            known.clear()
+        known[shifts] = found
+    return found
 
 
 def min_raw_value(sensor: Sensor) -> int:

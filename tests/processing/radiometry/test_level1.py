@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from processing.image.line_means import line_means
 from processing.radiometry.calibration import RadiometricCalibration, neutral_radiometry
+from processing.radiometry.defects import spread_defects
 from processing.radiometry.level1 import (
     LEVEL1_FLOOR,
     corrector_for,
@@ -284,6 +285,46 @@ def test_a_filled_defect_is_no_saturated_pixel(sensor: Sensor) -> None:
     defect[10, 10] = 1
     filled = defective(sensor, np.full(SHAPE, 800.0), defect)
     assert filled[10, 10] == pytest.approx(800.0, abs=0.3)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("shifts", [0, 1, 7, 120])
+def test_the_map_of_bits_and_the_places_are_the_defects_over_their_path(
+    shifts: int, sign: int
+) -> None:
+    defect = np.random.default_rng(5).uniform(size=SHAPE) < 0.03
+    expected = np.zeros(SHAPE, np.bool_)
+    for row, column in np.argwhere(defect):
+        end = row + sign * shifts
+        expected[max(min(row, end), 0) : max(row, end) + 1, column] = True
+    mask, places = spread_defects(np.argwhere(defect), SHAPE, shifts, sign)
+    bits = np.unpackbits(mask, axis=1, bitorder="little")
+    assert np.array_equal(bits[:, : SHAPE[1]], expected) and not bits[:, SHAPE[1] :].any()
+    assert np.array_equal(places, np.argwhere(expected)) and places.dtype == np.int32
+
+
+def test_maps_of_few_numbers_of_shifts_are_kept_and_pixels_do_not_depend_on_it(
+    sensor: Sensor, calibration: RadiometricCalibration
+) -> None:
+    defect = (np.random.default_rng(6).uniform(size=SHAPE) < 0.02).astype(np.uint8)
+    corrector = corrector_for(sensor, replace(calibration, defect=defect))
+    raw = np.random.default_rng(7).integers(100, 3000, SHAPE).astype(np.uint16)
+
+    def words(shifts: int) -> NDArray[np.uint16]:
+        out = np.zeros(SHAPE, np.uint16)
+        level1_from_level0(
+            corrector,
+            raw,
+            temperature_c=20.0,
+            exposure_time_s=0.01,
+            tdi_shifts=shifts,
+            out=out,
+        )
+        return out
+
+    first = [words(shifts) for shifts in range(20)]
+    assert len(corrector.defects_by_shifts) <= 8
+    assert all(np.array_equal(words(k), one) for k, one in enumerate(first))
 
 
 def test_a_defect_spoils_as_many_rows_more_as_there_were_tdi_shifts(sensor: Sensor) -> None:
