@@ -171,11 +171,12 @@ def computed(
     )
     counted = CountedWork(work, attempts, failure_share)
     known: list[tuple[int, float, float]] = []  # exposures done, wall and CPU seconds
+    first = iter([at_first])
 
     def progress(counts: BatchCounts) -> None:
         done = counts.done + counts.failed
-        if done == 1:
-            at_first()
+        if done:
+            next(first, lambda: None)()
         is_last = done == len(found.pending)
         if is_last or (not known and counts_of(attempts)["opened"] >= workers):
             known.append((done, time.monotonic(), tree_cpu_s()))

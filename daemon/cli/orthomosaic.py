@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 from rich.progress import Progress
 
+from daemon.cli.batch_options import ExecutorOptions, takes_executor
 from daemon.cli.exit_status import exit_if_failed
 from daemon.cli.options import AsJson, Crs, MountFile, Trajectory, lock_for
 from daemon.configuration.model import ConfigurationError
@@ -32,7 +33,11 @@ Examples: `syntopic orthomosaic MISSION --elevation dtm.tif`,
 `syntopic orthomosaic MISSION --triangulation MISSION/export/triangulation/none --gsd 0.1`
 """
 
+STEPS_PER_PROCESS = 8
+"""So many images or tiles take longer than the start of a process."""
 
+
+@takes_executor
 def orthomosaic(
     mission: Annotated[
         Path, typer.Argument(help="Mission folder with Level-2, or of photographs.")
@@ -63,20 +68,21 @@ def orthomosaic(
     trajectory: Trajectory = None,
     mount: MountFile = None,
     crs: Crs = None,
-    threads: Annotated[int, typer.Option(help="Number of threads.", min=1)] = 2,
     out: Annotated[
         Path | None, typer.Option(help="Folder for results (default: in the mission's export).")
     ] = None,
+    *,
+    where: ExecutorOptions,
     as_json: AsJson = False,
 ) -> None:
-    os.environ.setdefault("NUMBA_NUM_THREADS", str(threads))
-    from daemon.postflight.orthomosaic.inputs import block_for_orthomosaic
+    os.environ.setdefault("NUMBA_NUM_THREADS", str(where.threads or 2))
     from daemon.postflight.orthomosaic.orthomosaic import (
         DEPTHS,
         OrthomosaicSettings,
         make_orthomosaic,
         relief_sentence,
     )
+    from daemon.postflight.orthomosaic.orthomosaic_work import OrthomosaicRequest
     from daemon.postflight.orthomosaic.rasters import IMAGES
     from drivers.base.extras import require
 
@@ -86,26 +92,35 @@ def orthomosaic(
         raise ConfigurationError(["--image is pan, rgb or cir, --bits is 16 or 8"])
     if gsd is not None and not gsd > 0.0:
         raise ConfigurationError([f"--gsd is {gsd:g}; it is positive, in metres"])
+    where.check()
     begun = time.monotonic()
     folder = Mission.open(mission)
     final = out or folder.export_dir / "orthomosaic"
-    block = block_for_orthomosaic(
-        folder, triangulation=triangulation, elevation=elevation, plane_height_m=ground_height,
-        gsd_m=gsd, crs=crs, trajectory_file=trajectory, mount_file=mount,
+    request = OrthomosaicRequest(
+        folder.path.absolute(), triangulation and triangulation.absolute(),
+        elevation and elevation.absolute(), ground_height, gsd, crs,
+        trajectory and trajectory.absolute(), mount and mount.absolute(),
     )  # fmt: skip
-    with (
-        lock_for(folder, final),
-        Progress(console=Console(stderr=True), transient=True) as progress,
-    ):
-        task = progress.add_task("survey of the images", total=None)
-        report = make_orthomosaic(
-            block,
-            final,
-            OrthomosaicSettings(images, depths, level, threads),
-            lambda step, done, total: progress.update(
-                task, description=step, completed=done, total=total
-            ),
-        )
+    block = request.block()
+    bar = Progress(console=Console(stderr=True), transient=True)
+    task = bar.add_task("files", total=None)
+
+    def show(done: int, total: int) -> None:
+        bar.start()
+        bar.update(task, completed=done, total=total)
+
+    with lock_for(folder, final):
+        try:
+            report = make_orthomosaic(
+                request,
+                block,
+                final,
+                OrthomosaicSettings(images, depths, level),
+                compute=lambda step: where.compute(step, STEPS_PER_PROCESS),
+                progress=show,
+            )
+        finally:
+            bar.stop()
     report |= {"folder": str(final), "seconds": round(time.monotonic() - begun, 2)}
     if as_json:
         typer.echo(json.dumps(report))

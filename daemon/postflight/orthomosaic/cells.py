@@ -6,8 +6,7 @@ borders of cells.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -53,45 +52,57 @@ def cell_grid(grid: GroundGrid) -> GroundGrid:
     return grid.coarser(CELL_PX)
 
 
+@dataclass(frozen=True)
+class ImageCells:
+    """What one image shows of the cells of a grid.
+
+    `place` is its first row and column, multiples of `BLOCK_CELLS`; `covered` (rows, columns)
+    marks the cells it covers whole; `levels` is its signal.
+    """
+
+    place: tuple[int, int]
+    covered: NDArray[np.bool_]
+    levels: ImageLevels
+
+
+def cells_of(block: OrthoBlock, image: OrthoImage, bands: Sequence[str]) -> ImageCells:
+    """Look at an image once: which cells it covers, and with what signal.
+
+    Args:
+        block: of the image.
+        image: that is looked at.
+        bands: "pan", and colour bands that every image has.
+
+    Raises:
+        RasterError, OSError: it cannot be read.
+    """
+    place, cells = _signal_of(block, image, bands, cell_grid(block.grid))
+    return ImageCells(place, np.asarray(cells[0] > 0.0), _levels(place, cells))
+
+
 def survey(
-    block: OrthoBlock,
-    bands: Sequence[str],
-    *,
-    level: bool = True,
-    threads: int = 1,
-    progress: Callable[[int], None] = lambda _done: None,
+    block: OrthoBlock, bands: Sequence[str], seen: Sequence[ImageCells], *, level: bool = True
 ) -> CellSurvey:
-    """Look at every image once: which cells it covers, and with what signal.
+    """Take every cell from the image nearest to it, and level the images.
 
     Args:
         block: images, poses and grid.
         bands: "pan", and colour bands that every image has.
+        seen: cells of every image, in order.
         level: whether gains are computed; else they are one.
-        threads: images looked at simultaneously.
-        progress: called with the count of images done.
-
-    Raises:
-        RasterError, OSError: an image cannot be read.
     """
     grid = cell_grid(block.grid)
     owner = np.full((grid.height_px, grid.width_px), -1, np.int32)
     nearest = np.full(owner.shape, np.inf, np.float32)
-    found: list[ImageLevels] = []
-
-    def look(image: OrthoImage) -> tuple[tuple[int, int], Array]:
-        return _cells_of(block, image, bands, grid)
-
-    with ThreadPoolExecutor(threads) as pool:
-        for k, (place, cells) in enumerate(pool.map(look, block.images)):
-            row, column = place
-            height, width = cells.shape[1:]
-            part = np.s_[row : row + height, column : column + width]
-            distance = _nadir_distance(block.images[k], grid.window(column, row, width, height))
-            mine = (cells[0] > 0.0) & (distance < nearest[part])
-            owner[part][mine] = k
-            nearest[part][mine] = distance[mine]
-            found.append(_levels(place, cells))
-            progress(k + 1)
+    found = [one.levels for one in seen]
+    for k, one in enumerate(seen):
+        row, column = one.place
+        height, width = one.covered.shape
+        part = np.s_[row : row + height, column : column + width]
+        distance = _nadir_distance(block.images[k], grid.window(column, row, width, height))
+        mine = one.covered & (distance < nearest[part])
+        owner[part][mine] = k
+        nearest[part][mine] = distance[mine]
     blocks = owner[BLOCK_CELLS // 2 :: BLOCK_CELLS, BLOCK_CELLS // 2 :: BLOCK_CELLS]
     shape = tuple(-(-n // BLOCK_CELLS) for n in owner.shape)
     taken = np.full(shape, -1, np.int32)
@@ -107,7 +118,7 @@ def survey(
     return CellSurvey(owner, gains, tuple(bands), steps)
 
 
-def _cells_of(
+def _signal_of(
     block: OrthoBlock, image: OrthoImage, bands: Sequence[str], grid: GroundGrid
 ) -> tuple[tuple[int, int], Array]:
     """First row and column, a multiple of `BLOCK_CELLS`, and means of cells (bands, h, w)."""

@@ -13,11 +13,19 @@ import numpy as np
 from daemon.mission.canonical_json import canonical_bytes
 from daemon.mission.store import durable
 from daemon.mission.store.publication import published, sweep
+from daemon.postflight.batch.batch_run import in_this_process
 from daemon.postflight.orthomosaic.cells import CellSurvey, cell_grid, survey
 from daemon.postflight.orthomosaic.inputs import OrthoBlock, OrthomosaicError, described_ground
+from daemon.postflight.orthomosaic.orthomosaic_work import (
+    OrthomosaicRequest,
+    StepCompute,
+    make_tiles,
+    survey_images,
+    work_of,
+)
 from daemon.postflight.orthomosaic.rasters import IMAGES, tone_curves, write_cog
 from daemon.postflight.orthomosaic.seam_file import write_seams
-from daemon.postflight.orthomosaic.tiles import TilePlan, compute_tiles, plan_tiles
+from daemon.postflight.orthomosaic.tiles import TilePlan, missing_tiles, plan_tiles
 from processing.image.orthoimage.ground_grid import GroundGrid
 from processing.radiometry.tone_curve import curve_as_json
 
@@ -29,7 +37,7 @@ _BYTES_PER_SAMPLE: Final = 2
 _DISK_SHARE: Final = 3.0
 """Tiles, a plain GeoTIFF of one image, and the finished files, in bytes of the tiles."""
 
-Progress = Callable[[str, int, int], None]
+Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
@@ -39,11 +47,16 @@ class OrthomosaicSettings:
     images: tuple[str, ...] = tuple(IMAGES)
     depths: tuple[int, ...] = DEPTHS
     levelled: bool = True
-    threads: int = 2
 
 
 def make_orthomosaic(
-    block: OrthoBlock, final: Path, settings: OrthomosaicSettings, progress: Progress
+    request: OrthomosaicRequest,
+    block: OrthoBlock,
+    final: Path,
+    settings: OrthomosaicSettings,
+    *,
+    compute: StepCompute = lambda _step: in_this_process,
+    progress: Progress = lambda _done, _total: None,
 ) -> dict[str, Any]:
     """Make the orthomosaic in a folder; an earlier one there is replaced when all is complete.
 
@@ -51,14 +64,19 @@ def make_orthomosaic(
     continues and gives the same bytes.
 
     Args:
-        progress: called with the step, what is done of it, and of how much.
+        request: by which the block was collected.
+        block: what was found.
+        final: folder of the results.
+        settings: what is made.
+        compute: where images are looked at and tiles are made, by step.
+        progress: called with the count of files written and of all.
 
     Returns:
         The report, as in `orthomosaic.json`, with `files` and `tiles_computed` in addition.
 
     Raises:
-        OrthomosaicError: no image covers the ground, or the disk is too small.
-        RasterError, OSError: an image cannot be read, or the disk refused.
+        OrthomosaicError: no image covers the ground, one cannot be read, or the disk is too small.
+        OSError: the disk refused.
     """
     bands, left_out = _bands(block, settings.images)
     work = final.with_name(final.name + WORK_SUFFIX)
@@ -69,11 +87,9 @@ def make_orthomosaic(
     for other in work.iterdir():
         if other != tiles:
             durable.remove_tree(other) if other.is_dir() else other.unlink()
-    count = len(block.images)
-    found = survey(
-        block, bands, level=settings.levelled, threads=settings.threads,
-        progress=lambda done: progress("survey of the images", done, count),
-    )  # fmt: skip
+    work_on = work_of(request, block, bands, tiles)
+    seen = survey_images(work_on, block, compute("survey of the images"))
+    found = survey(block, bands, seen, level=settings.levelled)
     if not (found.owner >= 0).any():
         raise OrthomosaicError(
             "no image covers the ground of the grid: is the ground in the height system of the "
@@ -81,10 +97,8 @@ def make_orthomosaic(
         )
     plan = plan_tiles(block, found)
     _refuse_full_disk(final.parent, plan.grid, len(bands))
-    computed = compute_tiles(
-        block, found, plan, tiles, threads=settings.threads,
-        progress=lambda done, total: progress("tiles", done, total),
-    )  # fmt: skip
+    missing = missing_tiles(found, plan, tiles)
+    make_tiles(work_on, missing, compute("tiles"))
     curves, pixels = tone_curves(tiles, plan, bands)
     report = _report(block, found, plan, settings, left_out)
     report["pixels_with_data"] = pixels
@@ -105,14 +119,14 @@ def make_orthomosaic(
                     curves=curves if depth == 8 else None,
                     georeference=block.georeference, tags=tags,
                 )  # fmt: skip
-                progress("files", len(files), total)
+                progress(len(files), total)
         report["seams"]["lines"] = write_seams(
             part / SEAM_FILE, found.owner, cell_grid(block.grid),
             [(image.name, image.exposure) for image in block.images], block.georeference,
         )  # fmt: skip
         durable.create_file(part / REPORT_FILE, [canonical_bytes(report)], mode=0o644)
     durable.remove_tree(work)
-    return report | {"files": files, "tiles_computed": computed}
+    return report | {"files": files, "tiles_computed": len(missing)}
 
 
 def _bands(block: OrthoBlock, images: Sequence[str]) -> tuple[tuple[str, ...], list[str]]:

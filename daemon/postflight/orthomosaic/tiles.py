@@ -7,8 +7,7 @@ tiles bears the hash of all inputs: with other inputs all tiles are computed.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -22,6 +21,7 @@ from daemon.postflight.orthomosaic.inputs import OrthoBlock
 from daemon.postflight.orthomosaic.pixels import image_pixels
 from processing.image.orthoimage.ground_grid import GroundGrid
 from processing.image.orthoimage.ground_resampling import resample_to_ground, window_seen
+from processing.image.orthoimage.levelling import GainField
 
 Array = NDArray[Any]
 
@@ -63,84 +63,89 @@ def tile_file(folder: Path, column: int, row: int) -> Path:
     return folder / f"{row:06d}-{column:06d}.npy"
 
 
-def compute_tiles(
-    block: OrthoBlock,
-    survey: CellSurvey,
-    plan: TilePlan,
-    folder: Path,
-    *,
-    threads: int,
-    progress: Callable[[int, int], None] = lambda _done, _total: None,
-) -> int:
-    """Compute the tiles that are not stored.
+@dataclass(frozen=True)
+class TileJob:
+    """One tile, and the part of seams and gains that it is made with; it can be pickled.
+
+    `column`, `row` are its first pixel in the plan, `first_column`, `first_row` in the block's
+    grid. `owner` are images of its cells, `gains` those of these images.
+    """
+
+    column: int
+    row: int
+    first_column: int
+    first_row: int
+    grid: GroundGrid
+    owner: Array
+    gains: Mapping[int, GainField]
+
+
+def missing_tiles(survey: CellSurvey, plan: TilePlan, folder: Path) -> list[TileJob]:
+    """The tiles that are not stored.
 
     Args:
-        threads: tiles computed simultaneously; so many are in memory.
-        progress: called with the count of tiles done and of all.
+        survey: seams and gains of the block.
+        plan: part of the grid that has data.
+        folder: of the tiles.
+    """
+    jobs = []
+    for column, row, width, height in plan.tiles:
+        if tile_file(folder, column, row).exists():
+            continue
+        first_row, first_column = plan.first_row + row, plan.first_column + column
+        rows = slice(first_row // CELL_PX, (first_row + height - 1) // CELL_PX + 1)
+        columns = slice(first_column // CELL_PX, (first_column + width - 1) // CELL_PX + 1)
+        owner = np.ascontiguousarray(survey.owner[rows, columns])
+        grid = plan.grid.window(column, row, width, height)
+        gains = {int(k): survey.gains[k] for k in np.unique(owner[owner >= 0])}
+        jobs.append(TileJob(column, row, first_column, first_row, grid, owner, gains))
+    return jobs
 
-    Returns:
-        How many were computed; the others were there.
+
+def store_tile(block: OrthoBlock, bands: Sequence[str], job: TileJob, folder: Path) -> None:
+    """Compute a tile and store it.
+
+    Args:
+        block: of the tile.
+        bands: of the tile.
+        job: which one.
+        folder: of the tiles.
 
     Raises:
-        RasterError, OSError: an image cannot be read, or the disk refused. What is stored stays.
+        RasterError, OSError: an image cannot be read, or the disk refused.
     """
-    every = list(plan.tiles)
-    missing = [tile for tile in every if not tile_file(folder, *tile[:2]).exists()]
-    done = len(every) - len(missing)
-    progress(done, len(every))
-
-    def compute(tile: tuple[int, int, int, int]) -> None:
-        _store(tile_file(folder, *tile[:2]), render_tile(block, survey, plan, tile))
-
-    queue = iter(missing)
-    with ThreadPoolExecutor(threads) as pool:
-        running: set[Future[None]] = set()
-        try:
-            while True:
-                while len(running) < threads and (tile := next(queue, None)) is not None:
-                    running.add(pool.submit(compute, tile))
-                if not running:
-                    break
-                finished, running = wait(running, return_when=FIRST_COMPLETED)
-                for one in finished:
-                    one.result()
-                    done += 1
-                    progress(done, len(every))
-        finally:
-            for one in running:
-                one.cancel()
-    return len(missing)
+    _store(tile_file(folder, job.column, job.row), render_tile(block, bands, job))
 
 
-def render_tile(
-    block: OrthoBlock, survey: CellSurvey, plan: TilePlan, tile: tuple[int, int, int, int]
-) -> Array:
+def render_tile(block: OrthoBlock, bands: Sequence[str], job: TileJob) -> Array:
     """Pixels of one tile, each from the image its cell is taken from.
+
+    Args:
+        block: of the tile.
+        bands: of the tile.
+        job: which one.
 
     Returns:
         (bands, rows, columns) uint16, 0 where no image has data.
     """
-    column, row, width, height = tile
-    grid = plan.grid.window(column, row, width, height)
-    surface = block.surface(grid)
-    first_row, first_column = plan.first_row + row, plan.first_column + column
-    r = (first_row + np.arange(height)) // CELL_PX
-    c = (first_column + np.arange(width)) // CELL_PX
-    owner = survey.owner[np.ix_(r, c)]
-    result = np.zeros((len(survey.bands), height, width), np.uint16)
+    width, height = job.grid.width_px, job.grid.height_px
+    surface = block.surface(job.grid)
+    y, x = job.first_row + np.arange(height), job.first_column + np.arange(width)
+    cells = np.ix_(y // CELL_PX - y[0] // CELL_PX, x // CELL_PX - x[0] // CELL_PX)
+    owner = job.owner[cells]
+    result = np.zeros((len(bands), height, width), np.uint16)
     span = CELL_PX * BLOCK_CELLS
-    rows = (first_row + np.arange(height) + 0.5) / span - 0.5
-    columns = (first_column + np.arange(width) + 0.5) / span - 0.5
-    for k in np.unique(owner[owner >= 0]):
+    rows, columns = (y + 0.5) / span - 0.5, (x + 0.5) / span - 0.5
+    for k, gain in job.gains.items():
         image = block.images[k]
-        seen = window_seen(surface, image.pose)
-        if seen is None:
+        visible = window_seen(surface, image.pose)
+        if visible is None:
             continue
         wanted = owner == k
-        pixels = image_pixels(block, image, survey.bands, seen)
-        found = resample_to_ground(pixels, image.pose.window(*seen), surface, wanted=wanted)
+        pixels = image_pixels(block, image, bands, visible)
+        found = resample_to_ground(pixels, image.pose.window(*visible), surface, wanted=wanted)
         filled = found > 0.0
-        found = survey.gains[k].levelled(found, rows, columns)
+        found = gain.levelled(found, rows, columns)
         words = np.clip(np.rint(found), 1.0, _WORD_MAX).astype(np.uint16)
         words[~filled] = 0
         # Where one band has no data, none has: colours of a pixel belong together.

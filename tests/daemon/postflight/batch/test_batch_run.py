@@ -72,7 +72,9 @@ def test_killed_processes_cost_their_own_exposure_one_more_attempt(tmp_path: Pat
     assert sorted(outcome.results) == [1, 2, 3, 5, 7, 8, 9, 10, 11, 12]
     found = causes(outcome)
     assert "quarantined after 3 attempts: its process was killed by SIGKILL" in found[4]
-    assert "the last time with no other exposure in work" in found[4] and "--processes 0" in found[4]
+    assert (
+        "the last time with no other exposure in work" in found[4] and "--processes 0" in found[4]
+    )
     assert "quarantined after 2 attempts: the process could not allocate memory" in found[6]
     attempts = [attempts_of(tmp_path, number) for number in range(1, 13)]
     assert attempts == [1, 2, 3, 3, 2, 2, 2, 1, 1, 1, 1, 1]

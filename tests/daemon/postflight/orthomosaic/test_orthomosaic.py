@@ -25,7 +25,7 @@ from daemon.cli import app
 from daemon.mission.layout import Mission
 from daemon.postflight.orthomosaic import inputs
 from daemon.postflight.orthomosaic import orthomosaic as making
-from daemon.postflight.orthomosaic.cells import CELL_PX, survey
+from daemon.postflight.orthomosaic.cells import CELL_PX, cells_of, survey
 from daemon.postflight.orthomosaic.ground_reach import corner_slope, ground_reach_m
 from daemon.postflight.orthomosaic.inputs import block_for_orthomosaic
 from daemon.postflight.orthomosaic.tiles import TILE_PX
@@ -123,22 +123,18 @@ def test_interrupted_and_repeated_gives_the_same_bytes(flown, made, monkeypatch)
     out, report = made
     again = flown.folder / "again"
     model = ["--elevation", str(flown.folder / "dtm.asc"), "--json"]
-    real, count = making.compute_tiles, []
+    real = making.make_tiles
 
-    def interrupted(*args, **kwargs):
-        def stop(done: int, total: int) -> None:
-            count.append(done)
-            if done == total // 2:
-                raise KeyboardInterrupt
-
-        return real(*args, **{**kwargs, "progress": stop})
+    def interrupted(work, jobs, compute):
+        real(work, jobs[: len(jobs) // 2], compute)
+        raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
-        patched.setattr(making, "compute_tiles", interrupted)
+        patched.setattr(making, "make_tiles", interrupted)
         done = RUN.invoke(app, ["orthomosaic", *_arguments(flown, again, *model)])
     assert done.exit_code != 0 and not again.exists()
     kept = list((flown.folder / "again.work").rglob("*.npy"))
-    assert len(kept) >= max(count) > 0
+    assert len(kept) == report["tiles_computed"] // 2 > 0
     # Half a tile, as a killed writer leaves it, is not taken for one.
     (kept[0].parent / f".{kept[0].name}.deadbeef.part").write_bytes(b"half")
     second = command("orthomosaic", *_arguments(flown, again, *model[:-1], "--threads", "1"))
@@ -177,7 +173,7 @@ def test_a_finer_grid_shows_the_same_ground(flown) -> None:
     area_m2 = []
     for gsd_m in (0.16, 0.02):
         block = _block(flown, gsd_m=gsd_m)
-        found = survey(block, ["pan"], threads=2)
+        found = survey(block, ["pan"], [cells_of(block, one, ["pan"]) for one in block.images])
         area_m2.append((found.owner >= 0).sum() * (gsd_m * CELL_PX) ** 2)
     # Cells are taken where an image covers them whole; smaller ones come nearer to its edge.
     assert 1.0 < area_m2[1] / area_m2[0] < 1.1
