@@ -123,10 +123,11 @@ def test_a_gain_between_the_steps_of_a_head_is_rounded_and_recorded_as_held() ->
         assert frame.settings["Gain"] == pytest.approx(3.47, abs=0.1)
 
 
-def test_no_gain_is_one_where_the_lowest_factor_is_below_it() -> None:
-    with head(gain(unit("x"), lowest=0.5)) as (emulated, driver, _):
+@pytest.mark.parametrize(("lowest", "held"), [(0.5, 10), (1, 10), (2, 20)])
+def test_no_gain_is_the_factor_one_or_the_heads_lowest_above_it(lowest: float, held: int) -> None:
+    with head(gain(unit("x"), lowest)) as (emulated, driver, _):
         driver.bind()
-        assert emulated.registers.nodes.number("GainTenthsReg") == 10
+        assert emulated.registers.nodes.number("GainTenthsReg") == held
 
 
 def test_a_gain_with_named_steps_is_left_and_recorded() -> None:
