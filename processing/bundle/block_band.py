@@ -48,7 +48,11 @@ class BandMatrix:
         return part[:, :-rows], part[:, -rows:]
 
     def border(self) -> Array:
-        """View of the border, (b, c)."""
+        """View of the border.
+
+        Returns:
+            Shape (b, c).
+        """
         columns = len(self.order.columns)
         return self.values[self.order.block_offset[-2] :].reshape(-1, columns)
 
@@ -127,7 +131,7 @@ class BandMatrix:
         return result
 
     def factor(self, least: float) -> BandFactor | None:
-        """Cholesky factor by blocks.
+        """Cholesky factor by blocks, in the place of the matrix.
 
         Args:
             least: a squared pivot below it is a direction without information.
@@ -135,13 +139,12 @@ class BandMatrix:
         Returns:
             None where there is such a direction.
         """
-        result = BandMatrix(self.order, self.values.copy())
         begin, local = self.order.begin, self.order.local
-        border = result.border()
+        border = self.border()
         corner = border[:, local:]
         above = np.zeros((0, 0))
         for k in range(self.order.blocks):
-            before, own = result.blocks(k)
+            before, own = self.blocks(k)
             part = border[:, begin[k] : begin[k + 1]]
             if k:
                 before[:] = linalg.solve_triangular(above, before.T, lower=True).T
@@ -158,7 +161,7 @@ class BandMatrix:
             if last is None:
                 return None
             corner[:] = last
-        return BandFactor(result)
+        return BandFactor(self)
 
 
 def _lower(matrix: Array, least: float) -> Array | None:
@@ -214,7 +217,7 @@ class BandFactor:
         Returns:
             The inverse.
 
-        Source: Takahashi, Fagan and Chin (1973), by blocks.
+        Source: Takahashi et al. (1973), by blocks.
         """
         order, lower = self.lower.order, self.lower
         begin, local, border = order.begin, order.local, lower.border()
@@ -361,7 +364,8 @@ class BandCofactor:
         """The cofactors with a product of few columns added.
 
         Args:
-            left, right: shape (c, k); left @ right.T is symmetric.
+            left: shape (c, k).
+            right: shape (c, k); left @ right.T is symmetric.
 
         Returns:
             The sum.

@@ -96,8 +96,8 @@ def block_order(
 
     Args:
         network: which image sees which object point; positions of the stations.
-        station_columns, attitude_columns: columns of stations and attitudes, shape (n, 3), -1 where
-            held.
+        station_columns: columns of stations, shape (n, 3), -1 where held.
+        attitude_columns: of attitudes.
         image_columns: columns of single images, shape (images, k).
         columns: number of columns c.
         tied: columns of the border in addition to those that are of no exposure, shape (c,).

@@ -34,7 +34,9 @@ def add_products(
     Args:
         rows: rows in the order of their points, shape (m,); those before `begin[0]` have none.
         begin: first of the rows of each point, and the end, shape (p + 1,).
-        indptr, indices, data: rows of the sparse columns.
+        indptr: first entry of each row of the sparse columns, and the end.
+        indices: sparse columns of the entries.
+        data: their values.
         own: orthonormal point part of each row, shape (m, 3).
         dense: coupling of points with the columns that are not sparse, shape (p, 3, d).
         right: right-hand side of the points, shape (p, 3).
@@ -115,17 +117,24 @@ def add_spread(
     """Add what passes through the columns, for groups of rows of one point or of none.
 
     Args:
-        rows, begin: rows by group, and the first of each group and the end.
+        rows: rows by group.
+        begin: first of each group, and the end.
         point: point of each row, -1 where there is none.
-        indptr, indices, data: sparse columns of the rows.
+        indptr: first entry of each row of the sparse columns, and the end.
+        indices: sparse columns of the entries.
+        data: their values.
         design: dense columns of the rows, shape (m, d).
         own: orthonormal point part of the rows, shape (m, 3).
         coupling: of the points with the dense columns, shape (p, 3, d).
         coupling_spread: that times the cofactors of the dense columns, shape (p, 3, d).
         factor: of the points, shape (p, 3, 3).
         window: cofactors between columns.
-        at_sparse, at_dense: index into `window` of each sparse and dense column.
-        leverage, influence, through: as of `statistics.spread_of`; changed.
+        at_sparse: index into `window` of each sparse column.
+        at_dense: of each dense column.
+        leverage: of the rows, without what is to be added, shape (m,); changed.
+        influence: change of each row's object point, shape (m, 3); changed.
+        through: cofactors of the points' orthonormal unknowns by the columns, shape (p, 3, 3);
+            changed.
     """
     d = len(at_dense)
     local = np.full(len(at_sparse), -1, dtype=np.int64)

@@ -257,8 +257,8 @@ def _split(
         (design.data[~of_dense], at[~of_dense], begin), shape=(rows, len(thin))
     )
     design_dense = np.zeros((rows, len(dense)))
-    row = np.repeat(np.arange(rows), np.diff(design.indptr))
-    design_dense[row[of_dense], at[of_dense]] = design.data[of_dense]
+    row = np.repeat(np.arange(rows), np.diff(design.indptr) - np.diff(begin))
+    design_dense[row, at[of_dense]] = design.data[of_dense]
     return thin, dense, design_sparse, design_dense
 
 
@@ -344,6 +344,9 @@ def null_directions(
     Returns:
         All directions without information, shape (c, n), and whether they are the expected ones;
         only then no eigenvalues were needed.
+
+    Raises:
+        SingularError: a matrix in blocks has other directions without information.
     """
     matrix, _ = constrained_matrix(reduced, constraints)
     if isinstance(matrix, BandMatrix):
@@ -443,7 +446,8 @@ def with_product(cofactor: Cofactor, left: Array, right: Array) -> Cofactor:
 
     Args:
         cofactor: shape (c, c).
-        left, right: shape (c, k); left @ right.T is symmetric.
+        left: shape (c, k).
+        right: shape (c, k); left @ right.T is symmetric.
 
     Returns:
         The sum.

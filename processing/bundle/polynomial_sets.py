@@ -28,7 +28,7 @@ _OF_GRUEN: Final = (
 """On the grid -1, -1/2, 0, 1/2, 1."""
 
 
-class Product(NamedTuple):
+class PolynomialProduct(NamedTuple):
     """A factor times the polynomials of degree `x` in x and degree `y` in y."""
 
     factor: float
@@ -39,21 +39,22 @@ class Product(NamedTuple):
 class Polynomial(NamedTuple):
     """Corrections of one parameter in x and in y, and the polynomials they are products of."""
 
-    of_x: tuple[Product, ...]
-    of_y: tuple[Product, ...]
+    of_x: tuple[PolynomialProduct, ...]
+    of_y: tuple[PolynomialProduct, ...]
     basis: tuple[tuple[float, ...], ...]
 
     def at(self, u: Array, v: Array) -> tuple[Array, Array]:
         """Corrections for a parameter of one.
 
         Args:
-            u, v: image coordinates over half the side of the grid, shape (n,).
+            u: image coordinates x over half the side of the grid, shape (n,).
+            v: image coordinates y, likewise.
 
         Returns:
             In x and y, shape (n,).
         """
 
-        def value(products: tuple[Product, ...]) -> Array:
+        def value(products: tuple[PolynomialProduct, ...]) -> Array:
             total = np.zeros_like(u)
             for factor, x, y in products:
                 total += (
@@ -68,19 +69,19 @@ class Polynomial(NamedTuple):
 
 def _ebner() -> dict[str, Polynomial]:
     one = 1.0
-    parts: list[tuple[tuple[Product, ...], tuple[Product, ...]]] = [
-        ((Product(one, 1, 0),), (Product(-one, 0, 1),)),
-        ((Product(one, 0, 1),), (Product(one, 1, 0),)),
-        ((Product(-2.0, 2, 0),), (Product(one, 1, 1),)),
-        ((Product(one, 1, 1),), (Product(-2.0, 0, 2),)),
-        ((Product(one, 0, 2),), ()),
-        ((), (Product(one, 2, 0),)),
-        ((Product(one, 1, 2),), ()),
-        ((), (Product(one, 2, 1),)),
-        ((Product(one, 2, 1),), ()),
-        ((), (Product(one, 1, 2),)),
-        ((Product(one, 2, 2),), ()),
-        ((), (Product(one, 2, 2),)),
+    parts: list[tuple[tuple[PolynomialProduct, ...], tuple[PolynomialProduct, ...]]] = [
+        ((PolynomialProduct(one, 1, 0),), (PolynomialProduct(-one, 0, 1),)),
+        ((PolynomialProduct(one, 0, 1),), (PolynomialProduct(one, 1, 0),)),
+        ((PolynomialProduct(-2.0, 2, 0),), (PolynomialProduct(one, 1, 1),)),
+        ((PolynomialProduct(one, 1, 1),), (PolynomialProduct(-2.0, 0, 2),)),
+        ((PolynomialProduct(one, 0, 2),), ()),
+        ((), (PolynomialProduct(one, 2, 0),)),
+        ((PolynomialProduct(one, 1, 2),), ()),
+        ((), (PolynomialProduct(one, 2, 1),)),
+        ((PolynomialProduct(one, 2, 1),), ()),
+        ((), (PolynomialProduct(one, 1, 2),)),
+        ((PolynomialProduct(one, 2, 2),), ()),
+        ((), (PolynomialProduct(one, 2, 2),)),
     ]
     return {f"ebner {k + 1}": Polynomial(*part, _OF_EBNER) for k, part in enumerate(parts)}
 
@@ -89,18 +90,18 @@ def _gruen() -> dict[str, Polynomial]:
     """a_ij and b_ij belong to degree j - 1 in x and i - 1 in y, in x and in y."""
     one, tilt = 1.0, -10.0 / 7.0
     found = {
-        "a12": ((Product(one, 1, 0),), (Product(-one, 0, 1),)),
-        "a21": ((Product(one, 0, 1),), (Product(one, 1, 0),)),
-        "a22": ((Product(one, 1, 1),), (Product(tilt, 0, 2),)),
-        "b22": ((Product(tilt, 2, 0),), (Product(one, 1, 1),)),
-        "a31": ((Product(one, 0, 2),), ()),
-        "b13": ((), (Product(one, 2, 0),)),
+        "a12": ((PolynomialProduct(one, 1, 0),), (PolynomialProduct(-one, 0, 1),)),
+        "a21": ((PolynomialProduct(one, 0, 1),), (PolynomialProduct(one, 1, 0),)),
+        "a22": ((PolynomialProduct(one, 1, 1),), (PolynomialProduct(tilt, 0, 2),)),
+        "b22": ((PolynomialProduct(tilt, 2, 0),), (PolynomialProduct(one, 1, 1),)),
+        "a31": ((PolynomialProduct(one, 0, 2),), ()),
+        "b13": ((), (PolynomialProduct(one, 2, 0),)),
     }
     for i in range(5):
         for j in range(5):
             if i + j >= 3:
-                found[f"a{i + 1}{j + 1}"] = ((Product(one, j, i),), ())
-                found[f"b{i + 1}{j + 1}"] = ((), (Product(one, j, i),))
+                found[f"a{i + 1}{j + 1}"] = ((PolynomialProduct(one, j, i),), ())
+                found[f"b{i + 1}{j + 1}"] = ((), (PolynomialProduct(one, j, i),))
     return {f"gruen {name}": Polynomial(*part, _OF_GRUEN) for name, part in found.items()}
 
 
