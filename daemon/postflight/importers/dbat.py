@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ElementTree
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +25,7 @@ from daemon.mission.foreign_xml import XmlError, parse_xml
 from daemon.postflight.adjustment.csv_tables import ProjectError
 from daemon.postflight.adjustment.project import CheckPoints
 from daemon.postflight.adjustment.project_file import AdjustSection, CameraSection, ProjectFile
-from daemon.postflight.importers.dbat_settings import filtered, read_settings
+from daemon.postflight.importers.dbat_settings import HERE, filtered, read_settings
 from processing.bundle.network import (
     INTERIOR,
     Attitudes,
@@ -75,6 +76,7 @@ def _imported(script: Path, root: ElementTree.Element) -> ImportedProject:
     if given is None:
         raise ProjectError([f"{script.name}: no input section; a DBAT script has one"])
     settings = read_settings(script.name, root)
+    script = _at_base(script, given)
     camera = _camera(script, given)
     if _text(script, camera, "unit") != "mm":
         raise ProjectError([f"{script.name}: a camera in {camera.findtext('unit')} is not read"])
@@ -279,6 +281,12 @@ def _tables(
                 ]
             )
         rows += _rows(_within(script, element.text.strip()), columns, constant)
+    if "im" not in columns:
+        ids = Counter(row["id"] for row in rows)
+        if repeated := [name for name, count in ids.items() if count > 1]:
+            raise ProjectError(
+                [f"{script.name}: {what} {', '.join(repeated[:5])} more than once; name each once"]
+            )
     return rows
 
 
@@ -296,9 +304,15 @@ def _rows(path: Path, columns: Sequence[str], constant: Mapping[str, str]) -> li
     return rows
 
 
+def _at_base(script: Path, given: ElementTree.Element) -> Path:
+    """The script as if it were in its base folder, to which names of files are relative."""
+    base = given.get("base_dir", HERE).removeprefix(HERE).strip("/")
+    return _within(script, base) / script.name if base not in ("", ".") else script
+
+
 def _within(script: Path, name: str) -> Path:
     try:
-        return within(script.parent, name, f"{script.name}: file")
+        return within(script.parent, name.removeprefix(f"{HERE}/"), f"{script.name}: file")
     except ForeignFileError as error:
         raise ProjectError([str(error)]) from error
 
@@ -312,7 +326,7 @@ def _bytes_of(path: Path) -> bytes:
 
 def _text_of(path: Path) -> str:
     try:
-        return _bytes_of(path).decode("utf-8")
+        return _bytes_of(path).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise ProjectError([f"{path}: cannot be read ({error})"]) from error
 

@@ -16,6 +16,9 @@ from daemon.postflight.adjustment.csv_tables import ProjectError
 
 T = TypeVar("T")
 
+HERE: Final = "$HERE"
+"""The folder of the script."""
+
 _INPUTS: Final = frozenset(
     ("c", "ctrl_pts", "check_pts", "images", "image_pts", "cameras", "prior_eo")
 )
@@ -67,8 +70,9 @@ def read_settings(script: str, root: ElementTree.Element) -> DbatSettings:
         if root.find(f"input/{what}/filter") is not None
     ]
     given = root.find("input")
-    if given is not None and given.get("base_dir", "$HERE") not in ("$HERE", "."):
-        problems.append(f"{script}: base_dir {given.get('base_dir')} is not read; use $HERE")
+    base = HERE if given is None else given.get("base_dir", HERE)
+    if base not in (HERE, ".") and not base.startswith(f"{HERE}/"):
+        problems.append(f"{script}: base_dir {base} is not read; use {HERE} or a folder in it")
     free: list[str] | None = None
     is_loaded, notes = False, []
     for operation in root.findall("operations/operation"):
@@ -83,7 +87,10 @@ def read_settings(script: str, root: ElementTree.Element) -> DbatSettings:
                 free = _free(script, child, problems)
             elif child.tag == "set_datum":
                 datum = (child.text or "").strip()
-                notes.append(f"set_datum {datum}: imported as a free network (minimum norm)")
+                note = f"set_datum {datum}: imported as a free network (minimum norm)"
+                if datum == "depend":
+                    note += '; free_datum = "dependent" is the datum of DBAT'
+                notes.append(note)
             else:
                 problems.append(f"{script}: operation <{child.tag}> is not read")
     if problems:

@@ -102,7 +102,10 @@ def test_prior_orientations_begin_a_block_without_control(folder: Path) -> None:
     (folder / "script.xml").write_text(text.replace("</operations>", datum))
     done = import_dbat(folder / "script.xml")
     assert done.file.adjust.minimum_norm
-    assert done.notes == ("set_datum depend: imported as a free network (minimum norm)",)
+    assert done.notes == (
+        "set_datum depend: imported as a free network (minimum norm); free_datum = "
+        '"dependent" is the datum of DBAT',
+    )
     assert np.allclose(done.network.stations.position_m[0], [1.5, 2.5, float(ids[0])])
     expected = rotation_matrix(*np.radians([10.0, -20.0, 30.0]))
     assert np.allclose(done.network.attitudes.rotation[0], expected)
@@ -157,4 +160,35 @@ def test_cameras_that_are_not_carried_are_refused(folder: Path, old, new, senten
     assert old in text
     (folder / "camera.xml").write_text(text.replace(old, new, 1))
     with pytest.raises(ProjectError, match=sentence):
+        import_dbat(folder / "script.xml")
+
+
+def test_files_of_a_base_folder_with_byte_order_marks_are_read(folder: Path) -> None:
+    expected = import_dbat(folder / "script.xml")
+    data = folder / "data"
+    data.mkdir()
+    for path in sorted(folder.iterdir()):
+        if path.name not in ("data", "script.xml"):
+            path.rename(data / path.name)
+    for path in data.rglob("*.txt"):
+        path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes().replace(b"\n", b"\r\n"))
+    text = SCRIPT.replace('base_dir="$HERE"', 'base_dir="$HERE/data"')
+    assert text != SCRIPT
+    (folder / "script.xml").write_text(text)
+    done = import_dbat(folder / "script.xml")
+    assert done.network.images.names == expected.network.images.names
+    assert done.network.points.names == expected.network.points.names
+    assert np.array_equal(done.network.image_points.xy_mm, expected.network.image_points.xy_mm)
+    (folder / "script.xml").write_text(text.replace("$HERE/data", "$HERE/../other"))
+    with pytest.raises(ProjectError, match="file"):
+        import_dbat(folder / "script.xml")
+
+
+def test_an_image_or_control_point_twice_is_refused_by_name(folder: Path) -> None:
+    images = folder / "images/images.txt"
+    lines = images.read_text().splitlines()
+    last = [line for line in lines if line.strip() and not line.startswith("#")][-1]
+    images.write_text("\n".join([*lines, last]) + "\n")
+    name = last.split(",")[0].strip()
+    with pytest.raises(ProjectError, match=f"images {name} more than once"):
         import_dbat(folder / "script.xml")
