@@ -31,7 +31,7 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 
-_ROWS_AT_ONCE = 200_000
+_ROWS_AT_ONCE = 50_000
 
 
 class BehindCameraError(ProcessingError, ValueError):
