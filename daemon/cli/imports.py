@@ -99,7 +99,7 @@ def multispectral(
 
 @app.command()
 def photographs(
-    folder: Annotated[Path, typer.Argument(help="Folder with JPEG or TIFF files of one camera.")],
+    folder: Annotated[Path, typer.Argument(help="Folder with JPEG or TIFF files.")],
     out: Annotated[Path, typer.Option(help="New mission folder.")],
     focal_mm: Annotated[
         float | None, typer.Option(help="Focal length in mm (default: EXIF).", min=0.1)
@@ -109,17 +109,18 @@ def photographs(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Import photographs with positions in EXIF as a mission of one head.
+    """Import photographs with positions in EXIF as a mission.
 
-    The interior orientation is provisional; `syntopic triangulate` estimates it. Photographs of
-    several cameras, sizes or focal lengths are refused.
+    Each camera becomes a head: photographs that differ in camera, serial number, size or focal
+    length. Its interior orientation is provisional; `syntopic triangulate` estimates it.
 
     Example: `syntopic import photographs DCIM --out missions/field-8`
     """
-    from daemon.postflight.importers.photographs import import_photographs
+    from daemon.postflight.importers.photographs import import_photographs, in_order
 
     imported = import_photographs(folder, out, focal_mm=focal_mm, pixel_um=pixel_um)
     first = imported.photographs[0]
+    heads = in_order(imported.heads)
     if as_json:
         content = {
             "mission": str(imported.mission.path),
@@ -127,14 +128,16 @@ def photographs(
             "camera": first.camera,
             "f_px": first.focal_px,
             "pixel_um": first.pitch_mm * 1e3,
+            "heads": heads,
             "notes": list(imported.notes),
         }
         typer.echo(json.dumps(content))
         return
     console = Console()
+    of = f"{first.camera}, {first.width_px} x {first.height_px} px"
     console.print(
-        f"{len(imported.photographs)} photographs of {first.camera}, {first.width_px} x "
-        f"{first.height_px} px, in {out}",
+        f"{len(imported.photographs)} photographs of "
+        f"{of if len(heads) == 1 else f'{len(heads)} cameras'}, in {out}",
         soft_wrap=True,
     )
     for note in imported.notes:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import typer
 from rich.progress import Progress
@@ -43,9 +45,9 @@ def triangulate_photographs(
     from daemon.postflight.triangulation.held_interior import free_principal_point
     from daemon.postflight.triangulation.photograph_block import photograph_block_of
     from daemon.postflight.triangulation.photograph_project import (
+        adjusted_photographs,
         adjusted_rig,
         photograph_cautions,
-        photograph_project,
         photographs_section,
     )
     from daemon.postflight.triangulation.report import (
@@ -54,8 +56,6 @@ def triangulate_photographs(
         write_triangulation,
     )
     from daemon.postflight.triangulation.triangulation import TriangulationError
-    from processing.bundle.adjust import adjust
-    from processing.bundle.initial_values import completed
     from processing.bundle.network import NetworkError
     from processing.bundle.rank_diagnosis import RankDefectError
 
@@ -73,18 +73,25 @@ def triangulate_photographs(
         control = control_of(found, points, measured)
         if mistakes := control_mistakes(found, control):
             raise TriangulationError(f"{points}: {'; '.join(mistakes)}")
-        project = photograph_project(
-            found, control, position_sigma_m=position_sigma_m, reject_beyond=reject_beyond
-        )
 
         def show(what: str, number: int, squares: float) -> None:
             progress.update(task, description=f"{what} {number}: {squares:.6g}", total=None)
 
         try:
-            result = adjust(completed(project.network), project.settings, progress=show)
+            project, result, less = adjusted_photographs(
+                found,
+                control,
+                position_sigma_m=position_sigma_m,
+                reject_beyond=reject_beyond,
+                progress=show,
+            )
         except (NetworkError, RankDefectError) as error:
             doubts = "; ".join([str(error), *doubtful_control(found, control)])
-            raise TriangulationError(f"{folder.path}: {doubts}") from error
+            oriented, out = len(found.block.names), len(found.left_out)
+            raise TriangulationError(
+                f"{folder.path}: {oriented} of {oriented + out} photographs are oriented, and "
+                f"their adjustment fails: {doubts}"
+            ) from error
         report = report_of(
             result,
             project.checks,
@@ -93,16 +100,14 @@ def triangulate_photographs(
             peak_mib=_peak_mib(),
         )
         report["triangulation"] = triangulation_of(found.block, found.tied, project, result)
-        image = found.block.image
         free = free_principal_point(
             result,
-            pitch_mm=image.pitch_mm,
-            longer_side_px=max(image.width_px, image.height_px),
+            longer_side_px=[max(size.width_px, size.height_px) for size in found.sizes],
             progress=show,
         )
         section = photographs_section(found, control, result, free)
         report["photographs"] = section
-        report["cautions"] += photograph_cautions(section)
+        report["cautions"] += [*less, *photograph_cautions(section)]
         write_triangulation(results, found.block, project, result, report)
         content = rig_toml(
             adjusted_rig(found.block.rig, result),
@@ -119,12 +124,18 @@ def triangulate_photographs(
         print_triangulation(console, report["triangulation"])
         console.print(
             f"{section['oriented']} photographs oriented, {len(section['left_out'])} not; "
-            f"f {section['f_px']:.1f} +- {section['f_sigma_px']:.1f} px (EXIF "
-            f"{section['f_exif_px']:.1f}); positions of EXIF differ by "
-            f"{', '.join(f'{v:.1f}' for v in section['position_rms_m'])} m RMS",
+            f"{', '.join(map(_principal_distance, section['cameras']))}; positions of EXIF "
+            f"differ by {', '.join(f'{v:.1f}' for v in section['position_rms_m'])} m RMS",
             highlight=False,
             soft_wrap=True,
         )
         console.print(f"Results: {results}, report {results / 'report.html'}", soft_wrap=True)
     if incomplete:
         raise typer.Exit(ExitStatus.PROBLEM)
+
+
+def _principal_distance(camera: Mapping[str, Any]) -> str:
+    return (
+        f"f {camera['f_px']:.1f} +- {camera['f_sigma_px']:.1f} px of {camera['camera']} (EXIF "
+        f"{camera['f_exif_px']:.1f})"
+    )

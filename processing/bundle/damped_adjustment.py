@@ -1,4 +1,4 @@
-"""A fast adjustment of one camera's images as a free network, for starting values.
+"""A fast adjustment of images as a free network, for starting values.
 
 Damped least squares with robust weights: damping stands in for a datum. It yields values, no
 statistics; `processing.bundle.adjust` is the adjustment that results are taken from.
@@ -6,7 +6,9 @@ statistics; `processing.bundle.adjust` is the adjustment that results are taken 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
@@ -32,7 +34,10 @@ zero explains all image points, since residuals are measured in the plane of the
 
 @dataclass(frozen=True)
 class FreeBlock:
-    """Unknowns: station (n, 3), rotation (n, 3, 3) object from camera, points (p, 3), ten (10,)."""
+    """Unknowns: station (n, 3), rotation (n, 3, 3) object from camera, points (p, 3).
+
+    `interior` holds the ten of each camera, (cameras, 10).
+    """
 
     station: Array
     rotation: Array
@@ -41,14 +46,19 @@ class FreeBlock:
 
 
 def damped_adjustment(
-    camera: CameraModel, block: FreeBlock, image: Indices, point: Indices, xy_mm: Array
+    cameras: Sequence[CameraModel],
+    camera_of: Indices,
+    block: FreeBlock,
+    image: Indices,
+    point: Indices,
+    xy_mm: Array,
 ) -> FreeBlock:
     """Least squares of image points, with robust weights, from values nearby.
 
     Args:
-        camera: its `free` parameters are estimated, each with its `sigma` about the camera's own
-            values; the model is eq. 5.1 of
-            Heier et al. (2002).
+        cameras: their `free` parameters, the same of all, are estimated, each with its `sigma`
+            about the camera's own values; the model is eq. 5.1 of Heier et al. (2002).
+        camera_of: camera of each image, shape (n,).
         block: values to begin with.
         image: image of each image point, shape (m,).
         point: object point of each, shape (m,).
@@ -59,8 +69,8 @@ def damped_adjustment(
 
     Source: docs/explanation/mathematics/bundle.md#orientation-without-attitudes.
     """
-    free = [k for k, name in enumerate(INTERIOR) if name in camera.free]
-    problem = _Problem(camera, free, image, point, xy_mm)
+    free = [k for k, name in enumerate(INTERIOR) if name in cameras[0].free]
+    problem = _Problem(tuple(cameras), free, image, camera_of[image], point, xy_mm)
     misclosure = problem.misclosure(block)
     cost = problem.cost(misclosure, block)
     damping = _DAMPING
@@ -110,26 +120,49 @@ class _Reduced:
 
 @dataclass(frozen=True)
 class _Problem:
-    camera: CameraModel
+    cameras: tuple[CameraModel, ...]
     free: list[int]
     image: Indices
+    camera: Indices
     point: Indices
     xy_mm: Array
 
-    @property
-    def sigma_mm(self) -> float:
-        return self.camera.pixel_mm or 1e-3
+    @cached_property
+    def sigma_mm(self) -> Array:
+        """Of each image point, (m,)."""
+        return np.array([one.pixel_mm or 1e-3 for one in self.cameras])[self.camera]
 
+    @cached_property
+    def f_mm(self) -> Array:
+        """Of the camera of each image point, (m,)."""
+        return np.array([one.f_mm for one in self.cameras])[self.camera]
+
+    @cached_property
+    def rows(self) -> list[Indices]:
+        """Image points of each camera."""
+        return [np.flatnonzero(self.camera == k) for k in range(len(self.cameras))]
+
+    @cached_property
     def prior(self) -> Array:
-        """Standard deviations of the free parameters, (f,)."""
-        return np.array([self.camera.sigma.get(INTERIOR[k], _NO_SIGMA) for k in self.free])
+        """Standard deviations of the free parameters, (cameras, f)."""
+        return np.array(
+            [[one.sigma.get(INTERIOR[k], _NO_SIGMA) for k in self.free] for one in self.cameras]
+        )
+
+    def change(self, block: FreeBlock) -> Array:
+        """Free parameters less those of the cameras, (cameras, f)."""
+        given = np.array([one.interior for one in self.cameras])
+        return np.asarray((block.interior - given)[:, self.free])
 
     def misclosure(self, block: FreeBlock) -> Array:
         """Ideal image coordinates less the projection of object points, (m, 2), mm."""
-        ideal = ideal_mm(self.camera, block.interior, np.zeros(len(self.camera.terms)), self.xy_mm)
+        ideal = np.empty_like(self.xy_mm)
+        for camera, interior, rows in zip(self.cameras, block.interior, self.rows, strict=True):
+            terms = np.zeros(len(camera.terms))
+            ideal[rows] = ideal_mm(camera, interior, terms, self.xy_mm[rows])
         seen = self.seen(block)
         with np.errstate(all="ignore"):
-            place = -self.camera.f_mm * seen[:, :2] / seen[:, 2:]
+            place = -self.f_mm[:, None] * seen[:, :2] / seen[:, 2:]
         place[seen[:, 2] >= 0.0] = 1e6
         return np.asarray(ideal - place)
 
@@ -145,17 +178,17 @@ class _Problem:
     def cost(self, misclosure: Array, block: FreeBlock) -> float:
         size = np.linalg.norm(misclosure, axis=1) / self.sigma_mm
         huber = np.where(size <= _HUBER_PX, size**2, 2.0 * _HUBER_PX * size - _HUBER_PX**2)
-        change = (block.interior - self.camera.interior)[self.free] / self.prior()
+        change = self.change(block) / self.prior
         if (np.abs(change) > _INTERIOR_MAX).any():
             return np.inf
-        return float(huber.sum() + change @ change)
+        return float(huber.sum() + (change**2).sum())
 
     def equations(self, block: FreeBlock, misclosure: Array) -> _Reduced:
         from scipy.sparse import csr_array
 
         m, images = len(self.image), len(block.station)
         seen = self.seen(block)
-        f = self.camera.f_mm
+        f = self.f_mm
         by_seen = np.zeros((m, 2, 3))
         by_seen[:, 0, 0] = by_seen[:, 1, 1] = -f / seen[:, 2]
         by_seen[:, 0, 2] = f * seen[:, 0] / seen[:, 2] ** 2
@@ -166,18 +199,20 @@ class _Problem:
         cross[:, 0, 1], cross[:, 0, 2], cross[:, 1, 2] = -seen[:, 2], seen[:, 1], -seen[:, 0]
         cross -= cross.transpose(0, 2, 1)
         by_rotation = by_seen @ cross
-        by_interior = -interior_derivatives(
-            self.camera, block.interior, np.zeros(len(self.camera.terms)), self.xy_mm
-        )[:, :, self.free]
-        root = np.sqrt(self.weights(misclosure))[:, None] / self.sigma_mm
+        by_interior = np.zeros((m, 2, len(self.free)))
+        for camera, interior, rows in zip(self.cameras, block.interior, self.rows, strict=True):
+            terms = np.zeros(len(camera.terms))
+            derivatives = interior_derivatives(camera, interior, terms, self.xy_mm[rows])
+            by_interior[rows] = -derivatives[:, :, self.free]
+        root = (np.sqrt(self.weights(misclosure)) / self.sigma_mm)[:, None]
         design = np.concatenate([-by_point, by_rotation, by_interior], axis=2) * root[:, :, None]
         of_point = by_point * root[:, :, None]
         right = misclosure * root
-        columns = 6 * images + len(self.free)
+        columns = 6 * images + self.prior.size
         own = np.concatenate(
             [
                 6 * self.image[:, None] + np.arange(6),
-                np.broadcast_to(6 * images + np.arange(len(self.free)), (m, len(self.free))),
+                6 * images + len(self.free) * self.camera[:, None] + np.arange(len(self.free)),
             ],
             axis=1,
         )
@@ -199,9 +234,9 @@ class _Problem:
         )
         normal = (a.T @ a).toarray()
         size = np.arange(6 * images, columns)
-        normal[size, size] += 1.0 / self.prior() ** 2
+        normal[size, size] += 1.0 / self.prior.ravel() ** 2
         rhs = a.T @ right.ravel()
-        rhs[6 * images :] -= (block.interior - self.camera.interior)[self.free] / self.prior() ** 2
+        rhs[6 * images :] -= (self.change(block) / self.prior**2).ravel()
         points = np.zeros((len(block.points), 3, 3))
         np.add.at(points, self.point, np.einsum("mki,mkj->mij", of_point, of_point))
         points += 1e-12 * np.trace(points, axis1=1, axis2=2)[:, None, None] * np.eye(3)
@@ -212,7 +247,7 @@ class _Problem:
     def moved(self, block: FreeBlock, by: tuple[Array, Array]) -> FreeBlock:
         poses = by[0][: 6 * len(block.station)].reshape(-1, 6)
         interior = block.interior.copy()
-        interior[self.free] += by[0][6 * len(block.station) :]
+        interior[:, self.free] += by[0][6 * len(block.station) :].reshape(self.prior.shape)
         return FreeBlock(
             block.station + poses[:, :3],
             block.rotation @ rotations_from_vectors(poses[:, 3:]),

@@ -7,7 +7,7 @@ first image and has no scale; a similarity brings it to known positions.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Final
@@ -29,7 +29,12 @@ POINTS_MIN: Final = 20
 """Object points that an image must see to be oriented."""
 _VISION = np.diag([1.0, -1.0, -1.0])
 _PARALLAX_MIN_RAD: Final = np.radians(2.0)
-_PAIRS_TRIED: Final = 6
+_PAIRS_TRIED: Final = 8
+_PAIRS_MEASURED: Final = 2000
+_GROUPS_TRIED: Final = 4
+"""Images of different ground, or of ground that repeats itself, make groups of their own."""
+_TURNED_MAX_PX: Final = 6.0
+"""Images that differ by a rotation but for this were taken from one place."""
 _TRIAL_IMAGES: Final = 5
 """Images that each relative orientation of a first pair is tried with."""
 _ADJUSTED_EACH: Final = 6
@@ -45,13 +50,22 @@ _GROWTH: Final = 1.25
 
 @dataclass(frozen=True)
 class PhotographTracks:
-    """Image points of tracks: image (n,), point (n,), measured xy (n, 2) mm, y up; counts."""
+    """Image points of tracks: image (n,), point (n,), measured xy (n, 2) mm, y up; counts.
+
+    `camera` is the camera of each image, (images,); None: the first of all.
+    """
 
     image: Indices
     point: Indices
     xy_mm: Array
     images: int
     points: int
+    camera: Indices | None = None
+
+    @property
+    def camera_of(self) -> Indices:
+        """Camera of each image, (images,)."""
+        return np.zeros(self.images, np.int64) if self.camera is None else self.camera
 
 
 @dataclass(frozen=True)
@@ -59,8 +73,8 @@ class OrientedBlock:
     """Images in a frame without scale.
 
     `station` (images, 3), `rotation` (images, 3, 3) object from camera, `xyz` (points, 3): NaN
-    where not known. `interior` (10,). `used` (n,) marks the image points that fit. `seen` (images,)
-    counts object points that an image without orientation sees.
+    where not known. `interior` (cameras, 10). `used` (n,) marks the image points that fit. `seen`
+    (images,) counts object points that an image without orientation sees.
     """
 
     station: Array
@@ -77,16 +91,16 @@ class OrientedBlock:
 
 
 def orient_photographs(
-    camera: CameraModel,
+    cameras: Sequence[CameraModel],
     tracks: PhotographTracks,
     *,
     progress: Callable[[int], None] = lambda _done: None,
 ) -> OrientedBlock | None:
-    """Orient as many images of one camera as hang together.
+    """Orient as many images as hang together.
 
     Args:
-        camera: provisional interior orientation with pixel size; `free` names what is estimated
-            on the way, `sigma` how well it is known.
+        cameras: provisional interior orientations with pixel size; `free`, the same of all, names
+            what is estimated on the way, `sigma` how well it is known.
         tracks: image points of all images.
         progress: called with the number of oriented images.
 
@@ -96,7 +110,7 @@ def orient_photographs(
     Source: docs/explanation/mathematics/bundle.md#orientation-without-attitudes.
     """
     cv2.setRNGSeed(1)
-    block = _best_start(camera, tracks)
+    block = _best_start(tuple(cameras), tracks)
     if block is None:
         return None
     block.grow(tracks.images, progress)
@@ -106,12 +120,12 @@ def orient_photographs(
     )
 
 
-def _best_start(camera: CameraModel, tracks: PhotographTracks) -> _Growing | None:
+def _best_start(cameras: tuple[CameraModel, ...], tracks: PhotographTracks) -> _Growing | None:
     """The few images of the first pair that grows, with the relative orientation that fits most."""
     best, most = None, 0
-    for starts in _starts(_Growing(camera, tracks)):
-        for start in starts:
-            trial = _Growing(camera, tracks)
+    for pairs in _Growing(cameras, tracks).pairs():
+        for start in (start for pair in pairs for start in _starts(cameras, tracks, pair)):
+            trial = _Growing(cameras, tracks)
             if not trial.begin(start):
                 continue
             trial.grow(_TRIAL_IMAGES, lambda _done: None)
@@ -126,9 +140,12 @@ def _best_start(camera: CameraModel, tracks: PhotographTracks) -> _Growing | Non
 class _Growing:
     """A block while images are added to it. Rotations are object from our camera axes."""
 
-    def __init__(self, camera: CameraModel, tracks: PhotographTracks) -> None:
-        self.camera, self.tracks = camera, tracks
-        self.interior = camera.interior.copy()
+    def __init__(self, cameras: tuple[CameraModel, ...], tracks: PhotographTracks) -> None:
+        self.cameras, self.tracks = cameras, tracks
+        self.interior = np.array([camera.interior for camera in cameras])
+        pixel = np.array([(one.pixel_mm or 1e-3) / one.f_mm for one in cameras])
+        # Size of a pixel of each image in the plane at distance one.
+        self.pixel = pixel[tracks.camera_of]
         self.station = np.full((tracks.images, 3), np.nan)
         self.rotation = np.full((tracks.images, 3, 3), np.nan)
         self.xyz = np.full((tracks.points, 3), np.nan)
@@ -145,15 +162,13 @@ class _Growing:
 
     def _place(self) -> None:
         """Ideal directions (n, 2) in vision axes, x / z and y / z, by the present interior."""
-        ideal = ideal_mm(
-            self.camera, self.interior, np.zeros(len(self.camera.terms)), self.tracks.xy_mm
-        )
-        self.ideal = ideal * np.array([1.0, -1.0]) / self.camera.f_mm
-
-    @property
-    def pixel(self) -> float:
-        """Size of a pixel in the plane at distance one."""
-        return (self.camera.pixel_mm or 1e-3) / self.camera.f_mm
+        self.ideal = np.empty_like(self.tracks.xy_mm)
+        of_row = self.tracks.camera_of[self.tracks.image]
+        for k, (camera, interior) in enumerate(zip(self.cameras, self.interior, strict=True)):
+            rows = np.flatnonzero(of_row == k)
+            terms = np.zeros(len(camera.terms))
+            ideal = ideal_mm(camera, interior, terms, self.tracks.xy_mm[rows])
+            self.ideal[rows] = ideal * np.array([1.0, -1.0]) / camera.f_mm
 
     def begin(self, start: _Start) -> bool:
         """Orient a first pair; False where too few points intersect under a good angle."""
@@ -181,19 +196,45 @@ class _Growing:
             if not self.add_next():
                 return
 
-    def pairs(self) -> list[tuple[int, int, Indices, Indices]]:
-        """Pairs of images with the most common points, with their rows."""
-        points = [self.tracks.point[rows] for rows in self._rows]
-        found = []
-        for a in range(self.tracks.images):
-            for b in range(a + 1, self.tracks.images):
-                _, at, bt = np.intersect1d(
-                    points[a], points[b], assume_unique=True, return_indices=True
-                )
-                if len(at) >= 2 * POINTS_MIN:
-                    found.append((a, b, self._rows[a][at], self._rows[b][bt]))
-        found.sort(key=lambda one: -len(one[2]))
-        return found[:_PAIRS_TRIED]
+    def pairs(self) -> Iterator[list[_Pair]]:
+        """Pairs to begin with: many common points, seen from different places.
+
+        Yields one of each of the largest groups of connected images, then a second one, and so on.
+        """
+        groups = [self._pairs_of(group) for group in _by_common_points(self.tracks)]
+        for k in range(_PAIRS_TRIED):
+            yield [pairs[k] for pairs in groups if k < len(pairs)]
+
+    def _pairs_of(self, group: list[tuple[int, int]]) -> list[_Pair]:
+        """Those with an image that no pair before them has are first."""
+        first: list[_Pair] = []
+        repeated: list[_Pair] = []
+        begun: set[int] = set()
+        for a, b in group[:_PAIRS_MEASURED]:
+            _, at, bt = np.intersect1d(
+                self.tracks.point[self._rows[a]],
+                self.tracks.point[self._rows[b]],
+                assume_unique=True,
+                return_indices=True,
+            )
+            pair = _Pair(a, b, self._rows[a][at], self._rows[b][bt])
+            if self._turned_px(pair.first_rows, pair.second_rows) < _TURNED_MAX_PX:
+                continue
+            (repeated if {a, b} <= begun else first).append(pair)
+            begun |= {a, b}
+            if len(first) == _PAIRS_TRIED:
+                break
+        return [*first, *repeated][:_PAIRS_TRIED]
+
+    def _turned_px(self, a: Indices, b: Indices) -> float:
+        """Median residual of a rotation between two images: small where they have one place."""
+        first, second = (np.column_stack([self.ideal[rows], np.ones(len(rows))]) for rows in (a, b))
+        first /= np.linalg.norm(first, axis=1, keepdims=True)
+        second /= np.linalg.norm(second, axis=1, keepdims=True)
+        u, _, vt = np.linalg.svd(second.T @ first)
+        turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+        away = np.linalg.norm(first @ turn.T - second, axis=1)
+        return float(np.median(away) / self.pixel[self.tracks.image[a[0]]])
 
     def known_rows(self, image: int) -> Indices:
         """Rows of an image whose object points are known."""
@@ -218,7 +259,7 @@ class _Growing:
         try:
             found, rotation, shift, inside = cv2.solvePnPRansac(
                 known, self.ideal[rows], np.eye(3), None, iterationsCount=2000, confidence=0.9999,
-                reprojectionError=self.limit_px * self.pixel, flags=cv2.SOLVEPNP_SQPNP,
+                reprojectionError=self.limit_px * self.pixel[image], flags=cv2.SOLVEPNP_SQPNP,
             )  # fmt: skip
         except cv2.error:
             # Quirk: points of one place, from wrong tracks, end in an assertion of OpenCV.
@@ -260,7 +301,7 @@ class _Growing:
         seen = np.einsum("nji,nj->ni", self.rotation[image], xyz[point] - self.station[image])
         with np.errstate(all="ignore"):
             place = seen[:, :2] * np.array([-1.0, 1.0]) / seen[:, 2:]
-        residual = np.linalg.norm(place - self.ideal[rows], axis=1) / self.pixel
+        residual = np.linalg.norm(place - self.ideal[rows], axis=1) / self.pixel[image]
         return np.where((seen[:, 2] < 0.0) & np.isfinite(residual), residual, np.inf)
 
     def _parallax(self, rows: Indices) -> Array:
@@ -295,10 +336,12 @@ class _Growing:
             given = FreeBlock(
                 self.station[images], self.rotation[images], self.xyz[points], self.interior
             )
-            camera = self.camera
+            cameras = self.cameras
             if len(images) < _INTERIOR_FROM:
-                camera = replace(camera, free=frozenset())
-            found = damped_adjustment(camera, given, image, point, self.tracks.xy_mm[rows])
+                cameras = tuple(replace(camera, free=frozenset()) for camera in cameras)
+            found = damped_adjustment(
+                cameras, self.tracks.camera_of[images], given, image, point, self.tracks.xy_mm[rows]
+            )
             self.station[images], self.rotation[images] = found.station, found.rotation
             self.xyz[points], self.interior = found.points, found.interior
             self._place()
@@ -307,6 +350,35 @@ class _Growing:
                 np.clip(5.0 * np.median(fits), _RESIDUAL_MAX_PX, _FIRST_RESIDUAL_MAX_PX)
             )
             self._intersect()
+
+
+def _by_common_points(tracks: PhotographTracks) -> list[list[tuple[int, int]]]:
+    """Pairs of images with enough common points, those with the most first.
+
+    By groups of connected images, the largest ones, the largest first.
+    """
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import connected_components
+
+    shape = (tracks.images, tracks.points)
+    seen = csr_array((np.ones(len(tracks.image)), (tracks.image, tracks.point)), shape=shape)
+    common = np.triu((seen @ seen.T).toarray(), 1)
+    common[common < 2 * POINTS_MIN] = 0.0
+    _, group = connected_components(csr_array(common), directed=False)
+    largest = np.argsort(-np.bincount(group), kind="stable")[:_GROUPS_TRIED]
+    a, b = np.nonzero(common)
+    order = np.lexsort((b, a, -common[a, b]))
+    return [[(int(a[k]), int(b[k])) for k in order if group[a[k]] == one] for one in largest]
+
+
+@dataclass(frozen=True)
+class _Pair:
+    """Two images, and the rows of their common points in each."""
+
+    first: int
+    second: int
+    first_rows: Indices
+    second_rows: Indices
 
 
 @dataclass(frozen=True)
@@ -319,17 +391,22 @@ class _Start:
     shift: Array
 
 
-def _starts(block: _Growing) -> Iterator[list[_Start]]:
-    """Relative orientations of each of the pairs with the most points.
+def _starts(
+    cameras: tuple[CameraModel, ...], tracks: PhotographTracks, pair: _Pair
+) -> list[_Start]:
+    """Relative orientations of a pair.
 
     A plane is seen alike from two places by two pairs of attitudes. Which is right shows when
     further images are oriented; all are returned.
     """
-    for a, b, rows_a, rows_b in block.pairs():
-        first, second = block.ideal[rows_a], block.ideal[rows_b]
-        limit = _RESIDUAL_MAX_PX * block.pixel
-        found = [*_by_essential(first, second, limit), *_by_plane(first, second, 2.0 * limit)]
-        yield [_Start(a, b, turn, shift / np.linalg.norm(shift)) for turn, shift in found]
+    block = _Growing(cameras, tracks)
+    first, second = block.ideal[pair.first_rows], block.ideal[pair.second_rows]
+    limit = _RESIDUAL_MAX_PX * float(block.pixel[[pair.first, pair.second]].max())
+    found = [*_by_essential(first, second, limit), *_by_plane(first, second, 2.0 * limit)]
+    return [
+        _Start(pair.first, pair.second, turn, shift / np.linalg.norm(shift))
+        for turn, shift in found
+    ]
 
 
 def _by_essential(a: Array, b: Array, limit: float) -> list[tuple[Array, Array]]:

@@ -176,7 +176,7 @@ def join_tracks(features: Sequence[ImageFeatures], pairs: Pairs) -> Tracks:
 
 
 def spread_tracks(
-    image: Indices, point: Indices, px: Array, size_px: tuple[int, int]
+    image: Indices, point: Indices, px: Array, size_px: Indices | tuple[int, int]
 ) -> NDArray[np.bool_]:
     """Object points so that every part of every image keeps its longest tracks.
 
@@ -184,7 +184,7 @@ def spread_tracks(
         image: of each image point, shape (m,).
         point: of each, shape (m,).
         px: places, shape (m, 2).
-        size_px: columns and rows of an image.
+        size_px: columns and rows of all images, or of each image point, shape (m, 2).
 
     Returns:
         Image points to be kept, shape (m,); whole tracks.

@@ -1,13 +1,15 @@
-"""A folder of photographs of one camera becomes a mission folder that `syntopic triangulate` takes.
+"""A folder of photographs becomes a mission folder that `syntopic triangulate` takes.
 
-Files are copied as they are. The interior orientation is provisional: focal length of EXIF, no
-distortion, principal point in the middle. Positions are the camera's, without standard deviation.
+Files are copied as they are. Each camera becomes a head with a provisional interior orientation:
+focal length of EXIF, no distortion, principal point in the middle. Positions are the camera's,
+without standard deviation.
 """
 
 from __future__ import annotations
 
+import re
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -23,7 +25,9 @@ from daemon.postflight.importers.multispectral_tags import ImagesError
 from processing.rig import Cone, Lens, Rig, Sensor, load_rig
 
 CONE: Final = "C"
-"""Name of the only cone and sensor."""
+"""Name of the only cone and sensor; of several cameras C1, C2 and so on."""
+_CONES: Final = re.compile(r"C[1-9]?[0-9]?")
+_CAMERAS_MAX: Final = 20
 RIG_NAME: Final = "photographs"
 SUFFIXES: Final = (".jpg", ".jpeg", ".tif", ".tiff")
 POSITIONS_MIN: Final = 3
@@ -51,10 +55,14 @@ class Photograph:
 
 @dataclass(frozen=True)
 class ImportedPhotographs:
-    """The written mission; `notes` state what is provisional or missing."""
+    """The written mission; `heads` are the names of the heads of `photographs`.
+
+    `notes` state what is provisional or missing.
+    """
 
     mission: Mission
     photographs: tuple[Photograph, ...]
+    heads: tuple[str, ...]
     notes: tuple[str, ...]
 
 
@@ -76,17 +84,19 @@ def import_photographs(
         progress: gets files done and in all.
 
     Raises:
-        ImagesError: no usable photographs, several cameras, or fewer than three positions.
+        ImagesError: no usable photographs, too many cameras, or fewer than three positions.
         OSError: the disk refused.
     """
     if out.exists():
         raise ImagesError([f"{out}: is there already; give the path of a new mission folder"])
     photographs = read_photographs(folder, focal_mm=focal_mm, pixel_um=pixel_um)
-    rig = rig_of(photographs[0])
+    heads = head_names(photographs)
+    cameras = {name: photographs[heads.index(name)] for name in in_order(heads)}
+    rig = rig_of(cameras)
+    sources = ", ".join(sorted({one.focal_source for one in cameras.values()}))
     content = rig_toml(
         rig,
-        remark="Photographs of one camera. The interior orientation is provisional: "
-        f"{photographs[0].focal_source}.",
+        remark=f"Photographs. The interior orientation is provisional: {sources}.",
         names_schema=False,
     )
     with durable.new_files(out, last="rig.toml") as part:
@@ -94,17 +104,18 @@ def import_photographs(
             durable.make_directories(part / name)
         durable.create_file(part / "rig.toml", [content], mode=0o644)
         written = load_rig(part / "rig.toml")
-        for number, one in enumerate(photographs, start=1):
-            _write_exposure(part, number, one, written, sha256_hex(content))
+        for number, (one, head) in enumerate(zip(photographs, heads, strict=True), start=1):
+            _write_exposure(part, number, (one, head), written, sha256_hex(content))
             if progress is not None:
                 progress(number, len(photographs))
-    return ImportedPhotographs(Mission.open(out), tuple(photographs), _notes(photographs))
+    notes = _notes(photographs, heads)
+    return ImportedPhotographs(Mission.open(out), tuple(photographs), heads, notes)
 
 
 def read_photographs(
     folder: Path, *, focal_mm: float | None = None, pixel_um: float | None = None
 ) -> list[Photograph]:
-    """The photographs of a folder, all of one camera.
+    """The photographs of a folder.
 
     Raises:
         ImagesError: every reason why they make no block.
@@ -124,7 +135,13 @@ def read_photographs(
             found.append(_photograph(path, read_tags(path), given))
         except TagsError as error:
             problems.append(str(error))
-    problems += _of_several_cameras(found)
+    kinds = Counter(map(_kind, found))
+    if len(kinds) > _CAMERAS_MAX:
+        counted = "; ".join(f"{count} of {kind}" for kind, count in kinds.most_common(6))
+        problems.append(
+            f"the folder holds photographs of {len(kinds)} cameras or settings ({counted}; ...); "
+            f"{_CAMERAS_MAX} are estimated at most. A zoom lens needs one focal length for all"
+        )
     placed = sum(one.position is not None for one in found)
     if not problems and placed < POSITIONS_MIN:
         problems.append(
@@ -139,10 +156,14 @@ def read_photographs(
 def is_photographs(mission: Mission) -> bool:
     """Whether a mission was made of photographs: its only frames are JPEG or TIFF as they came."""
     try:
-        rig = load_rig(mission.rig_path)
+        return is_of_photographs(load_rig(mission.rig_path))
     except (OSError, ValueError):
         return False
-    return rig.name == RIG_NAME and [cone.name for cone in rig.cones] == [CONE]
+
+
+def is_of_photographs(rig: Rig) -> bool:
+    """Whether a rig is the one that `import_photographs` writes."""
+    return rig.name == RIG_NAME and all(_CONES.fullmatch(cone.name) for cone in rig.cones)
 
 
 def _photograph(path: Path, tags: ImageTags, given: tuple[float, float] | None) -> Photograph:
@@ -177,26 +198,55 @@ def _photograph(path: Path, tags: ImageTags, given: tuple[float, float] | None) 
     )
 
 
-def _of_several_cameras(photographs: Sequence[Photograph]) -> list[str]:
-    """One sentence where sizes, cameras, serial numbers or focal lengths differ."""
-    kinds = Counter(
-        f"{one.camera}{f' {one.serial}' if one.serial else ''}, {one.width_px} x {one.height_px} "
-        f"px, f {one.focal_px:.0f} px"
-        for one in photographs
+def _kind(one: Photograph) -> str:
+    """Photographs that differ in it have an interior orientation each."""
+    serial = f" {one.serial}" if one.serial else ""
+    size = f"{one.width_px} x {one.height_px} px"
+    return f"{one.camera}{serial}, {size}, f {one.focal_px:.0f} px"
+
+
+def head_names(photographs: Sequence[Photograph]) -> tuple[str, ...]:
+    """Name of the head of each photograph: of one camera C, of several C1 for the most, C2, ...
+
+    Camera, serial number, size and focal length in pixels make a head.
+    """
+    kinds = Counter(map(_kind, photographs)).most_common()
+    if len(kinds) == 1:
+        return (CONE,) * len(photographs)
+    number = {kind: k for k, (kind, _) in enumerate(kinds, start=1)}
+    return tuple(f"{CONE}{number[_kind(one)]}" for one in photographs)
+
+
+def in_order(heads: Iterable[str]) -> list[str]:
+    """The different names of heads: C1, C2, ..., C10."""
+    return sorted(set(heads), key=lambda name: (len(name), name))
+
+
+def rig_of(cameras: Mapping[str, Photograph]) -> Rig:
+    """A rig with a head for each camera, with a provisional interior orientation.
+
+    Args:
+        cameras: a photograph of each head, by its name.
+    """
+    first = next(iter(cameras))
+    return Rig(
+        name=RIG_NAME,
+        title=cameras[first].camera,
+        timing="synchronous",
+        frame_interval_s=1.0,
+        master_cone=first,
+        colour_master_cone=first,
+        reference_cone=first,
+        calibration_id="uncalibrated",
+        calibration_date="",
+        virtual_image=None,
+        cones=tuple(_cone(name, one) for name, one in cameras.items()),
     )
-    if len(kinds) < 2:
-        return []
-    counted = "; ".join(f"{count} of {kind}" for kind, count in kinds.most_common(6))
-    return [
-        f"the folder holds photographs of {len(kinds)} cameras or settings ({counted}); put those "
-        "of one camera, size and focal length into a folder of their own"
-    ]
 
 
-def rig_of(photograph: Photograph) -> Rig:
-    """A rig of one head with a provisional interior orientation."""
+def _cone(name: str, photograph: Photograph) -> Cone:
     sensor = Sensor(
-        name=CONE,
+        name=name,
         serial=photograph.serial,
         width_px=photograph.width_px,
         height_px=photograph.height_px,
@@ -207,8 +257,8 @@ def rig_of(photograph: Photograph) -> Rig:
         probe="",
         bits=8,
     )
-    cone = Cone(
-        name=CONE,
+    return Cone(
+        name=name,
         role="colour",
         bands=("red", "green", "blue"),
         position_mm=(0.0, 0.0, 0.0),
@@ -222,25 +272,15 @@ def rig_of(photograph: Photograph) -> Rig:
         ),
         sensors=(sensor,),
     )
-    return Rig(
-        name=RIG_NAME,
-        title=photograph.camera,
-        timing="synchronous",
-        frame_interval_s=1.0,
-        master_cone=CONE,
-        colour_master_cone=CONE,
-        reference_cone=CONE,
-        calibration_id="uncalibrated",
-        calibration_date="",
-        virtual_image=None,
-        cones=(cone,),
-    )
 
 
-def _write_exposure(mission: Path, number: int, one: Photograph, rig: Rig, rig_sha256: str) -> None:
+def _write_exposure(
+    mission: Path, number: int, photograph: tuple[Photograph, str], rig: Rig, rig_sha256: str
+) -> None:
+    one, head = photograph
     folder = mission / "L0" / exposure_name(number)
     folder.mkdir()
-    name = f"{CONE}{one.path.suffix.lower()}"
+    name = f"{head}{one.path.suffix.lower()}"
     data = one.path.read_bytes()
     durable.create_file(folder / name, [data])
     settings: dict[str, float | int | str] = {"Source": one.path.name}
@@ -250,7 +290,7 @@ def _write_exposure(mission: Path, number: int, one: Photograph, rig: Rig, rig_s
         place = ("GpsLatitudeDeg", "GpsLongitudeDeg", "GpsAltitudeM")
         settings |= dict(zip(place, one.position, strict=True))
     frame = FrameRecord(
-        sensor=CONE,
+        sensor=head,
         head_serial=one.serial,
         file=name,
         sha256=sha256_hex(data),
@@ -275,11 +315,15 @@ def _write_exposure(mission: Path, number: int, one: Photograph, rig: Rig, rig_s
     durable.sync_directory(folder)
 
 
-def _notes(photographs: Sequence[Photograph]) -> tuple[str, ...]:
-    notes = [
-        f"The interior orientation is provisional: f {photographs[0].focal_px:.1f} px from "
-        f"{photographs[0].focal_source}, no distortion."
-    ]
+def _notes(photographs: Sequence[Photograph], heads: Sequence[str]) -> tuple[str, ...]:
+    notes = []
+    for head in in_order(heads):
+        own = [one for one, name in zip(photographs, heads, strict=True) if name == head]
+        of = f"{head}, {len(own)} photographs of {_kind(own[0])}: t" if head != CONE else "T"
+        notes.append(
+            f"{of}he interior orientation is provisional: f {own[0].focal_px:.1f} px from "
+            f"{own[0].focal_source}, no distortion."
+        )
     without = [one.path.name for one in photographs if one.position is None]
     if without:
         notes.append(

@@ -145,7 +145,7 @@ def _signal_of(
 def _pixel_m(block: OrthoBlock, image: OrthoImage) -> float:
     ground = block.ground.surface
     level = ground if isinstance(ground, float) else float(np.nanmean(ground.height_m))
-    return (image.height_m - level) * block.image.pitch_mm / block.image.f_mm
+    return (image.height_m - level) * image.pose.pixel_mm / image.pose.f_mm
 
 
 def _shrunk(mask: Array) -> Array:

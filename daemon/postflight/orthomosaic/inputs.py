@@ -29,6 +29,7 @@ from daemon.orientation.georeference import Georeference
 from daemon.orientation.local_frame import FRAME_FILE, LocalFrame
 from daemon.postflight.adjustment.csv_tables import read_table
 from daemon.postflight.batch.software_identity import code_sha256, software_identity
+from daemon.postflight.importers.photographs import is_of_photographs
 from daemon.postflight.orthomosaic.ground_reach import (
     DEPRESSION_MIN_DEG,
     corner_slope,
@@ -36,9 +37,8 @@ from daemon.postflight.orthomosaic.ground_reach import (
 )
 from daemon.postflight.orthomosaic.photographs import (
     BANDS,
-    adjusted_head,
+    adjusted_heads,
     check_photograph,
-    is_of_photographs,
     source_of,
 )
 from daemon.postflight.triangulation.triangulation import block_of
@@ -74,7 +74,8 @@ class OrthoImage:
     """A stitched image with its pose in the local frame.
 
     `colour` are the bands of its colour raster; `marks` what its description marks it as, such as
-    simulated or uncalibrated; `sources` are the files of its pixels.
+    simulated or uncalibrated; `sources` are the files of its pixels; `head` is the one that took it
+    where it is a photograph, None where it is stitched.
     """
 
     name: str
@@ -85,6 +86,7 @@ class OrthoImage:
     colour: tuple[str, ...]
     marks: tuple[str, ...]
     sources: tuple[Path, ...]
+    head: Cone | None = None
 
 
 @dataclass(frozen=True)
@@ -101,8 +103,7 @@ class OrthoBlock:
     """Everything that an orthomosaic is computed from.
 
     `orientation` is the sentence that states where orientations come from; `failures` are images
-    that cannot be read and are not in the block; `head` is the one that took the images where they
-    are photographs, None where they are stitched.
+    that cannot be read and are not in the block. `image` is of the first head of photographs.
     """
 
     mission: Mission
@@ -114,7 +115,11 @@ class OrthoBlock:
     grid: GroundGrid
     orientation: str
     failures: tuple[ExposureFailure, ...]
-    head: Cone | None = None
+
+    @property
+    def is_of_photographs(self) -> bool:
+        """Whether images are photographs, not stitched."""
+        return any(image.head is not None for image in self.images)
 
     @property
     def marks(self) -> tuple[str, ...]:
@@ -157,7 +162,7 @@ class OrthoBlock:
             "poses": [[v if isinstance(v, str) else float(v).hex() for v in p] for p in poses],
             "crs": self.georeference.name,
             "ground": self.ground.sha256,
-            "head": repr(self.head),
+            "heads": sorted({repr(image.head) for image in self.images}),
             "grid": [grid.east_m, grid.north_m, grid.gsd_m, grid.width_px, grid.height_px],
         }
         return sha256_hex(canonical_bytes(facts))
@@ -187,7 +192,7 @@ def block_for_orthomosaic(
         OrthomosaicError: no usable images, no orientations, or a ground that does not fit.
     """
     folder = triangulation or _only_triangulation(mission)
-    image, head = _geometry(mission, folder)
+    image, heads = _geometry(mission, folder)
     if folder is not None:
         georeference, names, place, angles = _triangulated(folder, crs)
         orientation = f"adjusted orientations of {folder.name}"
@@ -205,7 +210,7 @@ def block_for_orthomosaic(
     geodetic = georeference.geodetic(place)
     frame = LocalFrame(float(geodetic[:, 0].mean()), float(geodetic[:, 1].mean()))
     images, unread = _images(
-        mission, image, head, georeference, frame, names, place, geodetic, angles
+        mission, image, heads, georeference, frame, names, place, geodetic, angles
     )
     offset_m = float(np.median(place[:, 2] - geodetic[:, 2]))
     ground = _ground(mission, georeference, elevation, plane_height_m)
@@ -214,18 +219,18 @@ def block_for_orthomosaic(
     if ground is None:
         _, plan = mount_of(mission)
         ground = _plane(plan.ground_height_m + offset_m, None)
-    grid = _grid(images, image, ground, gsd_m)
+    grid = _grid(images, ground, gsd_m)
     return OrthoBlock(
         mission, image, images, georeference, frame, ground, grid, orientation,
-        (*failures, *unread), head,
+        (*failures, *unread),
     )  # fmt: skip
 
 
-def _geometry(mission: Mission, folder: Path | None) -> tuple[VirtualImage, Cone | None]:
-    """Size and interior orientation of the images, and the head of photographs."""
+def _geometry(mission: Mission, folder: Path | None) -> tuple[VirtualImage, tuple[Cone, ...]]:
+    """Size and interior orientation of the images, and the heads of photographs."""
     rig = load_rig(mission.rig_path)
     if rig.virtual_image is not None:
-        return rig.virtual_image, None
+        return rig.virtual_image, ()
     if not is_of_photographs(rig):
         raise OrthomosaicError(
             f"rig {rig.name} stitches no PAN image; an orthomosaic is made of stitched images or "
@@ -235,8 +240,8 @@ def _geometry(mission: Mission, folder: Path | None) -> tuple[VirtualImage, Cone
         raise OrthomosaicError(
             f"{mission.path}: photographs have no orientation; run syntopic triangulate first"
         )
-    head = adjusted_head(folder)
-    return perspective_of(head), head
+    heads = adjusted_heads(folder)
+    return perspective_of(heads[0]), heads
 
 
 def _only_triangulation(mission: Mission) -> Path | None:
@@ -275,7 +280,7 @@ def _triangulated(
 def _images(
     mission: Mission,
     image: VirtualImage,
-    head: Cone | None,
+    heads: tuple[Cone, ...],
     georeference: Georeference,
     frame: LocalFrame,
     names: Sequence[str],
@@ -284,9 +289,12 @@ def _images(
     angles_deg: Array,
 ) -> tuple[tuple[OrthoImage, ...], tuple[ExposureFailure, ...]]:
     # The image of a head has the head's name behind the number.
-    suffix = "" if head is None else f"_{head.name}"
-    own = [name.removesuffix(suffix) if name.endswith(suffix) else "" for name in names]
-    at = {int(name): k for k, name in enumerate(own) if name.isdecimal()}
+    of_head = {head.name: head for head in heads}
+    at = {}
+    for k, name in enumerate(names):
+        number, _, suffix = name.partition("_")
+        if number.isdecimal() and (suffix in of_head if heads else not suffix):
+            at[int(number)] = (k, of_head.get(suffix))
     if not at:
         raise OrthomosaicError(
             "no orientation is that of a stitched image; an orthomosaic is made of stitched images"
@@ -294,7 +302,8 @@ def _images(
     centre = frame.from_geodetic(*geodetic.T)
 
     def oriented(number: int) -> OrthoImage:
-        k = at[number]
+        k, head = at[number]
+        own = image if head is None else perspective_of(head)
         sources, bands, marks = (
             _stitched(mission, number, image)
             if head is None
@@ -304,16 +313,14 @@ def _images(
         azimuth = georeference.place(latitude, longitude, height).azimuth_of_north_rad
         enu = grid_from_enu(azimuth).T @ rotation_matrix(*np.radians(angles_deg[k]))
         rotation = frame.local_from_enu(latitude, longitude) @ enu
-        pose = ImagePose(
-            image.f_mm, image.pitch_mm, image.width_px, image.height_px, centre[k], rotation
-        )
+        pose = ImagePose(own.f_mm, own.pitch_mm, own.width_px, own.height_px, centre[k], rotation)
         if not math.isfinite(corner_slope(pose)):
             raise OrthomosaicError(
                 f"a corner looks less than {DEPRESSION_MIN_DEG:.0f} degrees below the horizon; an "
                 "orthomosaic is made of images that look down"
             )
         east, north, up = (float(v) for v in place[k])
-        return OrthoImage(names[k], number, pose, (east, north), up, bands, marks, sources)
+        return OrthoImage(names[k], number, pose, (east, north), up, bands, marks, sources, head)
 
     read = for_each_exposure(sorted(at), oriented)
     if not read.results:
@@ -401,9 +408,7 @@ def _plane_of_points(folder: Path, frame: LocalFrame | None, offset_m: float) ->
     return _plane(round(middle, 3), float(np.sqrt(np.mean(spread[kept] ** 2))))
 
 
-def _grid(
-    images: Sequence[OrthoImage], image: VirtualImage, ground: Ground, gsd_m: float | None
-) -> GroundGrid:
+def _grid(images: Sequence[OrthoImage], ground: Ground, gsd_m: float | None) -> GroundGrid:
     """Grid over what the images see, its corner at a multiple of the GSD."""
     model = ground.surface
     level = float(np.nanmean(model.height_m)) if isinstance(model, HeightModel) else model
@@ -413,7 +418,8 @@ def _grid(
             f"the ground at {level:.1f} m is not below all cameras; is the height model in the "
             "height system of the orientations?"
         )
-    gsd = gsd_m or float(f"{above.mean() * image.pitch_mm / image.f_mm:.4g}")
+    pixel = np.array([one.pose.pixel_mm / one.pose.f_mm for one in images])
+    gsd = gsd_m or float(f"{(above * pixel).mean():.4g}")
     reach = np.array([ground_reach_m(i.pose, i.nadir_m, i.height_m, model) for i in images])
     at = np.array([one.nadir_m for one in images])
     low, high = (at - reach[:, None]).min(axis=0), (at + reach[:, None]).max(axis=0)

@@ -135,7 +135,7 @@ def _bands(block: OrthoBlock, images: Sequence[str]) -> tuple[tuple[str, ...], l
     bands, left_out = ["pan"], []
     for band in wanted:
         absent = [image.name for image in block.images if band not in image.colour]
-        if absent and block.head is not None:
+        if absent and block.is_of_photographs:
             left_out.append(f"{band}: photographs have none")
         elif absent:
             left_out.append(

@@ -15,13 +15,12 @@ from numpy.typing import NDArray
 from daemon.mission.layout import Mission
 from daemon.mission.store.level0 import RasterError
 from daemon.orientation.exterior_orientation import sealed_exposure
-from daemon.postflight.importers.photographs import CONE, RIG_NAME
 from daemon.postflight.triangulation.photograph_block import original_pixels
 from processing.image.kernels import DEFAULT_INTERPOLATION
 from processing.image.lattice import OUTSIDE
 from processing.image.resampling import SUPPORT_MARGIN_PX, WEIGHT_UNIT, resample
 from processing.pipelines.perspective import perspective_of, raw_of_perspective
-from processing.rig import Cone, Rig, load_rig
+from processing.rig import Cone, load_rig
 
 Array = NDArray[Any]
 
@@ -35,13 +34,8 @@ _DECODED_MAX: Final = 4
 _WORD_MAX: Final = 65534
 
 
-def is_of_photographs(rig: Rig) -> bool:
-    """Whether a rig is the one that `syntopic import photographs` writes."""
-    return rig.name == RIG_NAME and [cone.name for cone in rig.cones] == [CONE]
-
-
-def adjusted_head(folder: Path) -> Cone:
-    """The head with the interior orientation that a triangulation adjusted.
+def adjusted_heads(folder: Path) -> tuple[Cone, ...]:
+    """The heads with the interior orientations that a triangulation adjusted.
 
     Args:
         folder: of the triangulation.
@@ -49,7 +43,7 @@ def adjusted_head(folder: Path) -> Cone:
     Raises:
         RigError: the file is missing or cannot be read.
     """
-    return load_rig(folder / RIG_FILE).cone(CONE)
+    return load_rig(folder / RIG_FILE).cones
 
 
 def source_of(mission: Mission, number: int) -> Path:
@@ -120,7 +114,7 @@ def _decoded(mission: Mission, number: int, head: Cone, _mtime_ns: int) -> NDArr
     return original_pixels(mission, exposure, perspective_of(head), grey=False)
 
 
-@lru_cache(maxsize=2)
+@lru_cache(maxsize=8)
 def _lattice(head: Cone) -> Array:
     """Column and row in the file at every `_CELL_PX`-th pixel, beyond the last pixel too."""
     image = perspective_of(head)

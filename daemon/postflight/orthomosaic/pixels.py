@@ -41,10 +41,10 @@ def image_pixels(
         RasterError: a raster that cannot be read.
     """
     size = block.image
-    c, r, width, height = window or (0, 0, size.width_px, size.height_px)
-    if block.head is not None:
+    c, r, width, height = window or (0, 0, image.pose.width_px, image.pose.height_px)
+    if image.head is not None:
         return photograph_pixels(
-            block.mission, image.exposure, block.head, tuple(bands), (c, r, width, height)
+            block.mission, image.exposure, image.head, tuple(bands), (c, r, width, height)
         )
     folder = block.mission.level2(image.exposure)
 

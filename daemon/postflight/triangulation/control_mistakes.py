@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from daemon.postflight.triangulation.ground_control import GroundControl
 from daemon.postflight.triangulation.photograph_block import PhotographBlock
 from processing.bundle.camera_model import ideal_mm, principal_distance_mm
-from processing.matching.block_matching import image_mm
 
 Array = NDArray[np.float64]
 
@@ -98,22 +97,18 @@ def unmeasured(control: GroundControl) -> list[str]:
 
 
 def _outside(found: PhotographBlock, control: GroundControl) -> list[str]:
-    image = found.block.image
-    column, row = control.px.T
-    beyond = (
-        (column < -0.5)
-        | (row < -0.5)
-        | (column > image.width_px - 0.5)
-        | (row > image.height_px - 0.5)
-    )
+    size = np.array([(one.width_px, one.height_px) for one in found.sizes])
+    end = size[found.camera_of[control.image]] - 0.5
+    beyond = np.any((control.px < -0.5) | (control.px > end), axis=1)
     if not beyond.any():
         return []
-    fits_turned = (column <= image.height_px - 0.5) & (row <= image.width_px - 0.5)
+    fits_turned = (control.px <= end[:, ::-1]).all(axis=1)
+    largest = size[found.camera_of[control.image][np.argmax(beyond)]]
     cure = "; columns and rows appear exchanged" if fits_turned[beyond].all() else ""
     names = sorted({control.names[k] for k in control.point[beyond]})
     return [
         f"{int(beyond.sum())} measurements of {', '.join(names[:5])} are outside the image of "
-        f"{image.width_px} x {image.height_px} px{cure}"
+        f"{largest[0]} x {largest[1]} px{cure}"
     ]
 
 
@@ -145,11 +140,12 @@ def _deviations(
 
 def _measured_places(found: PhotographBlock, control: GroundControl, xyz_m: Array) -> Array:
     """Intersected places; of points in one photograph, where their ray meets their height."""
-    camera = found.camera
-    terms = np.array([term.value for term in camera.terms])
-    xy_mm = ideal_mm(camera, camera.interior, terms, image_mm(found.block.image, control.px))
-    f_mm = principal_distance_mm(camera, camera.interior)
-    ray = np.column_stack([xy_mm, np.full(len(xy_mm), -f_mm)])
+    of = found.camera_of[control.image]
+    ray = np.column_stack([found.image_mm(control.image, control.px), np.zeros(len(of))])
+    for k, camera in enumerate(found.cameras):
+        own, terms = of == k, np.array([term.value for term in camera.terms])
+        ray[own, :2] = ideal_mm(camera, camera.interior, terms, ray[own, :2])
+        ray[own, 2] = -principal_distance_mm(camera, camera.interior)
     ray = np.einsum("nij,nj->ni", found.block.rotation[control.image], ray)
     ray /= np.linalg.norm(ray, axis=1)[:, None]
     start = found.block.station_m[control.image]

@@ -9,7 +9,7 @@ Source: Fraser (1997), section 5 (projective coupling of interior and exterior o
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -53,34 +53,37 @@ class FreePrincipalPoint:
 def free_principal_point(
     result: Adjustment,
     *,
-    pitch_mm: float,
-    longer_side_px: int,
+    longer_side_px: Sequence[int],
     progress: Callable[[str, int, float], None] | None = None,
-) -> FreePrincipalPoint | None:
+) -> tuple[FreePrincipalPoint, ...] | None:
     """Adjust the used observations once more, with the principal point free.
 
     Args:
-        result: adjusted photographs of one camera.
-        pitch_mm: pixel size.
-        longer_side_px: of the photographs; the principal point has a standard deviation of 1 % of
-            it a priori.
+        result: adjusted photographs; cameras have a pixel size.
+        longer_side_px: of the photographs of each camera; its principal point has a standard
+            deviation of 1 % of it a priori.
         progress: see `adjust`.
 
     Returns:
-        The change; None where that adjustment has no solution.
+        The change of each camera; None where that adjustment has no solution.
     """
     network, state = used_network(result), result.state
-    (camera,) = network.cameras
-    sigma_mm = PRINCIPAL_POINT_SHARE * longer_side_px * pitch_mm
+    pitch_mm = [camera.pixel_mm or 1e-3 for camera in network.cameras]
     network = replace(
         network,
-        cameras=(
+        cameras=tuple(
             replace(
                 camera,
-                interior=state.interior[0],
+                interior=interior,
                 free=camera.free | set(_POINT),
-                sigma={**camera.sigma, **dict.fromkeys(_POINT, sigma_mm)},
-            ),
+                sigma={
+                    **camera.sigma,
+                    **dict.fromkeys(_POINT, PRINCIPAL_POINT_SHARE * side * pitch),
+                },
+            )
+            for camera, interior, side, pitch in zip(
+                network.cameras, state.interior, longer_side_px, pitch_mm, strict=True
+            )
         ),
         stations=replace(network.stations, position_m=state.station),
         attitudes=replace(network.attitudes, rotation=state.attitude),
@@ -93,13 +96,18 @@ def free_principal_point(
         free = adjust(network, _SETTINGS, progress=progress)
     except (NetworkError, RankDefectError):
         return None
-    columns = free.layout.interior[0]
     at = {name: INTERIOR.index(name) for name in ("df", *_POINT)}
-    change = state.interior[0][at["df"]] - free.state.interior[0][at["df"]]
-    x, y = (float(free.state.interior[0][at[name]]) / pitch_mm for name in _POINT)
-    sx, sy = (
-        free.sigma0 * float(np.sqrt(free.cofactor[columns[at[name]], columns[at[name]]])) / pitch_mm
-        for name in _POINT
-    )
-    # Coordinates are corrected by dx0 and dy0, and y is up.
-    return FreePrincipalPoint(float(change) / pitch_mm, (-x, y), (sx, sy))
+    found = []
+    for k, pitch in enumerate(pitch_mm):
+        columns = free.layout.interior[k]
+        change = state.interior[k][at["df"]] - free.state.interior[k][at["df"]]
+        x, y = (float(free.state.interior[k][at[name]]) / pitch for name in _POINT)
+        sx, sy = (
+            free.sigma0
+            * float(np.sqrt(free.cofactor[columns[at[name]], columns[at[name]]]))
+            / pitch
+            for name in _POINT
+        )
+        # Coordinates are corrected by dx0 and dy0, and y is up.
+        found.append(FreePrincipalPoint(float(change) / pitch, (-x, y), (sx, sy)))
+    return tuple(found)

@@ -7,7 +7,7 @@ named with the reason.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Final
@@ -23,7 +23,6 @@ from daemon.orientation.exterior_orientation import ExteriorOrientation, sealed_
 from daemon.orientation.geodesy import utm_of
 from daemon.orientation.georeference import Georeference
 from daemon.orientation.local_frame import LocalFrame
-from daemon.postflight.importers.photographs import CONE
 from daemon.postflight.triangulation.triangulation import ImageBlock, TriangulationError
 from processing.bundle.incremental_orientation import (
     OrientedBlock,
@@ -44,7 +43,7 @@ from processing.matching.photograph_tracks import (
     spread_tracks,
 )
 from processing.pipelines.perspective import perspective_of
-from processing.rig import Rig, VirtualImage, load_rig
+from processing.rig import Cone, Rig, VirtualImage, load_rig
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, int, int], None]
@@ -64,18 +63,25 @@ _DECENTRING_SIGMA: Final = 0.005
 class PhotographBlock:
     """Oriented photographs with tie points.
 
-    `block`, `tied`: as of any mission, of the oriented images alone. `files` by image name;
-    `start` in the local frame, its image points those of `tied`. `left_out` has a sentence for
-    each photograph without orientation. `position_m` (n, 3) is NaN where EXIF has none.
+    `block`, `tied`: as of any mission, of the oriented images alone; `block.image` is that of the
+    first camera. `files` by image name. `cameras` have oriented images, `sizes` are their pixels,
+    `camera_of` (n,) is the camera of each image. `left_out` has a sentence for each photograph
+    without orientation. `position_m` (n, 3) is NaN where EXIF has none.
     """
 
     block: ImageBlock
     tied: BlockTiePoints
     files: Mapping[str, str]
-    camera: CameraModel
+    cameras: tuple[CameraModel, ...]
+    sizes: tuple[VirtualImage, ...]
+    camera_of: NDArray[np.int64]
     xyz_m: Array
     position_m: Array
     left_out: tuple[str, ...]
+
+    def image_mm(self, image: NDArray[np.int64], px: Array) -> Array:
+        """Image coordinates (m, 2), mm, of pixels (m, 2) of images (m,)."""
+        return _image_mm(self.sizes, self.camera_of[image], px)
 
 
 def photograph_block_of(
@@ -88,7 +94,7 @@ def photograph_block_of(
             not place them.
     """
     rig = load_rig(mission.rig_path)
-    image = perspective_of(rig.cone(CONE))
+    sizes = [perspective_of(cone) for cone in rig.cones]
     read = sealed_exposures(mission)
     exposures = list(read.results.values())
     if len(exposures) < _ORIENTED_MIN:
@@ -102,34 +108,48 @@ def photograph_block_of(
     frame = LocalFrame(*(float(v) for v in geodetic[known, :2].mean(axis=0)))
     position = np.full((len(exposures), 3), np.nan)
     position[known] = frame.from_geodetic(*geodetic[known].T)
-    features = _features(mission, exposures, image, progress)
+    heads = {cone.name: k for k, cone in enumerate(rig.cones)}
+    camera_of = np.array([heads[exposure.frames[0].sensor] for exposure in exposures], np.int64)
+    features = _features(mission, exposures, [sizes[k] for k in camera_of], progress)
     candidates = candidate_pairs(position)
     pairs = match_photographs(
         features, candidates, progress=lambda done: progress("matching", done, len(candidates))
     )
     tracks = join_tracks(features, pairs)
-    camera = provisional_camera(rig)
+    cameras = [provisional_camera(cone) for cone in rig.cones]
     measured = PhotographTracks(
-        tracks.image, tracks.point, image_mm(image, tracks.px), len(exposures), tracks.points
+        tracks.image,
+        tracks.point,
+        _image_mm(sizes, camera_of[tracks.image], tracks.px),
+        len(exposures),
+        tracks.points,
+        camera_of,
     )
     found = orient_photographs(
-        camera, measured, progress=lambda done: progress("orienting", done, len(exposures))
+        cameras, measured, progress=lambda done: progress("orienting", done, len(exposures))
     )
     names = [_source(exposure) for exposure in exposures]
     if found is None or found.oriented.sum() < _ORIENTED_MIN:
         raise TriangulationError(_unconnected(mission, names, features, len(pairs)))
     placed = _placed(found, position)
     return _assembled(
-        mission, rig, exposures, frame, position, tracks, features, placed, crs, camera
+        mission, rig, exposures, frame, position, tracks, features, placed, crs, camera_of
     )
 
 
-def provisional_camera(rig: Rig) -> CameraModel:
+def _image_mm(sizes: Sequence[VirtualImage], camera: NDArray[np.int64], px: Array) -> Array:
+    """Image coordinates (m, 2), mm, of pixels (m, 2) of cameras (m,)."""
+    xy_mm = np.empty((len(px), 2))
+    for k, size in enumerate(sizes):
+        xy_mm[camera == k] = image_mm(size, px[camera == k])
+    return xy_mm
+
+
+def provisional_camera(cone: Cone) -> CameraModel:
     """The head's camera model with the parameters that are estimated, and how well they are known.
 
     EXIF gives f to 2 %; distortion is within 5 % at the corner.
     """
-    cone = rig.cone(CONE)
     image = perspective_of(cone)
     corner = 0.5 * float(np.hypot(image.width_px, image.height_px)) * image.pitch_mm
     sigma = {
@@ -138,7 +158,9 @@ def provisional_camera(rig: Rig) -> CameraModel:
         "p1": _DECENTRING_SIGMA / corner,
         "p2": _DECENTRING_SIGMA / corner,
     }
-    return CameraModel(CONE, image.f_mm, free=frozenset(FREE), sigma=sigma, pixel_mm=image.pitch_mm)
+    return CameraModel(
+        cone.name, image.f_mm, free=frozenset(FREE), sigma=sigma, pixel_mm=image.pitch_mm
+    )
 
 
 def candidate_pairs(position_m: Array) -> list[tuple[int, int]]:
@@ -176,10 +198,10 @@ def original_pixels(
 
 
 def _features(
-    mission: Mission, exposures: list[Exposure], image: VirtualImage, progress: Progress
+    mission: Mission, exposures: list[Exposure], sizes: list[VirtualImage], progress: Progress
 ) -> list[ImageFeatures]:
     found = []
-    for done, exposure in enumerate(exposures, start=1):
+    for done, (exposure, image) in enumerate(zip(exposures, sizes, strict=True), start=1):
         try:
             found.append(features_of(original_pixels(mission, exposure, image, grey=True)))
         except RasterError as error:
@@ -243,22 +265,32 @@ def _assembled(
     features: list[ImageFeatures],
     placed: OrientedBlock,
     crs: str | None,
-    camera: CameraModel,
+    camera_of: NDArray[np.int64],
 ) -> PhotographBlock:
     names = [_source(exposure) for exposure in exposures]
     kept = np.flatnonzero(placed.oriented)
     number = np.full(len(exposures), -1)
     number[kept] = np.arange(len(kept))
     rows = np.flatnonzero(placed.used)
-    size = (rig.cone(CONE).sensors[0].width_px, rig.cone(CONE).sensors[0].height_px)
-    rows = rows[spread_tracks(tracks.image[rows], tracks.point[rows], tracks.px[rows], size)]
+    used, camera = np.unique(camera_of[kept], return_inverse=True)
+    cones = [rig.cones[k] for k in used]
+    sizes = tuple(perspective_of(cone) for cone in cones)
+    size = np.array([(one.width_px, one.height_px) for one in sizes])[camera]
+    rows = rows[
+        spread_tracks(
+            tracks.image[rows],
+            tracks.point[rows],
+            tracks.px[rows],
+            size[number[tracks.image[rows]]],
+        )
+    ]
     points, point = np.unique(tracks.point[rows], return_inverse=True)
     image = number[tracks.image[rows]]
     crs = crs or utm_of(frame.latitude_deg, frame.longitude_deg) or "EPSG:4978"
-    oriented = _exteriors(exposures, kept, placed, frame, crs)
+    oriented = _exteriors(exposures, [cones[k].name for k in camera], kept, placed, frame, crs)
     ground = float(np.median(placed.xyz[points, 2]))
     block = ImageBlock(
-        mission, rig, perspective_of(rig.cone(CONE)), oriented, crs, frame,
+        mission, rig, sizes[0], oriented, crs, frame,
         placed.station[kept], placed.rotation[kept], ground,
     )  # fmt: skip
     matched = _matched(image, point)
@@ -268,15 +300,20 @@ def _assembled(
         f"({len(features[k].px)} features)"
         for k in np.flatnonzero(~placed.oriented)
     ]
-    interior = replace(camera, interior=placed.interior)
+    cameras = tuple(
+        replace(provisional_camera(cone), interior=placed.interior[k])
+        for cone, k in zip(cones, used, strict=True)
+    )
+    files = {eo.name: names[k] for eo, k in zip(oriented, kept, strict=True)}
     return PhotographBlock(
-        block, tied, {eo.name: names[k] for eo, k in zip(oriented, kept, strict=True)},
-        interior, placed.xyz[points], position[kept], tuple(left_out),
+        block, tied, files, cameras, sizes, camera.astype(np.int64), placed.xyz[points],
+        position[kept], tuple(left_out),
     )  # fmt: skip
 
 
 def _exteriors(
     exposures: list[Exposure],
+    heads: list[str],
     kept: NDArray[np.int64],
     placed: OrientedBlock,
     frame: LocalFrame,
@@ -284,14 +321,15 @@ def _exteriors(
 ) -> tuple[ExteriorOrientation, ...]:
     georeference = Georeference(crs)
     found = []
-    for k, place in zip(kept, frame.to_geodetic(placed.station[kept]), strict=True):
+    places = frame.to_geodetic(placed.station[kept])
+    for k, head, place in zip(kept, heads, places, strict=True):
         latitude, longitude, height = (float(v) for v in place)
         at = georeference.place(latitude, longitude, height)
         enu = frame.local_from_enu(latitude, longitude).T @ placed.rotation[k]
         found.append(
             ExteriorOrientation(
                 exposure=exposures[k].number,
-                cone=CONE,
+                cone=head,
                 is_virtual=False,
                 gps_ns=0,
                 line_id=exposures[k].line_id,

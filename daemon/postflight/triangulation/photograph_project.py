@@ -7,7 +7,7 @@ and with control their common shift, such as that between heights above the elli
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final
 
@@ -16,31 +16,41 @@ from numpy.typing import NDArray
 
 from daemon.postflight.adjustment.project import CheckPoints, Project
 from daemon.postflight.adjustment.project_file import AdjustSection, CameraSection, ProjectFile
-from daemon.postflight.importers.photographs import CONE
 from daemon.postflight.triangulation.control_mistakes import shift_to_control, unmeasured
 from daemon.postflight.triangulation.ground_control import GroundControl
 from daemon.postflight.triangulation.held_interior import FreePrincipalPoint
-from daemon.postflight.triangulation.photograph_block import FREE, PhotographBlock
-from processing.bundle.adjust import Adjustment, AdjustmentSettings
+from daemon.postflight.triangulation.photograph_block import (
+    FREE,
+    PhotographBlock,
+    provisional_camera,
+)
+from processing.bundle.adjust import Adjustment, AdjustmentSettings, adjust
+from processing.bundle.initial_values import completed
 from processing.bundle.network import (
     INTERIOR,
     Attitudes,
+    CameraModel,
     Gnss,
     ImagePoints,
     Images,
     Network,
+    NetworkError,
     Points,
     Stations,
 )
 from processing.bundle.normal_equations import reduced_equations
-from processing.matching.block_matching import image_mm
+from processing.bundle.rank_diagnosis import RankDefectError
 from processing.rig import Rig
 
 Array = NDArray[np.float64]
 
 TIE_SIGMA_PX: Final = 0.7
+ITERATIONS_MAX: Final = 300
+"""Blocks of few lines without control come to rest slowly."""
 EXIF_LINE: Final = "EXIF"
 """The positions of EXIF as one line, whose common shift against the control is unknown."""
+OWN_INTERIOR_MIN: Final = 5
+"""Cameras of fewer photographs keep a priori standard deviations of the interior orientation."""
 _LENS_FIELDS: Final = {"dx0": "dx0_mm", "dy0": "dy0_mm", "df": "df_mm"}
 
 
@@ -62,7 +72,7 @@ def photograph_project(
     shift_m = shift_to_control(found, control)
     has_shift = _places_block(control)
     block, tied = found.block, found.tied
-    n, pitch = len(block.names), block.image.pitch_mm
+    n = len(block.names)
     is_control = np.array([role == "control" for role in control.roles], dtype=bool)
     names = (*(f"t{k}" for k in range(tied.points)), *control.names)
     xyz = np.concatenate([found.xyz_m + shift_m, np.full((len(control.names), 3), np.nan)])
@@ -70,19 +80,22 @@ def photograph_project(
     xyz[tied.points :][is_control] = control.xyz_m[is_control]
     sigma[tied.points :][is_control] = control.sigma_m[is_control]
     px = np.concatenate([tied.px, control.px])
-    spread = np.concatenate([np.full(len(tied.image), TIE_SIGMA_PX), control.sigma_px]) * pitch
+    image = np.concatenate([tied.image, control.image])
+    spread = np.concatenate([np.full(len(tied.image), TIE_SIGMA_PX), control.sigma_px])
+    spread *= np.array([size.pitch_mm for size in found.sizes])[found.camera_of[image]]
+    cameras = _cameras(found)
     every = np.arange(n)
     placed = np.flatnonzero(np.isfinite(found.position_m[:, 0]))
     network = Network(
-        cameras=(replace(found.camera, sigma={}),),
+        cameras=cameras,
         stations=Stations(block.names, block.station_m + shift_m, np.zeros(n, bool)),
         attitudes=Attitudes(block.names, block.rotation, np.zeros(n, bool)),
-        images=Images(block.names, every, every, np.zeros(n, np.int64), np.full(n, -1)),
+        images=Images(block.names, every, every, found.camera_of, np.full(n, -1)),
         points=Points(names, xyz, sigma, np.zeros(len(names), bool)),
         image_points=ImagePoints(
-            np.concatenate([tied.image, control.image]),
+            image,
             np.concatenate([tied.point, control.point + tied.points]),
-            image_mm(block.image, px),
+            found.image_mm(image, px),
             np.stack([spread, spread], axis=1),
         ),
         gnss=Gnss(
@@ -98,7 +111,10 @@ def photograph_project(
         ),
     )
     settings = AdjustmentSettings(
-        robust=True, reject_beyond=reject_beyond, variance_components=True
+        robust=True,
+        reject_beyond=reject_beyond,
+        variance_components=True,
+        max_iterations=ITERATIONS_MAX,
     )
     file = ProjectFile(
         format=1,
@@ -110,15 +126,17 @@ def photograph_project(
             gnss="shift" if has_shift else "none",
             image_sigma_um=TIE_SIGMA_PX * block.image.pitch_um,
         ),
-        camera=(
+        camera=tuple(
             CameraSection(
-                name=CONE,
-                f_mm=block.image.f_mm,
-                pixel_um=block.image.pitch_um,
-                width_px=block.image.width_px,
-                height_px=block.image.height_px,
+                name=camera.name,
+                f_mm=size.f_mm,
+                pixel_um=size.pitch_um,
+                width_px=size.width_px,
+                height_px=size.height_px,
                 free=FREE,
-            ),
+                sigma=dict(camera.sigma),
+            )
+            for camera, size in zip(cameras, found.sizes, strict=True)
         ),
     )
     checks = CheckPoints(
@@ -129,21 +147,114 @@ def photograph_project(
     return Project(file.name, file, network, settings, checks)
 
 
+def adjusted_photographs(
+    found: PhotographBlock,
+    control: GroundControl,
+    *,
+    position_sigma_m: tuple[float, float, float],
+    reject_beyond: float,
+    progress: Callable[[str, int, float], None] | None = None,
+) -> tuple[Project, Adjustment, tuple[str, ...]]:
+    """Adjust, with fewer unknowns where the photographs determine no more.
+
+    Args:
+        found: oriented photographs.
+        control: control and check points.
+        position_sigma_m: of the positions of EXIF, east, north, up.
+        reject_beyond: rejection limit in sigmas.
+        progress: see `adjust`.
+
+    Returns:
+        Project, adjustment, and a sentence where less was estimated.
+
+    Raises:
+        NetworkError: no adjustment converges.
+        RankDefectError: directions without information.
+    """
+    project = photograph_project(
+        found, control, position_sigma_m=position_sigma_m, reject_beyond=reject_beyond
+    )
+    trials = (
+        (project, ""),
+        (
+            _with_fixed_accuracies(project),
+            "these photographs determine no accuracies: those of image points and positions are "
+            "not estimated, and standard deviations rest on those given, times sigma0",
+        ),
+        (
+            _with_held_interior(_with_fixed_accuracies(project)),
+            "these photographs determine no interior orientation: that of the start (EXIF, and "
+            "what the photographs add) is held, and standard deviations do not contain its errors",
+        ),
+    )
+    for trial, sentence in trials:
+        try:
+            result = adjust(completed(trial.network), trial.settings, progress=progress)
+        except (NetworkError, RankDefectError):
+            if trial is trials[-1][0]:
+                raise
+            continue
+        return trial, result, (sentence,) if sentence else ()
+    raise AssertionError("the last trial returns or raises")
+
+
+def _with_fixed_accuracies(project: Project) -> Project:
+    adjust_section = project.file.adjust.model_copy(update={"variance_components": False})
+    return replace(
+        project,
+        file=project.file.model_copy(update={"adjust": adjust_section}),
+        settings=replace(project.settings, variance_components=False),
+    )
+
+
+def _with_held_interior(project: Project) -> Project:
+    cameras = tuple(
+        replace(camera, free=frozenset(), sigma={}) for camera in project.network.cameras
+    )
+    sections = tuple(
+        section.model_copy(
+            update={"free": (), "sigma": {}}
+            | dict(zip(INTERIOR, (float(v) for v in camera.interior), strict=True))
+        )
+        for section, camera in zip(project.file.camera, cameras, strict=True)
+    )
+    return replace(
+        project,
+        file=project.file.model_copy(update={"camera": sections}),
+        network=replace(project.network, cameras=cameras),
+    )
+
+
+def _cameras(found: PhotographBlock) -> tuple[CameraModel, ...]:
+    """Cameras of many photographs without a priori values, those of few with them."""
+    count = np.bincount(found.camera_of, minlength=len(found.cameras))
+    rig = found.block.rig
+    return tuple(
+        replace(camera, sigma={})
+        if own >= OWN_INTERIOR_MIN or len(count) == 1
+        else provisional_camera(rig.cone(camera.name))
+        for camera, own in zip(found.cameras, count, strict=True)
+    )
+
+
 def adjusted_rig(rig: Rig, result: Adjustment) -> Rig:
-    """The rig with the adjusted interior orientation; it stays uncalibrated."""
-    values: dict[str, Any] = {
-        _LENS_FIELDS.get(name, name): float(value)
-        for name, value in zip(INTERIOR, result.state.interior[0], strict=True)
+    """The rig with the adjusted interior orientations; it stays uncalibrated."""
+    values: dict[str, dict[str, Any]] = {
+        camera.name: {
+            _LENS_FIELDS.get(name, name): float(value)
+            for name, value in zip(INTERIOR, interior, strict=True)
+        }
+        for camera, interior in zip(result.network.cameras, result.state.interior, strict=True)
     }
-    cone = rig.cone(CONE)
-    return replace(rig, cones=(replace(cone, lens=replace(cone.lens, **values)),))
+    cones = [replace(c, lens=replace(c.lens, **values.get(c.name, {}))) for c in rig.cones]
+    return replace(rig, cones=tuple(cones))
 
 
 def photographs_section(
     found: PhotographBlock,
     control: GroundControl,
     result: Adjustment,
-    free: FreePrincipalPoint | None = None,
+    free: Sequence[FreePrincipalPoint] | None = None,
 ) -> dict[str, Any]:
     """The section `photographs` of the report; lengths in px and m as named.
 
@@ -151,13 +262,16 @@ def photographs_section(
         found: oriented photographs.
         control: control and check points.
         result: of the adjustment.
-        free: the same with an estimated principal point; None where it cannot be estimated.
+        free: the same with estimated principal points; None where they cannot be estimated.
+
+    Keys from `f_exif_px` to `f_depends_on_principal_point` are those of the first camera;
+    `cameras` has them of each.
     """
     block = found.block
-    pitch = block.image.pitch_mm
-    interior = dict(zip(INTERIOR, (float(v) for v in result.state.interior[0]), strict=True))
-    sigma = _interior_sigmas(result)
-    f_mm = block.image.f_mm - interior["df"]
+    cameras = [
+        _camera_section(found, result, k, None if free is None else free[k])
+        for k in range(len(found.cameras))
+    ]
     height_m = float(result.state.station[:, 2].mean() - np.nanmedian(result.state.points[:, 2]))
     gnss = result.network.gnss
     away = result.state.station[gnss.station] - gnss.position_m
@@ -170,11 +284,8 @@ def photographs_section(
         "oriented": len(block.names),
         "left_out": list(found.left_out),
         "unused_control": list(control.unused),
-        "f_exif_px": block.image.f_mm / pitch,
-        "f_px": f_mm / pitch,
-        "f_sigma_px": sigma["df"] / pitch,
-        "principal_point_free": None if free is None else vars(free),
-        "f_depends_on_principal_point": free is not None and free.contradicts(sigma["df"] / pitch),
+        **cameras[0],
+        "cameras": cameras,
         "height_above_ground_m": height_m,
         "height_per_percent_m": 0.01 * height_m,
         "position_shift_m": [float(v) for v in result.state.shift[0]] if len(gnss.lines) else None,
@@ -188,7 +299,25 @@ def photographs_section(
         ],
         "f_ground_correlation": correlation,
         "ground_sigma_of_f_m": ground_sigma_m,
-        "f_and_height_separated": ground_sigma_m <= height_m * pitch / f_mm,
+        "f_and_height_separated": 0.0 < ground_sigma_m <= height_m / cameras[0]["f_px"],
+    }
+
+
+def _camera_section(
+    found: PhotographBlock, result: Adjustment, camera: int, free: FreePrincipalPoint | None
+) -> dict[str, Any]:
+    """Principal distance of a camera, px, and what its held principal point does to it."""
+    size = found.sizes[camera]
+    df_mm = float(result.state.interior[camera, INTERIOR.index("df")])
+    sigma_px = _interior_sigmas(result, camera).get("df", 0.0) / size.pitch_mm
+    return {
+        "camera": found.cameras[camera].name,
+        "photographs": int((found.camera_of == camera).sum()),
+        "f_exif_px": size.f_mm / size.pitch_mm,
+        "f_px": (size.f_mm - df_mm) / size.pitch_mm,
+        "f_sigma_px": sigma_px,
+        "principal_point_free": None if free is None else vars(free),
+        "f_depends_on_principal_point": free is not None and free.contradicts(sigma_px),
     }
 
 
@@ -201,7 +330,7 @@ def photograph_cautions(section: Mapping[str, Any]) -> list[str]:
             f"control rejected by the adjustment: {', '.join(section['control_rejected'])}; check "
             "coordinates and measurements of these points"
         )
-    if not section["f_and_height_separated"]:
+    if not section["f_and_height_separated"] and section["ground_sigma_of_f_m"] > 0.0:
         used = section["control_points"]
         how = f"by {used} control points" if used else "without control"
         found.append(
@@ -212,17 +341,30 @@ def photograph_cautions(section: Mapping[str, Any]) -> list[str]:
             f"(correlation {section['f_ground_correlation']:.2f}). Give three control points or "
             "more, spread over the block (--points)"
         )
-    if section["principal_point_free"] is None:
+    if section["principal_point_free"] is None and section["f_sigma_px"] > 0.0:
         found.append(
             "the principal point is held in the middle, and these photographs do not determine it: "
             "stated standard deviations hold for these parameters only. Lines across, two heights "
             "or control points determine it"
         )
+    for camera in section["cameras"]:
+        found += _camera_cautions(camera, is_only=len(section["cameras"]) == 1)
+    return found
+
+
+def _camera_cautions(section: Mapping[str, Any], *, is_only: bool) -> list[str]:
+    of = "" if is_only else f"{section['camera']}: "
+    found = []
+    if not is_only and section["photographs"] < OWN_INTERIOR_MIN:
+        found.append(
+            f"{of}{section['photographs']} photographs do not determine an interior orientation of "
+            "their own; the one from EXIF is an observation"
+        )
     if section["f_depends_on_principal_point"]:
         free = section["principal_point_free"]
         x, y = free["point_px"]
         found.append(
-            f"the principal point is held in the middle; estimated, it moves by {x:.0f} "
+            f"{of}the principal point is held in the middle; estimated, it moves by {x:.0f} "
             f"columns and {y:.0f} rows and changes f by {free['change_px']:+.0f} px, "
             f"{abs(free['change_px']) / section['f_sigma_px']:.0f} times the standard deviation of "
             "f: stated standard deviations hold for these parameters only. Lines across, two "
@@ -231,24 +373,26 @@ def photograph_cautions(section: Mapping[str, Any]) -> list[str]:
     drift = abs(section["f_px"] / section["f_exif_px"] - 1.0)
     if drift > 0.05:
         found.append(
-            f"f was adjusted by {100 * drift:.0f} % against EXIF ({section['f_exif_px']:.0f} px to "
-            f"{section['f_px']:.0f} px)"
+            f"{of}f was adjusted by {100 * drift:.0f} % against EXIF "
+            f"({section['f_exif_px']:.0f} px to {section['f_px']:.0f} px)"
         )
     return found
 
 
 def f_and_ground_height(result: Adjustment) -> tuple[float, float]:
-    """How far the principal distance decides the mean height of the object points.
+    """How far principal distances decide the mean height of the object points.
 
     Args:
-        result: adjusted photographs, df of the only camera among the unknowns.
+        result: adjusted photographs, df of each camera among the unknowns.
 
     Returns:
-        Correlation of f with the mean height, and the standard deviation of that height that
-        comes from f alone, m.
+        Correlation of f with the mean height (of several the multiple correlation), and the
+        standard deviation of that height that comes from f alone, m.
     """
-    column = result.layout.interior[0][INTERIOR.index("df")]
-    of_f = float(result.cofactor[column, column])
+    own = [int(columns[INTERIOR.index("df")]) for columns in result.layout.interior]
+    if min(own) < 0:
+        return 0.0, 0.0
+    of_f = result.cofactor[np.ix_(own, own)]
     reduced = reduced_equations(result.equations, result.layout)
     points = len(result.layout.eliminated_points)
     mean = np.zeros((points, 3))
@@ -256,10 +400,11 @@ def f_and_ground_height(result: Adjustment) -> tuple[float, float]:
     by_column = np.zeros(result.layout.columns)
     by_column[reduced.sparse_columns] = -(reduced.coupling_sparse.T @ mean.ravel())
     by_column[reduced.dense_columns] = -(reduced.coupling_dense.T @ mean.ravel())
-    both = -float(by_column @ result.cofactor[:, column])
+    both = -(by_column @ result.cofactor[:, own])
     of_height = float(by_column @ result.cofactor @ by_column + (mean**2).sum())
-    correlation = both / float(np.sqrt(of_f * of_height))
-    return correlation, result.sigma0 * abs(both) / float(np.sqrt(of_f))
+    explained = float(np.sqrt(both @ np.linalg.solve(of_f, both)))
+    sign = float(np.sign(both[0])) if len(own) == 1 else 1.0
+    return sign * explained / float(np.sqrt(of_height)), result.sigma0 * explained
 
 
 def _places_block(control: GroundControl) -> bool:
@@ -277,9 +422,9 @@ def _measured_control(result: Adjustment) -> int:
     return int((is_control & (seen > 0)).sum())
 
 
-def _interior_sigmas(result: Adjustment) -> dict[str, float]:
-    """Standard deviations of the estimated interior orientation, internal units."""
-    columns = result.layout.interior[0]
+def _interior_sigmas(result: Adjustment, camera: int) -> dict[str, float]:
+    """Standard deviations of an estimated interior orientation, internal units."""
+    columns = result.layout.interior[camera]
     variance = np.clip(np.diag(result.cofactor), 0.0, None)
     return {
         name: result.sigma0 * float(np.sqrt(variance[column]))

@@ -197,7 +197,7 @@ def _orient_together(
     distance = np.array([cone.lens.f_mm for cone in cones])[images.head[images.tracks.image[rows]]]
     scaled = xy_mm[rows] * (camera.f_mm / distance)[:, None]
     block = orient_photographs(
-        camera,
+        (camera,),
         PhotographTracks(
             number[images.tracks.image[rows]],
             images.tracks.point[rows],
@@ -229,7 +229,7 @@ def _orient_together(
     new = own[block.oriented]
     found.station_m[new] = fit.applied(block.station[block.oriented])
     found.rotation[new] = fit.rotation @ block.rotation[block.oriented]
-    ideal = ideal_mm(camera, block.interior, np.zeros(0), scaled)
+    ideal = ideal_mm(camera, block.interior[0], np.zeros(0), scaled)
     found.ray[rows] = np.column_stack([ideal, np.full(len(rows), -camera.f_mm)])
     found.pixel[rows] = (camera.pixel_mm or 1e-3) / camera.f_mm
 

@@ -119,15 +119,56 @@ def refused(folder: Path, out: Path, *options: str) -> str:
     return " ".join(str(done.exception or done.output).split())
 
 
-def test_two_cameras_in_one_folder_are_refused(tmp_path, photographs) -> None:
+def test_every_camera_of_a_folder_is_a_head(tmp_path) -> None:
     folder = tmp_path / "mixed"
     folder.mkdir()
     for number in USED[:3]:
         reduced(number, folder)
     other = SENECA.parent / "caliterra" / "IMG_9419.jpg"
     (folder / other.name).write_bytes(other.read_bytes())
-    sentence = refused(folder, tmp_path / "out")
-    assert "2 cameras" in sentence and "SX260" in sentence and "ELPH 300" in sentence
+    out = tmp_path / "out"
+    done = RUN.invoke(app, ["import", "photographs", str(folder), "--out", str(out), "--json"])
+    about = json.loads(done.stdout)
+    assert about["heads"] == ["C1", "C2"] and "SX260" in str(about["notes"])
+    rig = load_rig(out / "rig.toml")
+    assert [cone.sensors[0].width_px for cone in rig.cones] == [WIDTH, 4000]
+    assert (out / "L0/000004/C2.jpg").read_bytes() == other.read_bytes()
+
+
+def test_photographs_of_a_zoom_lens_are_refused(tmp_path) -> None:
+    for k in range(21):
+        reduced(484, tmp_path, name=f"{k}.jpg", pixels=np.full((90, 120 + 4 * k, 3), 90, np.uint8))
+    options = ("--focal-mm", "5", "--pixel-um", "5")
+    assert "21 cameras or settings" in refused(tmp_path, tmp_path / "out", *options)
+
+
+@pytest.mark.soak
+def test_two_cameras_are_adjusted_together_with_an_interior_orientation_each(tmp_path) -> None:
+    """Three of the photographs reduced to two thirds are those of another camera."""
+    folder = tmp_path / "both"
+    folder.mkdir()
+    for number in USED:
+        whole = cv2.imread(str(SENECA / f"IMG_{number:04d}.jpg"))
+        width = 600 if number in (492, 495, 505) else WIDTH
+        pixels = cv2.resize(whole, (width, width * 3 // 4), interpolation=cv2.INTER_AREA)
+        reduced(number, folder, pixels=pixels)
+    mission = tmp_path / "mission"
+    RUN.invoke(app, ["import", "photographs", str(folder), "--out", str(mission)])
+    done = RUN.invoke(app, ["triangulate", str(mission), "--json"])
+    assert done.exit_code == 0, f"{done.output} {done.exception}"
+    found = json.loads(done.stdout)["photographs"]
+    large, small = found["cameras"]
+    assert (large["photographs"], small["photographs"]) == (4, 3)
+    assert small["f_px"] / large["f_px"] == pytest.approx(600 / WIDTH, rel=0.01)
+    assert any(one.startswith("C2: 3 photographs do not") for one in done_cautions(done))
+    options = ["--no-level", "--threads", "1", "--gsd", "0.4", "--json"]
+    done = RUN.invoke(app, ["orthomosaic", str(mission), *options])
+    assert done.exit_code == 0, f"{done.output} {done.exception}"
+    assert json.loads(done.stdout)["images_used"] == len(USED)
+
+
+def done_cautions(done) -> list[str]:
+    return json.loads(done.stdout)["cautions"]
 
 
 def test_photographs_without_positions_or_focal_length_are_refused(tmp_path) -> None:
@@ -313,8 +354,8 @@ def test_a_principal_point_off_the_middle_is_named_with_what_it_does_to_f(block,
     )
     result = adjust(completed(project.network), project.settings)
     image = block.block.image
-    free = free_principal_point(result, pitch_mm=image.pitch_mm, longer_side_px=image.width_px)
-    section = photographs_section(elsewhere, no_control(), result, free)
+    (free,) = free_principal_point(result, longer_side_px=[image.width_px])
+    section = photographs_section(elsewhere, no_control(), result, [free])
     assert free.point_px == pytest.approx(middle_px, abs=4 * max(free.point_sigma_px))
     named = [one for one in photograph_cautions(section) if "principal point is held" in one]
     assert bool(named) == (middle_px != (0.0, 0.0)) == section["f_depends_on_principal_point"]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -62,7 +64,7 @@ def camera(f_mm: float = F) -> CameraModel:
 @pytest.mark.parametrize("relief_m", [0.0, 12.0], ids=["level", "hilly"])
 def test_images_without_attitudes_come_back_to_the_truth(relief_m) -> None:
     tracks, place, turn = scene(relief_m)
-    found = orient_photographs(camera(1.01 * F), tracks)
+    found = orient_photographs([camera(1.01 * F)], tracks)
     assert found is not None and found.oriented.all()
     fit = fit_positions(found.station, place)
     assert np.abs(fit.residual_m).max() < 0.6
@@ -72,6 +74,25 @@ def test_images_without_attitudes_come_back_to_the_truth(relief_m) -> None:
     assert found.used[tied].mean() > 0.95
 
 
+def test_images_of_two_cameras_keep_an_interior_orientation_each() -> None:
+    """Every other image is of a camera with 1.5 times the principal distance and pixel size."""
+    tracks, place, _ = scene(12.0)
+    of_image = np.arange(8) % 2
+    xy_mm = tracks.xy_mm * np.where(of_image[tracks.image] == 1, 1.5, 1.0)[:, None]
+    both = replace(tracks, xy_mm=xy_mm, camera=of_image)
+    larger = replace(
+        camera(0.99 * 1.5 * F), name="D", pixel_mm=1.5 * PIXEL, sigma={"df": 0.15, "k1": 3e-3}
+    )
+    found = orient_photographs([camera(1.01 * F), larger], both)
+    assert found is not None and found.oriented.all()
+    assert np.abs(fit_positions(found.station, place).residual_m).max() < 0.6
+    k1 = found.interior[:, INTERIOR.index("k1")]
+    assert k1 == pytest.approx([K1, K1 / 1.5**2], rel=0.1)
+    df = found.interior[:, INTERIOR.index("df")]
+    ratio = (0.99 * 1.5 * F - df[1]) / (1.01 * F - df[0])
+    assert ratio == pytest.approx(1.5, rel=2e-3)
+
+
 def test_unrelated_images_are_left_without_orientation() -> None:
     tracks, place, _ = scene(12.0)
     random = np.random.default_rng(3)
@@ -79,7 +100,7 @@ def test_unrelated_images_are_left_without_orientation() -> None:
     xy = tracks.xy_mm.copy()
     xy[wrong] = random.uniform(-1, 1, (wrong.sum(), 2)) * HALF
     found = orient_photographs(
-        camera(), PhotographTracks(tracks.image, tracks.point, xy, 8, tracks.points)
+        [camera()], PhotographTracks(tracks.image, tracks.point, xy, 8, tracks.points)
     )
     assert found is not None
     assert found.oriented.tolist() == [True, True, False, True, True, False, True, True]
@@ -91,7 +112,7 @@ def test_images_without_common_points_are_not_oriented() -> None:
     tracks, *_ = scene(12.0)
     alone = np.arange(len(tracks.image), dtype=np.int64)
     assert orient_photographs(
-        camera(), PhotographTracks(tracks.image, alone, tracks.xy_mm, 8, len(alone))
+        [camera()], PhotographTracks(tracks.image, alone, tracks.xy_mm, 8, len(alone))
     ) is None  # fmt: skip
 
 
@@ -122,9 +143,11 @@ def test_wrong_tracks_do_not_shrink_the_principal_distance_to_nothing() -> None:
     random = np.random.default_rng(7)
     xy_mm = random.uniform(-1, 1, (len(point), 2)) * HALF
     xyz = random.uniform(-60, 60, (len(points), 3))
-    started = FreeBlock(place[:4], turn[:4], xyz, np.zeros(10))
-    found = damped_adjustment(camera(), started, tracks.image[tied], point, xy_mm)
-    df = found.interior[INTERIOR.index("df")]
+    started = FreeBlock(place[:4], turn[:4], xyz, np.zeros((1, 10)))
+    found = damped_adjustment(
+        [camera()], np.zeros(4, np.int64), started, tracks.image[tied], point, xy_mm
+    )
+    df = found.interior[0, INTERIOR.index("df")]
     assert abs(df) <= 5.0 * camera().sigma["df"]
     assert F + df > 0.8 * F
 
@@ -132,7 +155,7 @@ def test_wrong_tracks_do_not_shrink_the_principal_distance_to_nothing() -> None:
 def test_an_image_that_sees_points_of_one_place_only_is_left_without_orientation() -> None:
     """OpenCV ends in an assertion then; points of wrong tracks come to lie so."""
     tracks, *_ = scene(12.0)
-    block = _Growing(camera(), tracks)
+    block = _Growing((camera(),), tracks)
     own = block._rows[0]
     block.xyz[tracks.point[own]] = 1e-5 * np.column_stack([block.ideal[own], np.ones(len(own))])
     assert not block._resect(0)
@@ -143,7 +166,7 @@ def test_an_adjustment_without_fitting_points_changes_nothing() -> None:
     camera = CameraModel("head", F, interior=np.zeros(len(INTERIOR)), pixel_mm=PIXEL)
     image, point = np.repeat([0, 1, 2], 20), np.tile(np.arange(20), 3)
     xy_mm = np.random.default_rng(2).uniform(-1.0, 1.0, (60, 2))
-    block = _Growing(camera, PhotographTracks(image, point, xy_mm, 3, 20))
+    block = _Growing((camera,), PhotographTracks(image, point, xy_mm, 3, 20))
     block.station[:2], block.rotation[:2] = np.eye(3)[:2], np.eye(3)
     block.adjust()
     assert not block.used().any()
