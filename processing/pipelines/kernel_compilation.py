@@ -44,6 +44,7 @@ _KERNEL_MODULES: Final = (
     "processing.image.line_means",
     "processing.quality.common_windows",
     "processing.quality.frame_blocks",
+    "processing.quality.frame_rectangles",
     "processing.quality.local_sharpness",
     "processing.quality.signal_steps",
     "processing.quality.valid_area",

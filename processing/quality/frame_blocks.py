@@ -19,6 +19,7 @@ from processing.geometry.placement import SensorPlacement, raw_from_vip_mm, vip_
 from processing.image.compiled_kernel import compiled_kernel
 from processing.image.line_means import BUNDLE_PX, LineMeans
 from processing.quality.figures.image import BlockFigures
+from processing.quality.frame_rectangles import Side, changed_rectangles
 from processing.quality.ground_steps import (
     MAX_SHARED,
     SAMPLES,
@@ -55,6 +56,8 @@ those count that are so far from the next one, in distances at which other heads
 CANDIDATES: Final = 6
 """Edges of a frame that are compared with other heads, the largest."""
 MIN_HEADS: Final = 2
+CLOSED: Final = 4
+"""Sides of a rectangle of which none is the border of the frame."""
 MIN_LASTING: Final = 0.3
 """Of the step between two lines, that is still there where other heads are compared: a block has
 another offset all over, a line of plants or vehicles only itself."""
@@ -111,6 +114,16 @@ def block_edges(
             if block is not None:
                 found.append(block)
                 break
+    edged = {block.sensor for block in found}
+    rectangles = [
+        block
+        for name, lines in means.items()
+        if name not in edged
+        for block in _rectangle(view, rig.sensor(name), lines)
+    ]
+    # Small offsets of many frames at once are rows of plants and roofs.
+    if len(rectangles) <= MAX_FRAMES:
+        found += rectangles
     return tuple(sorted(found, key=lambda block: -abs(block.relative)))
 
 
@@ -314,6 +327,56 @@ def _isolated(edges: Iterable[_Edge], every: Sequence[_Edge], reach_px: float) -
         away = np.abs(places[edge.axis] - edge.at)
         if not np.any((away > 0) & (away < ISOLATED_REACH * reach_px)):
             yield edge
+
+
+def _rectangle(view: GroundView, sensor: Sensor, lines: LineMeans) -> Iterator[BlockEdge]:
+    """The clearest side of a rectangle of sharp sides that no other head shows, if there is one."""
+    for sides in itertools.islice(changed_rectangles(sensor, lines), CANDIDATES):
+        shared = _shared_by_others(view, sensor.name, sides)
+        if shared is not None and shared <= MAX_SHARED:
+            side, counts = sides[0], level1_counts_per_dn(sensor.bits)
+            yield BlockEdge(
+                sensor.name,
+                side.axis,
+                side.at,
+                side.first,
+                side.last,
+                side.step / counts,
+                side.relative,
+                shared * abs(side.relative),
+            )
+            return
+
+
+def _shared_by_others(view: GroundView, name: str, sides: Sequence[Side]) -> float | None:
+    """The share of the sides' steps that other heads show; None where too few see them.
+
+    What the frame itself shows there is the step and the ground; what of that another head shows
+    is ground. Of a closed rectangle the median head counts, as ground has no such sides and differs
+    from band to band; of one that the border closes, the head that shows most.
+    """
+    away = view.reach_px(name)
+    seen: dict[str, list[float]] = {}
+    for side in sides:
+        along = np.linspace(side.first + 2, side.last - 2, min(SAMPLES, side.last - side.first))
+        places = sides_of(side.axis, side.at, along, away)
+        own = signal_change(view.frames[name], view.placements[name], places, 1)
+        ground = [vip_mm_from_raw(view.placements[name], place) for place in places]
+        for other, frame in view.frames.items():
+            if other == name or own is None:
+                continue
+            placement = view.placements[other]
+            with np.errstate(invalid="ignore"):
+                before, after = (raw_from_vip_mm(placement, place) for place in ground)
+            reach = 1 if view.is_pan(other) else 0
+            change = signal_change(frame, placement, (before, after), reach)
+            if change is not None:
+                missing = (own - change) / side.relative
+                seen.setdefault(other, []).append(missing)
+    if len(seen) < MIN_HEADS:
+        return None
+    shares = [1.0 - float(np.mean(missing)) for missing in seen.values()]
+    return float(np.median(shares)) if len(sides) == CLOSED else max(shares)
 
 
 def _unshared(

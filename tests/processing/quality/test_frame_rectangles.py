@@ -1,0 +1,134 @@
+"""Rectangles with another offset: found by sharp sides, which a lens does not draw."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from processing.geometry.placement import nominal_placements, vip_mm_from_raw
+from processing.image.line_means import line_means
+from processing.quality.frame_blocks import block_edges, edge_limits
+from processing.quality.frame_rectangles import Side, changed_rectangles
+from processing.rig import find_rig
+
+Array = NDArray[Any]
+RIG = find_rig("ultracam-x-mini")
+SENSOR = RIG.sensor("SU11")
+COUNTS = 8
+"""Level-1 counts of one DN of 12 bits."""
+STEP = 40 * COUNTS
+ROWS, COLUMNS = (200, 407), (300, 611)
+
+
+def _ground() -> Array:
+    """Texture of 50 DN as a lens draws it, and photon noise, float64."""
+    draw = np.random.default_rng(3)
+    size = (SENSOR.height_px, SENSOR.width_px)
+    texture = cv2.GaussianBlur(draw.normal(0.0, 1.0, size), (0, 0), 1.5)
+    texture *= 50.0 * COUNTS / texture.std()
+    return np.asarray(8000.0 + texture + draw.normal(0.0, 8.0 * COUNTS, size))
+
+
+GROUND = _ground()
+
+
+def _words(signal: Array) -> Array:
+    return np.asarray(np.clip(np.rint(signal / 2.0) * 2.0, 2, 65534), np.uint16)
+
+
+def _part(rows: tuple[int, int] = ROWS, columns: tuple[int, int] = COLUMNS) -> Array:
+    part = np.zeros_like(GROUND)
+    part[rows[0] : rows[1] + 1, columns[0] : columns[1] + 1] = 1.0
+    return part
+
+
+def _first(signal: Array) -> tuple[Side, ...]:
+    lines = line_means(_words(signal), (0, SENSOR.height_px - 1))
+    return next(changed_rectangles(SENSOR, lines), ())
+
+
+def test_ground_as_a_lens_draws_it_has_no_rectangle() -> None:
+    assert _first(GROUND) == ()
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_all_four_sides_of_a_block_below_the_texture_are_found_to_the_line(sign: int) -> None:
+    sides = _first(GROUND + sign * STEP * _part())
+    found = {(side.axis, side.at): side.step for side in sides}
+    assert set(found) == {
+        ("rows", ROWS[0] - 1),
+        ("rows", ROWS[1]),
+        ("columns", COLUMNS[0] - 1),
+        ("columns", COLUMNS[1]),
+    }
+    for (_, at), step in found.items():
+        expected = sign * STEP if at in (ROWS[0] - 1, COLUMNS[0] - 1) else -sign * STEP
+        assert step == pytest.approx(expected, rel=0.15)
+    assert [side.sigmas for side in sides] == sorted((s.sigmas for s in sides), reverse=True)
+
+
+def test_a_block_in_a_corner_of_the_frame_has_two_sides() -> None:
+    sides = _first(GROUND + 3 * STEP * _part((0, 249), (0, 399)))
+    assert {(side.axis, side.at) for side in sides} == {("rows", 249), ("columns", 399)}
+
+
+def test_an_edge_that_a_lens_drew_is_no_side() -> None:
+    assert _first(GROUND + 3 * STEP * cv2.GaussianBlur(_part(), (0, 0), 0.8)) == ()
+
+
+def test_lines_around_a_place_are_no_rectangle() -> None:
+    inner = _part((ROWS[0] + 1, ROWS[1] - 1), (COLUMNS[0] + 1, COLUMNS[1] - 1))
+    assert _first(GROUND + 3 * STEP * (_part() - inner)) == ()
+
+
+def test_a_step_along_one_side_alone_is_no_rectangle() -> None:
+    ramp = np.clip((np.arange(SENSOR.height_px) - ROWS[0]) / 200.0, 0.0, 1.0)[:, None]
+    fading = (1.0 - ramp) * _part((ROWS[0], SENSOR.height_px - 1))
+    assert _first(GROUND + 3 * STEP * fading) == ()
+
+
+def _named(changed: str, among: str) -> list[str]:
+    """Frames that are named of those over textured ground, where some have the same rectangle."""
+    temperatures = {cone.probe: cone.calibration_c for cone in RIG.cones}
+    placements = nominal_placements(RIG, temperatures, {})
+    of_first = placements[changed.split()[0]]
+    corners = [(COLUMNS[0] - 0.5, ROWS[0] - 0.5), (COLUMNS[1] + 0.5, ROWS[1] + 0.5)]
+    ends = vip_mm_from_raw(of_first, np.array(corners))
+    frames = {}
+    for sensor in (RIG.sensor(name) for name in among.split()):
+        rough = GROUND[: sensor.height_px, : sensor.width_px]
+        signal = 8000.0 + 0.3 * (rough - 8000.0)
+        if sensor.name in changed.split():
+            rows, columns = np.indices(rough.shape)
+            pixels = np.stack((columns.ravel(), rows.ravel()), axis=1).astype(np.float64)
+            at = vip_mm_from_raw(placements[sensor.name], pixels)
+            inside = (at >= ends.min(axis=0)).all(axis=1) & (at <= ends.max(axis=0)).all(axis=1)
+            signal = rough + STEP * inside.reshape(rough.shape)
+        frames[sensor.name] = _words(signal)
+    means = {n: line_means(frame, (0, len(frame) - 1)) for n, frame in frames.items()}
+    found = block_edges(RIG, placements, frames, means, edge_limits(RIG, means))
+    return [block.sensor for block in found]
+
+
+def test_a_block_below_the_texture_is_named_where_no_other_head_shows_it() -> None:
+    assert _named("SU11", "SU11 R G B N") == ["SU11"]
+    assert _named("R", "R G B N") == ["R"]
+
+
+def test_a_rectangle_that_other_heads_show_is_ground() -> None:
+    assert _named("R G B N", "R G B N") == []
+
+
+def test_a_rectangle_that_one_other_head_at_most_sees_is_not_decided() -> None:
+    assert _named("R", "R G") == []
+
+
+def test_a_small_frame_has_none() -> None:
+    small = replace(SENSOR, width_px=120, height_px=20)
+    lines = line_means(_words(GROUND[:20, :120]), (0, 19))
+    assert not list(changed_rectangles(small, lines))
