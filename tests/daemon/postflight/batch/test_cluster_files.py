@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -21,6 +23,18 @@ def test_the_image_has_no_root_and_no_compiler() -> None:
     assert final.index("USER 10001") < final.index("syntopic kernels")
     assert not re.search(r"\b(gcc|g\+\+|build-essential|python3-dev)\b", text)
     assert "--only-binary=:all:" in text and "requirements.lock" in text
+
+
+def test_sources_have_times_that_a_layer_holds_before_kernels_are_compiled(tmp_path: Path) -> None:
+    (source := tmp_path / "package/kernels.py").parent.mkdir()
+    source.touch()
+    os.utime(source, ns=(1_795_256_100_700_000_000,) * 2)
+    text = (FOLDER / "Containerfile").read_text()
+    (command,) = re.findall(r'^RUN /opt/syntopic/bin/python -c "(.*)"$', text, re.MULTILINE)
+    assert text.index(command) < text.index("COPY --from=build") < text.index("syntopic kernels")
+    code = command.replace("/opt/syntopic", str(tmp_path))
+    subprocess.run([sys.executable, "-c", code], check=True)
+    assert source.stat().st_mtime_ns == 1_795_256_100_000_000_000
 
 
 def test_pods_have_no_root_and_every_connection_has_tls() -> None:
