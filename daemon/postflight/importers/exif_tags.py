@@ -195,22 +195,20 @@ def _value(raw: bytes, kind: int, n: int, order: str, code: int) -> Value:
 def position_of(tags: ImageTags) -> tuple[float, float, float] | None:
     """Latitude, longitude, deg, and height, m, as the camera's receiver gave them; else None.
 
-    A height below sea level (GPSAltitudeRef 1) is negative. Zero degrees on both axes is a
-    receiver without a fix.
+    A height below sea level (GPSAltitudeRef 1) is negative; of one that is not given it is NaN.
+    Zero degrees on both axes is a receiver without a fix.
     """
     gps = tags.gps
     try:
         latitude = _degrees(gps[GPS_LATITUDE]) * _sign(gps[GPS_LATITUDE_REF], "N", "S")
         longitude = _degrees(gps[GPS_LONGITUDE]) * _sign(gps[GPS_LONGITUDE_REF], "E", "W")
-        height = gps[GPS_ALTITUDE]
-        reference = gps.get(GPS_ALTITUDE_REF, (0.0,))
     except (KeyError, TypeError, ValueError, IndexError):
         return None
-    if not isinstance(height, tuple) or not height:
-        return None
-    below = reference in ((1.0,), b"\x01")
+    height, below = gps.get(GPS_ALTITUDE), gps.get(GPS_ALTITUDE_REF) in ((1.0,), b"\x01")
+    if not isinstance(height, tuple) or not height or not math.isfinite(height[0]):
+        height = (math.nan,)
     place = (latitude, longitude, -height[0] if below else height[0])
-    if not all(math.isfinite(v) for v in place) or place[:2] == (0.0, 0.0):
+    if not all(math.isfinite(v) for v in place[:2]) or place[:2] == (0.0, 0.0):
         return None
     return place if abs(latitude) <= 90.0 and abs(longitude) <= 180.0 else None
 

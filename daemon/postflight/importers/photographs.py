@@ -7,10 +7,11 @@ without standard deviation.
 
 from __future__ import annotations
 
+import math
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -22,6 +23,7 @@ from daemon.postflight.calibration.rig_writer import rig_toml
 from daemon.postflight.importers import exif_tags
 from daemon.postflight.importers.exif_tags import ImageTags, TagsError, read_tags
 from daemon.postflight.importers.multispectral_tags import ImagesError
+from daemon.postflight.importers.xmp import XmpError, read_xmp
 from processing.rig import Cone, Lens, Rig, Sensor, load_rig
 
 CONE: Final = "C"
@@ -31,6 +33,8 @@ _CAMERAS_MAX: Final = 20
 RIG_NAME: Final = "photographs"
 SUFFIXES: Final = (".jpg", ".jpeg", ".tif", ".tiff")
 POSITIONS_MIN: Final = 3
+NO_HEIGHT_M: Final = 0.0
+"""Height of all photographs where none states one."""
 _NOMINAL_PITCH_MM: Final = 1e-3
 _FILES_MAX: Final = 100_000
 
@@ -142,11 +146,12 @@ def read_photographs(
             f"the folder holds photographs of {len(kinds)} cameras or settings ({counted}; ...); "
             f"{_CAMERAS_MAX} are estimated at most. A zoom lens needs one focal length for all"
         )
+    found = _with_heights(found)
     placed = sum(one.position is not None for one in found)
     if not problems and placed < POSITIONS_MIN:
         problems.append(
             f"{folder}: {placed} of {len(found)} photographs have a position in EXIF (GPSLatitude, "
-            f"GPSLongitude, GPSAltitude); {POSITIONS_MIN} are needed to place a block"
+            f"GPSLongitude); {POSITIONS_MIN} are needed to place a block"
         )
     if problems:
         raise ImagesError(problems)
@@ -194,8 +199,34 @@ def _photograph(path: Path, tags: ImageTags, given: tuple[float, float] | None) 
         f_number=tags.number(exif_tags.F_NUMBER) or 5.6,
         taken=tags.text(exif_tags.DATE_TIME_ORIGINAL)[:40],
         exposure_time_us=None if seconds is None or seconds <= 0.0 else seconds * 1e6,
-        position=exif_tags.position_of(tags),
+        position=_position(path, tags),
     )
+
+
+def _position(path: Path, tags: ImageTags) -> tuple[float, float, float] | None:
+    """Of EXIF; a height that is not there is that of XMP (drone-dji:AbsoluteAltitude), else NaN."""
+    place = exif_tags.position_of(tags)
+    if place is None or math.isfinite(place[2]) or tags.xmp is None:
+        return place
+    try:
+        return (*place[:2], read_xmp(tags.xmp, path.name).number("AbsoluteAltitude"))
+    except XmpError:
+        return place
+
+
+def _with_heights(photographs: list[Photograph]) -> list[Photograph]:
+    """Positions without height are none where others have one; else all heights are zero."""
+    places = [one.position for one in photographs if one.position is not None]
+    if all(math.isfinite(place[2]) for place in places):
+        return photographs
+    is_any = any(math.isfinite(place[2]) for place in places)
+    found = []
+    for one in photographs:
+        place = one.position
+        if place is not None and not math.isfinite(place[2]):
+            place = None if is_any else (*place[:2], NO_HEIGHT_M)
+        found.append(replace(one, position=place))
+    return found
 
 
 def _kind(one: Photograph) -> str:
@@ -330,7 +361,14 @@ def _notes(photographs: Sequence[Photograph], heads: Sequence[str]) -> tuple[str
             f"{len(without)} photographs have no position: {', '.join(without[:5])}"
             f"{', ...' if len(without) > 5 else ''}."
         )
-    notes.append(
-        "EXIF does not state which heights GPSAltitude has; they are taken as ellipsoidal."
-    )
+    heights = {one.position[2] for one in photographs if one.position is not None}
+    if heights == {NO_HEIGHT_M}:
+        notes.append(
+            "EXIF has no GPSAltitude: all heights are taken as 0 m, as of level flight. Heights of "
+            "the block are below the flight, unless control places it (--points)."
+        )
+    else:
+        notes.append(
+            "EXIF does not state which heights GPSAltitude has; they are taken as ellipsoidal."
+        )
     return tuple(notes)

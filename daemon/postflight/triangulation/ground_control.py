@@ -6,6 +6,7 @@ Images are named by their files. Pixels are zero in the middle of the upper left
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -84,7 +85,7 @@ def read_gcp_list(path: Path, images: Mapping[str, int], frame: LocalFrame) -> G
     rows: list[tuple[str, tuple[float, float, float], int, tuple[float, float]]] = []
     unused: list[str] = []
     for n, line in numbered[1:]:
-        parts = line.split()
+        parts = line.replace(",", " ").split()
         try:
             numbers = [float(part) for part in parts[:5]]
             image = parts[5]
@@ -93,8 +94,8 @@ def read_gcp_list(path: Path, images: Mapping[str, int], frame: LocalFrame) -> G
         except (ValueError, IndexError):
             problems.append(f"{path.name} line {n}: east north height column row image [name]")
             continue
-        at = images.get(image.lower())
-        name = parts[6] if len(parts) > 6 else f"{parts[0]}_{parts[1]}_{parts[2]}"
+        at = _image_of(image, images)
+        name = parts[6] if len(parts) > 6 else "_".join(f"{v:.12g}" for v in numbers[:3])
         if at is None:
             unused.append(f"{image}: {name}")
             continue
@@ -145,7 +146,7 @@ def read_control_tables(
     seen = read_table(measured_file, ("image", "point", "column_px", "row_px"), ("sigma_px",))
     number = {name: k for k, name in enumerate(names)}
     own = seen.text("image")
-    of = [images.get(name.lower()) for name in own]
+    of = [_image_of(name, images) for name in own]
     for name, line in zip(seen.text("point"), seen.lines, strict=True):
         if name not in number:
             seen.add_problem(line, f"point {name!r} is not there")
@@ -172,7 +173,7 @@ def _geodetic(path: Path, system: str, xyz: Array) -> Array:
     """Latitude, longitude, ellipsoidal height (n, 3) of coordinates in a system."""
     place = f"{path.name} line 1: {system[:80]!r}"
     try:
-        crs = CRS.from_user_input(_named_utm(system) or system)
+        crs = CRS.from_user_input(_named_utm(system) or _with_datum(system))
     except CRSError as error:
         raise TriangulationError(
             f"{place} is no coordinate system; write EPSG:32616, a PROJ text or WGS84 UTM 16N"
@@ -195,6 +196,22 @@ def _geodetic(path: Path, system: str, xyz: Array) -> Array:
     except (GeoreferenceError, ProjError) as error:
         raise TriangulationError(f"{path.name} line 1: {error}") from error
     return np.stack([latitude, longitude, height], axis=-1)
+
+
+def _image_of(name: str, images: Mapping[str, int]) -> int | None:
+    """Index of an image by its file's name, without its folder, or with another suffix."""
+    own = name.replace("\\", "/").rsplit("/", 1)[-1].lower()
+    if own in images:
+        return images[own]
+    stem = own.rsplit(".", 1)[0]
+    of_stem = {k for file, k in images.items() if file.rsplit(".", 1)[0] == stem}
+    return of_stem.pop() if len(of_stem) == 1 else None
+
+
+def _with_datum(system: str) -> str:
+    """A PROJ text on the ellipsoid of WGS 84 that names no datum: WGS 84 is meant."""
+    is_bare = "+proj=" in system and not re.search(r"\+(datum|towgs84|nadgrids)=", system)
+    return f"{system} +datum=WGS84" if is_bare and "+ellps=WGS84" in system else system
 
 
 def _named_utm(system: str) -> str | None:

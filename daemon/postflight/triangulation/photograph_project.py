@@ -325,6 +325,12 @@ def photograph_cautions(section: Mapping[str, Any]) -> list[str]:
     """What a reader has to know about the result, one sentence each."""
     found = list(section["left_out"])
     found += section["control_not_measured"]
+    unused = section["unused_control"]
+    if unused:
+        found.append(
+            f"{len(unused)} measurements of control are in photographs that are not in the block: "
+            f"{'; '.join(unused[:5])}{'; ...' if len(unused) > 5 else ''}"
+        )
     if section["control_rejected"]:
         found.append(
             f"control rejected by the adjustment: {', '.join(section['control_rejected'])}; check "

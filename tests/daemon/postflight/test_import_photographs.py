@@ -181,6 +181,51 @@ def test_photographs_without_positions_or_focal_length_are_refused(tmp_path) -> 
     assert "0 of 3 photographs have a position" in sentence
 
 
+def without_height(path: Path, xmp: str = "") -> None:
+    """Give GPSAltitude (tag 6, one rational) a number that EXIF does not use."""
+    data = path.read_bytes()
+    for order in ("<", ">"):
+        tag, other = (struct.pack(f"{order}HHI", code, 5, 1) for code in (6, 102))
+        data = data.replace(tag, other)
+    packet = b"http://ns.adobe.com/xap/1.0/\0" + xmp.encode()
+    segment = b"\xff\xe1" + struct.pack(">H", len(packet) + 2) + packet if xmp else b""
+    path.write_bytes(data[:2] + segment + data[2:])
+
+
+XMP = (
+    '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-'
+    'syntax-ns#"><rdf:Description xmlns:d="http://www.dji.com/drone-dji/1.0/" '
+    'd:AbsoluteAltitude="+312.50" d:RelativeAltitude="+80.1"/></rdf:RDF></x:xmpmeta>'
+)
+
+
+@pytest.mark.parametrize(
+    ("changed", "xmp", "heights", "sentence"),
+    [
+        (range(4), "", [0.0] * 4, "no GPSAltitude: all heights"),
+        (range(1), "", [None, 280.0, 280.0, 280.0], "1 photographs have no position"),
+        (range(4), XMP, [312.5] * 4, "taken as ellipsoidal"),
+        (range(4), "<broken", [0.0] * 4, "no GPSAltitude"),
+    ],
+    ids=["none", "one without", "in XMP", "damaged XMP"],
+)
+def test_positions_without_height(tmp_path, changed, xmp, heights, sentence) -> None:
+    folder = tmp_path / "photographs"
+    folder.mkdir()
+    for k in range(4):
+        path = reduced(484 + k, folder, pixels=np.full((675, 900, 3), 90, np.uint8))
+        if k in changed:
+            without_height(path, xmp)
+    options = ["--out", str(tmp_path / "out"), "--json"]
+    done = RUN.invoke(app, ["import", "photographs", str(folder), *options])
+    assert done.exit_code == 0, f"{done.output} {done.exception}"
+    assert sentence in " ".join(json.loads(done.stdout)["notes"])
+    for k, height in enumerate(heights, start=1):
+        record = json.loads((tmp_path / f"out/L0/{k:06d}/exposure.json").read_text())
+        found = record["frames"][0]["settings"].get("GpsAltitudeM")
+        assert found == (height if height is None else pytest.approx(height, abs=8.0))
+
+
 @pytest.fixture(scope="module")
 def triangulated_block(photographs, tmp_path_factory) -> tuple[Path, dict, PhotographBlock]:
     """The mission, its report without control, and its oriented block."""
@@ -491,3 +536,31 @@ def test_an_odm_list_of_control_points_is_read(tmp_path) -> None:
     path.write_text("EPSG:32617\n1 2 3 4 IMG_1.jpg\n")
     with pytest.raises(TriangulationError, match="line 2"):
         read_gcp_list(path, {"img_1.jpg": 0}, frame)
+
+
+@pytest.mark.parametrize(
+    ("header", "lines"),
+    [
+        ("EPSG:32617", ["{} images/IMG_1.JPG", "{} ./IMG_2.jpg"]),
+        ("WGS84 UTM 17N", ["{} IMG_1.tif gcp more columns", "{} img_2 gcp"]),
+        ("+proj=utm +zone=17 +ellps=WGS84 +units=m", ["{} IMG_1.JPG", "{}\tIMG_2.JPG"]),
+        ("32617", ["{},IMG_1.JPG", "{} IMG_2.JPG"]),
+    ],
+    ids=["folders", "other suffix", "no datum", "commas"],
+)
+def test_gcp_lists_as_programs_write_them_are_read_alike(tmp_path, header, lines) -> None:
+    """Points without a name are one if their coordinates are, however they are written."""
+    path = tmp_path / "gcp_list.txt"
+    place = ("306162.164 4545392.858 220.0 10 20", "306162.164 4545392.858 220 10 20")
+    rows = [line.format(own) for line, own in zip(lines, place, strict=True)]
+    path.write_text("\n".join([header, *rows]))
+    frame = LocalFrame(41.0367, -83.306)
+    found = read_gcp_list(path, {"img_1.jpg": 0, "img_2.jpg": 1}, frame)
+    assert len(found.names) == 1 and found.image.tolist() == [0, 1] and not found.unused
+    assert found.xyz_m[0] == pytest.approx([0.0, 0.0, 220.0], abs=0.1)
+
+
+def test_control_in_photographs_outside_the_block_is_named(block) -> None:
+    control = replace(no_control(), unused=("IMG_9999.JPG: p1",))
+    cautions = photograph_cautions(section_of(block, control))
+    assert any("photographs that are not in the block: IMG_9999.JPG: p1" in one for one in cautions)
