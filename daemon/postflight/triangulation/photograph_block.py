@@ -53,6 +53,12 @@ FREE: Final = ("df", "k1", "k2", "p1", "p2")
 NEIGHBOURS: Final = 10
 """Images whose positions are nearest are compared; without positions all are."""
 _ORIENTED_MIN: Final = 3
+_CONTRADICTING_SHARE: Final = 0.5
+_UPWARD_MAX: Final = 0.2
+"""Sine of the elevation of the axis of most photographs of the ground."""
+_WRONG_POSITION_M: Final = 15.0
+_WRONG_POSITION: Final = 6.0
+"""Of a position that is not used: distance from the block, over the median of all."""
 _MAX_PIXELS: Final = 500_000_000
 _FOCAL_SIGMA: Final = 0.02
 _CORNER_SIGMA: Final = 0.05
@@ -66,7 +72,8 @@ class PhotographBlock:
     `block`, `tied`: as of any mission, of the oriented images alone; `block.image` is that of the
     first camera. `files` by image name. `cameras` have oriented images, `sizes` are their pixels,
     `camera_of` (n,) is the camera of each image. `left_out` has a sentence for each photograph
-    without orientation. `position_m` (n, 3) is NaN where EXIF has none.
+    without orientation, `wrong_positions` one for each position of EXIF that is not used.
+    `position_m` (n, 3) is NaN where EXIF has none that is used.
     """
 
     block: ImageBlock
@@ -78,6 +85,7 @@ class PhotographBlock:
     xyz_m: Array
     position_m: Array
     left_out: tuple[str, ...]
+    wrong_positions: tuple[str, ...] = ()
 
     def image_mm(self, image: NDArray[np.int64], px: Array) -> Array:
         """Image coordinates (m, 2), mm, of pixels (m, 2) of images (m,)."""
@@ -131,10 +139,18 @@ def photograph_block_of(
     names = [_source(exposure) for exposure in exposures]
     if found is None or found.oriented.sum() < _ORIENTED_MIN:
         raise TriangulationError(_unconnected(mission, names, features, len(pairs)))
-    placed = _placed(found, position)
-    return _assembled(
+    placed, wrong = _placed(found, position)
+    away = np.linalg.norm(placed.station - position, axis=1)
+    wrong_position = tuple(
+        f"{names[k]}: its position of EXIF is {away[k]:.0f} m from where the other photographs "
+        "place it, and is not used"
+        for k in np.flatnonzero(wrong)
+    )
+    position[wrong] = np.nan
+    block = _assembled(
         mission, rig, exposures, frame, position, tracks, features, placed, crs, camera_of
     )
+    return replace(block, wrong_positions=wrong_position)
 
 
 def _image_mm(sizes: Sequence[VirtualImage], camera: NDArray[np.int64], px: Array) -> Array:
@@ -238,8 +254,13 @@ def _unconnected(
     )
 
 
-def _placed(found: OrientedBlock, position: Array) -> OrientedBlock:
-    """The block brought to the known positions by a similarity."""
+def _placed(found: OrientedBlock, position: Array) -> tuple[OrientedBlock, NDArray[np.bool_]]:
+    """The block brought to the known positions by a similarity, and the positions (n,) that
+    contradict it.
+
+    Raises:
+        TriangulationError: positions that do not place it, or contradict it as a whole.
+    """
     own = found.oriented & np.isfinite(position[:, 0])
     try:
         fit = fit_positions(found.station[own], position[own])
@@ -247,12 +268,30 @@ def _placed(found: OrientedBlock, position: Array) -> OrientedBlock:
         raise TriangulationError(
             f"the positions of EXIF do not place the block: {error}"
         ) from error
-    return replace(
+    placed = replace(
         found,
         station=fit.applied(found.station),
         rotation=fit.rotation @ found.rotation,
         xyz=fit.applied(found.xyz),
     )
+    away = np.linalg.norm(fit.residual_m, axis=1)
+    extent = float(np.linalg.norm(position[own].std(axis=0)))
+    typical = float(np.median(away))
+    if typical > _CONTRADICTING_SHARE * extent:
+        raise TriangulationError(
+            f"photographs and positions of EXIF contradict each other by {typical:.1f} m (median) "
+            f"over {extent:.0f} m (standard deviation of positions): positions are not those of "
+            "these photographs, or the ground repeats itself"
+        )
+    upward = -placed.rotation[placed.oriented][:, 2, 2]
+    if np.median(upward) > _UPWARD_MAX:
+        raise TriangulationError(
+            "most photographs look upward where positions of EXIF place them: the positions do not "
+            "determine the attitude of the block. Lines across or control points do"
+        )
+    wrong = np.zeros(len(position), bool)
+    wrong[np.flatnonzero(own)[away > max(_WRONG_POSITION_M, _WRONG_POSITION * typical)]] = True
+    return placed, wrong
 
 
 def _assembled(

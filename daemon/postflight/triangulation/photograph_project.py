@@ -283,6 +283,7 @@ def photographs_section(
         "files": dict(found.files),
         "oriented": len(block.names),
         "left_out": list(found.left_out),
+        "wrong_positions": list(found.wrong_positions),
         "unused_control": list(control.unused),
         **cameras[0],
         "cameras": cameras,
@@ -323,7 +324,7 @@ def _camera_section(
 
 def photograph_cautions(section: Mapping[str, Any]) -> list[str]:
     """What a reader has to know about the result, one sentence each."""
-    found = list(section["left_out"])
+    found = [*section["left_out"], *section["wrong_positions"]]
     found += section["control_not_measured"]
     unused = section["unused_control"]
     if unused:

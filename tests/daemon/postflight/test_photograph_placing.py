@@ -1,0 +1,67 @@
+"""A block of photographs is placed by positions of EXIF, or states why these do not place it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from daemon.postflight.triangulation.photograph_block import _placed
+from daemon.postflight.triangulation.triangulation import TriangulationError
+from processing.bundle.incremental_orientation import OrientedBlock
+from processing.geometry.rotation import rotation_matrix
+
+Array = NDArray[np.float64]
+
+
+def flown(*, seed: int = 1) -> tuple[OrientedBlock, Array]:
+    """Two lines of six nadir photographs in a frame of their own, and positions to 1 m."""
+    random = np.random.default_rng(seed)
+    place = np.array([[30.0 * (k % 6), 40.0 * (k // 6), 280.0] for k in range(12)])
+    turn = rotation_matrix(0.4, -0.3, 1.0)
+    own = OrientedBlock(
+        station=(place - 100.0) @ turn / 25.0,
+        rotation=np.repeat(turn.T[None], 12, axis=0),
+        xyz=np.zeros((0, 3)),
+        interior=np.zeros((1, 10)),
+        used=np.zeros(0, bool),
+        seen=np.zeros(12, np.int64),
+    )
+    return own, place + random.normal(0.0, 1.0, place.shape)
+
+
+def test_photographs_come_to_their_positions_and_look_down() -> None:
+    own, position = flown()
+    placed, wrong = _placed(own, position)
+    assert np.abs(placed.station - position).max() < 4.0 and not wrong.any()
+    assert placed.rotation[:, 2, 2].min() > 0.99
+
+
+def test_one_wrong_position_is_not_used() -> None:
+    own, position = flown()
+    truth = position[7].copy()
+    position[7] += [60.0, -30.0, 0.0]
+    placed, wrong = _placed(own, position)
+    assert np.flatnonzero(wrong).tolist() == [7]
+    assert np.abs(placed.station[7] - truth).max() < 5.0
+
+
+def test_photographs_without_a_position_are_placed_with_the_others() -> None:
+    own, position = flown()
+    truth = position[[2, 5]].copy()
+    position[[2, 5]] = np.nan
+    placed, wrong = _placed(own, position)
+    assert np.abs(placed.station[[2, 5]] - truth).max() < 5.0 and not wrong.any()
+
+
+def test_positions_of_other_photographs_are_refused() -> None:
+    own, position = flown()
+    with pytest.raises(TriangulationError, match="contradict each other by"):
+        _placed(own, np.random.default_rng(3).permutation(position))
+
+
+def test_photographs_that_would_look_upward_are_refused() -> None:
+    """As where positions in one plane were those of a mirrored block."""
+    own, position = flown()
+    with pytest.raises(TriangulationError, match="look upward"):
+        _placed(own, position * [-1.0, 1.0, 1.0])
