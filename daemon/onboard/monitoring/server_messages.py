@@ -21,7 +21,7 @@ CATALOG: Final = PAGE / "messages" / "en" / "server.json"
 PREFIX: Final = "server."
 SENTENCE_MAX: Final = 2000
 """Characters; a longer sentence is shown as it is."""
-DEPTH_MAX: Final = 4
+DEPTH_MAX: Final = 6
 LISTS: Final = ("missing", "problems", "reasons", "notes", "recovery")
 """Keys of lists of sentences."""
 FURTHER: Final = ("poweroff",)
@@ -39,7 +39,10 @@ NUMBERS: Final = frozenset(
     )
 )
 """Parameters that are numbers. A text where one is expected belongs to another message."""
+NAMES: Final = frozenset(("address", "feature", "file", "folder", "key", "name", "path", "setting"))
+"""Parameters that are names. A value with a part of a sentence in it belongs to another message."""
 
+_CLAUSE = re.compile(r":(?: |$)|; |\n|\([^)]*$")
 _NUMBER = re.compile(r"[+-]?[\d.,]+(?:e[+-]?\d+)?")
 _SEPARATORS = re.compile(r"; (?![^(]*\))")
 """Separators outside of parentheses."""
@@ -82,7 +85,11 @@ class _Template:
             begin = at + len(literal)
         values.append(sentence[begin:end])
         found = dict(zip(self.names, values, strict=True))
-        is_wrong = any(name in NUMBERS and not _NUMBER.fullmatch(found[name]) for name in found)
+        is_wrong = any(
+            (name in NUMBERS and not _NUMBER.fullmatch(value))
+            or (name in NAMES and _CLAUSE.search(value))
+            for name, value in found.items()
+        )
         return None if begin >= end or is_wrong else found
 
 
@@ -180,7 +187,7 @@ def _message_of(sentence: str) -> str | None:
 
 
 def _match(sentence: str, depth: int) -> Message | None:
-    for template in _templates():
+    for template in _candidates(sentence[:1], sentence[-1:]):
         values = template.match(sentence)
         if values is None:
             continue
@@ -220,9 +227,19 @@ def _catalog() -> Mapping[str, str]:
     return cast(Mapping[str, str], json.loads(CATALOG.read_text("utf-8")))
 
 
+@lru_cache(maxsize=1024)
+def _candidates(first: str, last: str) -> Sequence[_Template]:
+    """The templates of sentences that begin and end with these characters, in their order."""
+    return [
+        one
+        for one in _templates()
+        if one.literals[0][:1] in ("", first) and one.literals[-1][-1:] in ("", last)
+    ]
+
+
 @lru_cache(maxsize=1)
 def _templates() -> Sequence[_Template]:
-    """The most specific first; of frames, those that split at a colon, which joins the least."""
+    """The most specific first; of frames, lines, then a colon, which joins the least."""
     found = []
     for code, text in _catalog().items():
         parts = re.split(r"\{(\w+)\}", text)
@@ -231,6 +248,7 @@ def _templates() -> Sequence[_Template]:
         found,
         key=lambda one: (
             one.is_frame,
+            one.is_frame and "\n" not in one.literals,
             one.is_frame and ": " not in one.literals,
             -one.literal_length,
         ),

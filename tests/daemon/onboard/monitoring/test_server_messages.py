@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-import ast
-import itertools
 import json
 import re
-from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -19,39 +14,8 @@ from daemon.onboard.monitoring.server_messages import (
     message_of,
     with_messages,
 )
+from tests.daemon.onboard.monitoring.sentence_literals import codes_of, texts_of
 
-ROOT = Path(__file__).parents[4]
-SOURCES = (
-    *("processing/quality/evaluation.py", "processing/quality/image_findings.py"),
-    *("processing/quality/stitching_findings.py", "processing/quality/level_steps.py"),
-    *("drivers/base/device.py", "drivers/receivers/fix_monitor.py"),
-    *("drivers/cameras/aravis/byte_order.py", "drivers/thermometers/modbus_rtu/frames.py"),
-    "drivers/transport/line_errors.py",
-    *("daemon/onboard/service/command_execution.py", "daemon/onboard/service/guidance_feed.py"),
-    *("daemon/onboard/service/service.py", "daemon/onboard/service/flight_line.py"),
-    *("daemon/onboard/service/override_record.py", "daemon/onboard/storage/mirror.py"),
-    *("daemon/onboard/storage/writer.py", "daemon/onboard/timing/gps_clock.py"),
-    *("daemon/onboard/timing/ptp_time.py", "daemon/onboard/flight/arming.py"),
-    *("daemon/onboard/pipeline/worker.py", "daemon/mission/mirror/mirrored.py"),
-    *("daemon/onboard/service/landed_stage.py", "daemon/onboard/service/operator_journal.py"),
-    *("daemon/onboard/service/triangulation_link.py", "daemon/onboard/flight/fault_latches.py"),
-    *("daemon/onboard/service/poweroff.py", "daemon/mission/verification/recovery.py"),
-)
-"""What writes the sentences of findings, faults, commands and landing."""
-WORDS_MIN = 5
-PARTS = (
-    r"\wSU11|SU11\w",
-    r"^[;.,:)( ]|[:(] ?$|coverage counts as a gap$|^by their places|^by the fixed pattern",
-    r"\(common scale .*cone SU11$|^Motion blur SU11|^probe SU11 reads|^A block of",
-    r"^SU11 m SU11 the planned",
-    r"^Columns SU11 to|^was (triggered|stored) but",
-    r"^(rejected|accepted); |^has its computed|^parity SU11|^SU11 cannot be read",
-)
-"""Parts of sentences, which are in the sentences below."""
-REFUSALS = (
-    r"^arguments of|^(interval|distance|retake) needs|^SU11 holds SU11 decisions|^start although",
-)
-"""Refusals of commands that the page does not give."""
 SENTENCES = (
     "Head SU11 sent no image; 9% of pan has no valid pixels, which coverage counts as a gap. "
     "Check power and cable.",
@@ -108,15 +72,6 @@ def test_a_code_renders_the_sentence_that_it_was_found_for() -> None:
         assert not re.search(r"[a-z]{3,} [a-z]{3,} [a-z]{3,}", " ".join(texts_of(message))), message
 
 
-def texts_of(value: Any) -> list[str]:
-    """The texts of a message that are not of the catalog."""
-    if isinstance(value, dict):
-        return [text for one in value["parameters"].values() for text in texts_of(one)]
-    if isinstance(value, list):
-        return [text for one in value for text in texts_of(one)]
-    return [value]
-
-
 def test_every_text_of_the_catalog_is_found_by_itself() -> None:
     for code, text in json.loads(CATALOG.read_text("utf-8")).items():
         names = re.findall(r"\{(\w+)\}", text)
@@ -130,48 +85,6 @@ def test_every_text_of_the_catalog_is_found_by_itself() -> None:
             continue
         assert english(message) == sentence
         assert f"server.{message['code']}" == code, sentence
-
-
-@pytest.mark.parametrize("source", SOURCES)
-def test_every_sentence_of_a_source_has_a_code(source: str) -> None:
-    """A sentence that is new or changed here needs its text in `messages/*/server.json`."""
-    missing = [
-        variants[0]
-        for variants in sentences_of(ROOT / source)
-        if all(message_of(one) is None for one in variants)
-        and not any(re.search(part, variants[0]) for part in (*PARTS, *REFUSALS))
-    ]
-    assert missing == []
-
-
-def sentences_of(source: Path) -> Iterator[list[str]]:
-    """Each text of a module in all variants: a number or a name for every value in it."""
-    tree = ast.parse(source.read_text("utf-8"))
-    documents = {id(n.value) for n in ast.walk(tree) if isinstance(n, ast.Expr)}
-    for node in ast.walk(tree):
-        if isinstance(node, ast.JoinedStr):
-            documents |= {id(part) for part in node.values}
-    for node in ast.walk(tree):
-        if id(node) in documents:
-            continue
-        if isinstance(node, ast.Constant) and isinstance(node.value, str):
-            choices: list[tuple[str, ...]] = [(node.value,)]
-        elif isinstance(node, ast.JoinedStr):
-            choices = [
-                (str(part.value),) if isinstance(part, ast.Constant) else _values(part)
-                for part in node.values
-            ]
-        else:
-            continue
-        variants = ["".join(one) for one in itertools.product(*choices)]
-        if len(variants[0].split()) >= WORDS_MIN:
-            yield [re.sub(r"\{\d:[^}]*\}", "7", re.sub(r"\{\d\}", "SU11", v)) for v in variants]
-
-
-def _values(part: ast.expr) -> tuple[str, ...]:
-    assert isinstance(part, ast.FormattedValue)
-    is_share = part.format_spec is not None and "%" in ast.unparse(part.format_spec)
-    return ("7%",) if is_share else ("SU11", "7")
 
 
 def test_a_text_where_a_number_is_expected_is_not_this_message() -> None:
@@ -204,36 +117,6 @@ def test_a_long_sentence_of_a_device_costs_no_time() -> None:
     """Matching is linear: what a device sends cannot hold up the page."""
     for text in ("; ".join(["a (b"] * 400), "the " * 500, ": " * 900, "(" * 1900, "7 m of " * 250):
         assert message_of(text) is None or english(message_of(text) or {}) == text
-
-
-COMPOSED = {
-    *("use_end_program", "use_stop_modem", "instrument_silent", "head_open_holding"),
-    *("node_forbidden", "node_not_opened", "not_opened", "serial_lost", "serial_silent"),
-}
-"""Sentences that a driver composes, or that are shorter than what `sentences_of` looks at."""
-
-
-def codes_of(value: Any) -> Iterator[str]:
-    """The codes of a message and of its parameters."""
-    if isinstance(value, dict):
-        yield value["code"]
-        for one in value["parameters"].values():
-            yield from codes_of(one)
-    elif isinstance(value, list):
-        for one in value:
-            yield from codes_of(one)
-
-
-def test_every_text_of_a_device_is_one_that_a_driver_writes() -> None:
-    """A sentence that a driver changes would otherwise be English on every page."""
-    found: set[str] = set()
-    for source in sorted((ROOT / "drivers").rglob("*.py")):
-        for variants in sentences_of(source):
-            for one in variants:
-                found |= set(codes_of(message_of(one) or {"code": "", "parameters": {}}))
-    catalog = json.loads(CATALOG.read_text("utf-8"))
-    device = {one.removeprefix("server.") for one in catalog if one.startswith("server.device.")}
-    assert device - found - {f"device.{one}" for one in COMPOSED} == set()
 
 
 @pytest.mark.parametrize(
