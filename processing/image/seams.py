@@ -90,11 +90,12 @@ def seam_labels(centres: Array, means: Array, gains: Array, feather_px: int) -> 
         slice(joined_all.column, joined_all.end_column),
     )
     labels[box] = joined_all.labels
-    orphaned = joined_all.signal == np.float32(NOT_COVERED)
-    if orphaned.any():
-        inner = labels[box]
-        for index in range(len(means)):
-            inner[orphaned & (means[index][box] != np.float32(NOT_COVERED))] = index
+    orphaned = np.flatnonzero(joined_all.signal == np.float32(NOT_COVERED))
+    row, column = np.divmod(orphaned, joined_all.signal.shape[1])
+    row, column = row + joined_all.row, column + joined_all.column
+    for index in range(len(means)):
+        covers = means[index][row, column] != np.float32(NOT_COVERED)
+        labels[row[covers], column[covers]] = index
     return labels
 
 
@@ -184,12 +185,8 @@ def _join(
 
 
 def _transposed(part: _JoinedSensors) -> _JoinedSensors:
-    return _JoinedSensors(
-        part.column,
-        part.row,
-        np.ascontiguousarray(part.labels.T),
-        np.ascontiguousarray(part.signal.T),
-    )
+    """The part with rows and columns exchanged; views, not copies."""
+    return _JoinedSensors(part.column, part.row, part.labels.T, part.signal.T)
 
 
 def _window(
