@@ -91,11 +91,11 @@ def seam_labels(centres: Array, means: Array, gains: Array, feather_px: int) -> 
     )
     labels[box] = joined_all.labels
     orphaned = np.flatnonzero(joined_all.signal == np.float32(NOT_COVERED))
-    row, column = np.divmod(orphaned, joined_all.signal.shape[1])
-    row, column = row + joined_all.row, column + joined_all.column
+    i, j = np.divmod(orphaned, joined_all.signal.shape[1])
+    i, j = i + joined_all.row, j + joined_all.column
     for index in range(len(means)):
-        covers = means[index][row, column] != np.float32(NOT_COVERED)
-        labels[row[covers], column[covers]] = index
+        covers = means[index][i, j] != np.float32(NOT_COVERED)
+        labels[i[covers], j[covers]] = index
     return labels
 
 

@@ -106,8 +106,9 @@ def gap_cells(raster: NDArray[Any], columns: int, rows: int, *, saturated_bit: i
     _count_samples(raster, down, across, saturated_bit, there, saturated)
     half = SAMPLES * SAMPLES / 2.0
     gaps: Mask = there < half
-    if saturated_bit:
-        gaps |= _smoothed(saturated >= half)
+    full = saturated >= half
+    if full.any():
+        gaps |= _smoothed(full)
     return gaps
 
 
