@@ -84,6 +84,14 @@ def triangulate(
     measured: Annotated[
         Path | None, typer.Option(help="Table of their image measurements.")
     ] = None,
+    transfer: Annotated[
+        bool,
+        typer.Option(
+            "--transfer",
+            help="Points also in other images that show them, matched to where they were first "
+            "measured.",
+        ),
+    ] = False,
     head: Annotated[
         list[str] | None,
         typer.Option(help="Cone whose images form the block instead of stitched ones; repeatable."),
@@ -165,7 +173,10 @@ def triangulate(
     from daemon.postflight.adjustment.csv_tables import ProjectError
     from daemon.postflight.adjustment.summary import print_report, report_of
     from daemon.postflight.importers.photographs import is_photographs
+    from daemon.postflight.triangulation.block_findings import findings_json
+    from daemon.postflight.triangulation.block_points import read_block_points
     from daemon.postflight.triangulation.matching_work import match_mission_block
+    from daemon.postflight.triangulation.point_transfer import transferred
     from daemon.postflight.triangulation.report import (
         print_triangulation,
         triangulation_of,
@@ -220,6 +231,7 @@ def triangulate(
     block = block_of(
         folder, crs=crs, trajectory_file=trajectory, mount_file=mount, heads=head or ()
     )
+    surveyed = read_block_points(block.names, block.frame, points, measured)
     with lock_for(folder, results), ExitStack() as shown:
         try:
             tied = match_mission_block(
@@ -229,7 +241,10 @@ def triangulate(
             raise TriangulationError(f"{folder.path}: {error}") from error
         progress = shown.enter_context(Progress(console=Console(stderr=True), transient=True))
         task = progress.add_task("starting values", total=None)
-        project = project_of(block, tied, requirements, points_file=points, measured_file=measured)
+        if transfer:
+            progress.update(task, description="transferring points")
+            surveyed = transferred(block, surveyed, requirements.matching)
+        project = project_of(block, tied, requirements, surveyed=surveyed)
         try:
 
             def show(what: str, number: int, squares: float) -> None:
@@ -246,7 +261,9 @@ def triangulate(
             seconds=time.perf_counter() - begun,
             peak_mib=_peak_mib(),
         )
-        report["triangulation"] = triangulation_of(block, tied, project, result)
+        report["triangulation"] = triangulation_of(block, tied, project, result) | findings_json(
+            block, tied, result, requirements
+        )
         report["failures"] = [failure.as_json() for failure in block.failures]
         write_triangulation(results, block, project, result, report)
     if as_json:

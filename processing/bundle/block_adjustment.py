@@ -27,6 +27,7 @@ from processing.geometry.rotation import vectors_from_rotations
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
+_IMAGE_GROUPS: Final = (0, 1)
 _GNSS_GROUPS: Final = (4, 5)
 _ATTITUDE_GROUP: Final = 6
 
@@ -178,9 +179,14 @@ def intersected(
 
 
 def added_parameters(
-    result: Adjustment, position: Array, attitude: Array, sigma: Array
+    result: Adjustment,
+    position: Array,
+    attitude: Array,
+    sigma: Array,
+    *,
+    image_mm: Array | None = None,
 ) -> AddedParameters:
-    """Estimate effects on the measured orientations that the adjustment had no unknowns for.
+    """Estimate effects on observations that the adjustment had no unknowns for.
 
     One step of an adjustment with these unknowns, from the equations of the one without.
 
@@ -189,6 +195,7 @@ def added_parameters(
         position: (n, 3, k) derivatives of the measured positions by the parameters.
         attitude: (n, 3, k) likewise of rotation vectors about the camera's axes.
         sigma: (k,) a priori standard deviations, infinite for none.
+        image_mm: (m, 2, k) likewise of image coordinates, mm; None: they depend on no parameter.
 
     Returns:
         Values and covariance; a parameter that the observations do not contain has an infinite
@@ -202,6 +209,8 @@ def added_parameters(
     for table, groups in ((position, _GNSS_GROUPS), (attitude, (_ATTITUDE_GROUP,))):
         own = np.flatnonzero(np.isin(rows.group, groups))
         design[own] = table[rows.source[own], rows.axis[own]] / rows.sigma[own, None]
+    if image_mm is not None:
+        design += _without_points(result, image_mm)
     into = np.asarray(rows.reduced.T @ design)
     normal = design.T @ design - into.T @ result.cofactor @ into
     normal += np.diag(1.0 / np.square(sigma))
@@ -222,7 +231,7 @@ def added_parameters(
 def _of(result: Adjustment, points: Indices, prior: MountingPrior | None) -> BlockAdjustment:
     mounting = None
     if result.network.heads and prior is not None:
-        mounting = _mounting(result, prior)
+        mounting = adjusted_mounting(result, prior)
     factor = {g.name: g.factor for g in result.groups if np.isfinite(g.factor)}
     unit = max(1.0, result.sigma0)
     spread = np.sqrt(np.clip(np.einsum("pii->pi", result.point_cofactor), 0.0, None))
@@ -238,7 +247,36 @@ def _of(result: Adjustment, points: Indices, prior: MountingPrior | None) -> Blo
     )
 
 
-def _mounting(result: Adjustment, prior: MountingPrior) -> AdjustedMounting:
+def _without_points(result: Adjustment, image_mm: Array) -> Array:
+    """Rows of derivatives of image coordinates, less what moves of object points absorb."""
+    rows = result.equations
+    count = image_mm.shape[2]
+    design = np.zeros((len(rows.misclosure), count))
+    own = np.flatnonzero(np.isin(rows.group, _IMAGE_GROUPS))
+    source = rows.source[own]
+    weight = np.sqrt(result.weight[source]) / rows.sigma[own]
+    design[own] = image_mm[source, rows.group[own]] * weight[:, None]
+    seen = rows.point >= 0
+    points = int(rows.point.max(initial=-1)) + 1
+    part, point = rows.point_part[seen], rows.point[seen]
+    normal, right = np.zeros((points, 3, 3)), np.zeros((points, 3, count))
+    np.add.at(normal, point, part[:, :, None] * part[:, None, :])
+    np.add.at(right, point, part[:, :, None] * design[seen][:, None, :])
+    moved = np.linalg.pinv(normal, hermitian=True) @ right
+    design[seen] -= np.einsum("na,nak->nk", part, moved[point])
+    return design
+
+
+def adjusted_mounting(result: Adjustment, prior: MountingPrior) -> AdjustedMounting:
+    """Corrections of the mounting of the first head, which the calibration gives as none.
+
+    Args:
+        result: the adjustment.
+        prior: of the mounting.
+
+    Returns:
+        Values and standard deviations.
+    """
     layout, state = result.layout, result.state
     columns = np.concatenate([layout.head_rotation[0], layout.head_offset[0]])
     spread = np.sqrt(np.clip(np.diag(result.cofactor)[columns], 0.0, None))

@@ -137,6 +137,9 @@ def match_image(
         ground_m: height of the ground there, to begin with.
         settings: grid, windows, searches and limits.
 
+    Returns:
+        Its features, and where later images show them.
+
     Source: docs/explanation/mathematics/matching.md#least-squares-matching.
     """
     here = load(k)
@@ -152,8 +155,8 @@ def match_image(
     known = np.zeros(len(pixels), dtype=bool)
     for j in others:
         poses = ((station_m[k], rotation[k]), (station_m[j], rotation[j]))
-        found.tried[j], at = _matched_in(
-            here, _rectified(load(j), image, *poses, ground_m), image, rotation[j],
+        found.tried[j], at = matched_in(
+            here, rectified(load(j), image, *poses, ground_m), image, rotation[j],
             station_m[j], pixels, ground, known, settings,
         )  # fmt: skip
         rows = np.flatnonzero(np.isfinite(at[:, 0]))
@@ -314,14 +317,25 @@ def _plane_homography(
     return np.asarray(px_from_ray @ there[1].T @ seen @ here[1] @ ray_from_px)
 
 
-def _rectified(
+def rectified(
     there: Picture,
     image: VirtualImage,
     own: tuple[Array, Array],
     other: tuple[Array, Array],
     ground_m: float,
 ) -> tuple[Picture, Carry, Carry]:
-    """Another image so that about a shift is left to find, and pixels' way into it and back."""
+    """Another image so that about a shift is left to find, and pixels' way into it and back.
+
+    Args:
+        there: (h, w), NaN without data.
+        image: geometry of both.
+        own: place and rotation of the first image.
+        other: those of the other.
+        ground_m: height of the ground.
+
+    Returns:
+        The image, and functions of pixels (n, 2) from the other image into it and back.
+    """
     height, width = there.shape
     if min(own[1][2, 2], other[1][2, 2]) < _OBLIQUE_COSINE:
         from_here = _plane_homography(image, own, other, ground_m)
@@ -344,9 +358,9 @@ def _rectified(
     )
 
 
-def _matched_in(
+def matched_in(
     here: Picture,
-    rectified: tuple[Picture, Carry, Carry],
+    rectified_image: tuple[Picture, Carry, Carry],
     image: VirtualImage,
     rotation: Array,
     station_m: Array,
@@ -355,8 +369,23 @@ def _matched_in(
     known: NDArray[np.bool_],
     settings: BlockMatching,
 ) -> tuple[int, Array]:
-    """Number of places searched in another image, and where they are in it (n, 2), else NaN."""
-    rotated, into, back = rectified
+    """Find places of one image in another.
+
+    Args:
+        here: the first image.
+        rectified_image: the other, as `rectified` makes it.
+        image: geometry of both.
+        rotation: (3, 3) of the other.
+        station_m: (3,) of the other.
+        places: (n, 2) pixels of the first.
+        ground: (n, 3) where they are on the ground, about.
+        known: (n,) that is from a match.
+        settings: searches and limits.
+
+    Returns:
+        Number of places searched, and where they are in the other image (n, 2), NaN if not found.
+    """
+    rotated, into, back = rectified_image
     seen = pixels_of(image, station_m, rotation, ground)
     predicted = into(seen)
     margin_px = settings.window_px // 2 + MARGIN_PX + 2

@@ -6,6 +6,7 @@ flight or a replay reads and writes is in `daemon.onboard.triangulation`.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from typing import Final, Literal
 
@@ -76,6 +77,7 @@ class MeasuredImage:
             frame with z up.
         position_sigma_m, attitude_sigma_rad: (3,), the latter about the camera's axes.
         velocity_mps: (3,) in the same frame, NaN if unknown.
+        temperature_c: of the camera, NaN if unknown.
     """
 
     number: int
@@ -86,6 +88,7 @@ class MeasuredImage:
     position_sigma_m: Array
     attitude_sigma_rad: Array
     velocity_mps: Array
+    temperature_c: float = math.nan
 
 
 @dataclass(frozen=True)

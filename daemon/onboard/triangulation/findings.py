@@ -10,6 +10,8 @@ import numpy as np
 
 from daemon.onboard.triangulation.drifts import MOUNTING, Drift
 from daemon.onboard.triangulation.exposure_ranges import ranges
+from processing.bundle.adjust import Adjustment
+from processing.bundle.statistics import ObservationGroup
 from processing.pipelines.live_triangulation import LiveTriangulation
 
 MIN_TIES: Final = 6
@@ -20,6 +22,9 @@ MIN_FOUND_SHARE: Final = 0.15
 SIGNIFICANT: Final = 4.0
 CONTRADICTED_FACTOR: Final = 4.0
 """Variance factor of measured positions or attitudes: their errors are twice the stated ones."""
+MIN_LEFT_OUT: Final = 3
+LEFT_OUT_SHARE: Final = 0.25
+"""Of the exposures; fewer attitudes or positions that were left out are single blunders."""
 HEIGHT_MODEL_SIGMAS: Final = 3.0
 HEIGHT_MODEL_MIN_M: Final = 5.0
 
@@ -58,8 +63,104 @@ class HeightModelCheck:
     problem: str = ""
 
 
+@dataclass(frozen=True)
+class BlockTies:
+    """How the images of a block are tied, in flight or after landing.
+
+    Attributes:
+        numbers, lines: of the exposures, by image.
+        ties: points that an image shares with others, by image.
+        own_line: points tried and found in the image's own line, by image.
+        pairs: points tried and found between each pair of lines that overlap, by sorted pair.
+        groups: statistics of the adjustment; None before the first.
+        problems: sentences of adjustments that failed.
+        attitudes_left_out, positions_left_out: exposures whose measured attitude or position the
+            adjustment left out.
+    """
+
+    numbers: tuple[int, ...]
+    lines: tuple[str, ...]
+    ties: tuple[int, ...]
+    own_line: tuple[tuple[int, int], ...]
+    pairs: Mapping[tuple[str, str], tuple[int, int]]
+    groups: tuple[ObservationGroup, ...] | None
+    problems: tuple[str, ...] = ()
+    attitudes_left_out: tuple[int, ...] = ()
+    positions_left_out: tuple[int, ...] = ()
+
+    @property
+    def untied_numbers(self) -> tuple[int, ...]:
+        """Exposures that share fewer than `MIN_TIES` points with others, or whose own line is not
+        found in them."""
+        if len(self.numbers) < 2:
+            return ()
+        return tuple(
+            number
+            for number, ties, (tried, found) in zip(
+                self.numbers, self.ties, self.own_line, strict=True
+            )
+            if ties < MIN_TIES or _is_untied(tried, found)
+        )
+
+    @property
+    def untied_pairs(self) -> tuple[tuple[str, str], ...]:
+        """Pairs of overlapping lines that do not tie."""
+        return tuple(pair for pair, counts in self.pairs.items() if _is_untied(*counts))
+
+
+def _is_untied(tried: int, found: int) -> bool:
+    return tried >= MIN_TRIED and found < MIN_FOUND_SHARE * tried
+
+
+def live_ties(live: LiveTriangulation) -> BlockTies:
+    """Ties of the block in flight."""
+    table: dict[tuple[str, str], list[int]] = {}
+    for image, ties in zip(live.images, live.ties, strict=True):
+        for other, tried in ties.tried.items():
+            if other == image.line:
+                continue
+            first, second = sorted((image.line, other))
+            counts = table.setdefault((first, second), [0, 0])
+            counts[0] += tried
+            counts[1] += ties.found.get(other, 0)
+    return BlockTies(
+        tuple(one.number for one in live.images),
+        tuple(one.line for one in live.images),
+        tuple(one.ties for one in live.orientations),
+        tuple(
+            (ties.tried.get(image.line, 0), ties.found.get(image.line, 0))
+            for image, ties in zip(live.images, live.ties, strict=True)
+        ),
+        {pair: (tried, found) for pair, (tried, found) in table.items()},
+        None if live.last is None else live.last.result.groups,
+        tuple(live.problems),
+        *(
+            ((), ())
+            if live.last is None
+            else left_out_exposures(
+                live.last.result, [live.images[k].number for k in live.last_images]
+            )
+        ),
+    )
+
+
+def left_out_exposures(
+    result: Adjustment, numbers: Sequence[int]
+) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Exposures whose attitude, and those whose position, an adjustment left out.
+
+    Args:
+        numbers: of the exposures, in the order of the stations.
+    """
+    excluded = result.excluded
+    return (
+        tuple(numbers[int(k)] for k in np.flatnonzero(excluded.attitude.any(axis=1))),
+        tuple(numbers[int(k)] for k in np.flatnonzero(excluded.gnss.any(axis=1))),
+    )
+
+
 def findings_of(
-    live: LiveTriangulation,
+    block: BlockTies,
     drifts: Sequence[Drift],
     *,
     skipped: Mapping[int, str],
@@ -76,63 +177,26 @@ def findings_of(
         has_landed: lines that were not flown count only then.
     """
     found = [
-        *_skipped(live, skipped),
-        *_untied(live),
-        *_lines(live),
-        *_single_strip(live, drifts),
-        *_contradicted(live, drifts),
+        *_skipped(block, skipped),
+        *_untied(block),
+        *_lines(block),
+        *_single_strip(block, drifts),
+        *_contradicted(block, drifts),
         *_heights(heights),
     ]
     if has_landed:
-        found += _plan(live, planned_lines)
+        found += _plan(block, planned_lines)
     found += [
         TriangulationFinding(
             "ADJUSTMENT_FAILED",
             f"An adjustment failed: {sentence}. The orientations keep their last values.",
         )
-        for sentence in live.problems[-1:]
+        for sentence in block.problems[-1:]
     ]
     return tuple(found)
 
 
-def line_ties(live: LiveTriangulation) -> dict[tuple[str, str], tuple[int, int]]:
-    """Points tried and found between each pair of lines that overlap, by sorted pair."""
-    table: dict[tuple[str, str], list[int]] = {}
-    for image, ties in zip(live.images, live.ties, strict=True):
-        for other, tried in ties.tried.items():
-            if other == image.line:
-                continue
-            first, second = sorted((image.line, other))
-            counts = table.setdefault((first, second), [0, 0])
-            counts[0] += tried
-            counts[1] += ties.found.get(other, 0)
-    return {pair: (tried, found) for pair, (tried, found) in table.items()}
-
-
-def untied_numbers(live: LiveTriangulation) -> tuple[int, ...]:
-    """Exposures that share fewer than `MIN_TIES` points with others, or whose own line is not found
-    in them."""
-    if len(live.images) < 2:
-        return ()
-    found = []
-    for one, ties in zip(live.orientations, live.ties, strict=True):
-        tried = ties.tried.get(one.image.line, 0)
-        matched = ties.found.get(one.image.line, 0)
-        if one.ties < MIN_TIES or (tried >= MIN_TRIED and matched < MIN_FOUND_SHARE * tried):
-            found.append(one.image.number)
-    return tuple(found)
-
-
-def untied_pairs(live: LiveTriangulation) -> tuple[tuple[str, str], ...]:
-    """Pairs of overlapping lines that do not tie."""
-    return tuple(
-        pair
-        for pair, (tried, found) in line_ties(live).items()
-        if tried >= MIN_TRIED and found < MIN_FOUND_SHARE * tried
-    )
-
-
-def _skipped(live: LiveTriangulation, skipped: Mapping[int, str]) -> list[TriangulationFinding]:
+def _skipped(block: BlockTies, skipped: Mapping[int, str]) -> list[TriangulationFinding]:
     by_reason: dict[str, list[int]] = {}
     for number, reason in skipped.items():
         by_reason.setdefault(reason, []).append(number)
@@ -149,14 +213,14 @@ def _skipped(live: LiveTriangulation, skipped: Mapping[int, str]) -> list[Triang
             name, why = "NOT_TRIANGULATED", f"{reason}. Run `syntopic triangulate MISSION --live`."
         else:
             name, why = "NO_IMAGE", f"{reason}. Run `syntopic process` after landing."
-        if not live.images:
+        if not block.numbers:
             where = f"There is no block: exposures {ranges(numbers)} cannot be used"
         found.append(TriangulationFinding(name, f"{where}: {why}", tuple(numbers)))
     return found
 
 
-def _untied(live: LiveTriangulation) -> list[TriangulationFinding]:
-    numbers = untied_numbers(live)
+def _untied(block: BlockTies) -> list[TriangulationFinding]:
+    numbers = block.untied_numbers
     if not numbers:
         return []
     return [
@@ -170,8 +234,8 @@ def _untied(live: LiveTriangulation) -> list[TriangulationFinding]:
     ]
 
 
-def _lines(live: LiveTriangulation) -> list[TriangulationFinding]:
-    table = line_ties(live)
+def _lines(block: BlockTies) -> list[TriangulationFinding]:
+    table = block.pairs
     return [
         TriangulationFinding(
             "LINES_NOT_TIED",
@@ -180,14 +244,14 @@ def _lines(live: LiveTriangulation) -> list[TriangulationFinding]:
             "orientation). Fly a cross line over both.",
             lines=(first, second),
         )
-        for first, second in untied_pairs(live)
+        for first, second in block.untied_pairs
     ]
 
 
-def _single_strip(live: LiveTriangulation, drifts: Sequence[Drift]) -> list[TriangulationFinding]:
-    lines = tuple(dict.fromkeys(one.line for one in live.images))
-    tied_across = any(found for _, found in line_ties(live).values())
-    if live.last is None or tied_across:
+def _single_strip(block: BlockTies, drifts: Sequence[Drift]) -> list[TriangulationFinding]:
+    lines = tuple(dict.fromkeys(block.lines))
+    tied_across = any(found for _, found in block.pairs.values())
+    if block.groups is None or tied_across:
         return []
     mounting = {name for name, _, _ in MOUNTING}
     open_ones = [d.name for d in drifts if d.name in mounting and not d.is_determined]
@@ -206,11 +270,24 @@ def _single_strip(live: LiveTriangulation, drifts: Sequence[Drift]) -> list[Tria
     ]
 
 
-def _contradicted(live: LiveTriangulation, drifts: Sequence[Drift]) -> list[TriangulationFinding]:
+def _contradicted(block: BlockTies, drifts: Sequence[Drift]) -> list[TriangulationFinding]:
     found: list[TriangulationFinding] = []
-    if live.last is None:
-        return found
-    for group in live.last.result.groups:
+    for what, name, numbers, cure in (
+        ("Attitudes", "ATTITUDE_CONTRADICTED", block.attitudes_left_out,
+         "Check the inertial unit's alignment and mounting."),
+        ("Positions", "GNSS_CONTRADICTED", block.positions_left_out,
+         "Check the receiver's corrections."),
+    ):  # fmt: skip
+        if len(numbers) >= max(MIN_LEFT_OUT, LEFT_OUT_SHARE * len(block.numbers)):
+            found.append(
+                TriangulationFinding(
+                    name,
+                    f"{what} of exposures {ranges(numbers)} contradict the tie points and were "
+                    f"left out. {cure}",
+                    tuple(numbers),
+                )
+            )
+    for group in block.groups or ():
         if not np.isfinite(group.factor) or group.factor < CONTRADICTED_FACTOR:
             continue
         ratio = group.factor**0.5
@@ -236,7 +313,13 @@ def _contradicted(live: LiveTriangulation, drifts: Sequence[Drift]) -> list[Tria
         change = f"{one.value:.3g} {one.unit}, {one.significance:.0f} standard deviations"
         if one.unit == "mdeg/h":
             name, cure = "ATTITUDE_DRIFT", "Fly a turn of alignment and check the inertial unit."
-        elif one.name == "time offset":
+        elif one.unit == "mdeg/K":
+            name = "BORESIGHT_WITH_TEMPERATURE"
+            cure = "Calibrate the boresight near the temperatures of the flight."
+        elif one.unit in ("um", "um/h"):
+            name = "PRINCIPAL_DISTANCE"
+            cure = "Calibrate the camera, or run `syntopic triangulate MISSION --interior`."
+        elif one.name.startswith("time offset"):
             name, cure = "TIME_OFFSET", "Check the event mark's edge and [mount] time_offset_ms."
         elif one.name.startswith("boresight"):
             name, cure = "BORESIGHT_CHANGED", "Calibrate the boresight after landing."
@@ -274,8 +357,8 @@ def _heights(check: HeightModelCheck | None) -> list[TriangulationFinding]:
     ]
 
 
-def _plan(live: LiveTriangulation, planned: Sequence[str]) -> list[TriangulationFinding]:
-    flown = {one.line for one in live.images}
+def _plan(block: BlockTies, planned: Sequence[str]) -> list[TriangulationFinding]:
+    flown = set(block.lines)
     left = tuple(line for line in planned if line not in flown)
     if not left:
         return []

@@ -15,7 +15,7 @@ import numpy as np
 from daemon.mission.canonical_json import canonical_bytes
 from daemon.mission.store.level2 import write_folder
 from daemon.onboard.triangulation.control_points import control_json
-from daemon.onboard.triangulation.findings import line_ties, untied_numbers, untied_pairs
+from daemon.onboard.triangulation.findings import live_ties
 from daemon.onboard.triangulation.mission_triangulation import MissionTriangulation
 from daemon.onboard.triangulation.quality_page import quality_page
 from daemon.orientation.in_flight_orientation import ANGLES, PLACES
@@ -70,7 +70,7 @@ def summary_json(done: MissionTriangulation) -> dict[str, Any]:
         "drifts": [one.as_json() for one in done.drifts],
         "line_ties": [
             {"lines": list(pair), "tried": tried, "found": found}
-            for pair, (tried, found) in ({} if live is None else line_ties(live)).items()
+            for pair, (tried, found) in ({} if live is None else live_ties(live).pairs).items()
         ],
         "skipped": [{"exposure": k, "reason": v} for k, v in sorted(done.skipped.items())],
         "findings": [one.as_json() for one in done.findings],
@@ -83,7 +83,8 @@ def reflights_json(done: MissionTriangulation) -> list[dict[str, Any]]:
     """What to fly again by the tie points: exposures of a line, or lines that need a cross line."""
     advice: list[dict[str, Any]] = []
     live = done.live
-    bad = {} if live is None else dict.fromkeys(untied_numbers(live), "no tie points")
+    ties = None if live is None else live_ties(live)
+    bad = {} if ties is None else dict.fromkeys(ties.untied_numbers, "no tie points")
     bad |= dict(done.skipped)
     line_of = {} if live is None else {i.number: i.line for i in live.images}
     runs: list[tuple[str | None, str, list[int]]] = []
@@ -97,7 +98,7 @@ def reflights_json(done: MissionTriangulation) -> list[dict[str, Any]]:
         {"kind": "exposures", "line": line, "from": own[0], "to": own[-1], "reason": reason}
         for line, reason, own in runs
     ]
-    pairs = () if live is None else untied_pairs(live)
+    pairs = () if ties is None else ties.untied_pairs
     advice += [
         {"kind": "cross line", "lines": list(pair), "reason": "the lines do not tie"}
         for pair in pairs

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from daemon.configuration.model import MountSection
@@ -43,4 +45,11 @@ def measured_image(
         sigmas.of_position(eo),
         sigmas.about_camera_rad,
         velocity,
+        camera_temperature_c(exposure),
     )
+
+
+def camera_temperature_c(exposure: Exposure) -> float:
+    """Mean of the probes of an exposure; NaN without any."""
+    read = [one.value_c for one in exposure.temperatures if one.value_c is not None]
+    return sum(read) / len(read) if read else math.nan

@@ -30,7 +30,7 @@ from daemon.onboard.triangulation.control_points import (
     read_surveyed,
     residuals_of,
 )
-from daemon.onboard.triangulation.drifts import Drift, drifts_of
+from daemon.onboard.triangulation.drifts import Drift, live_drifts
 from daemon.onboard.triangulation.findings import (
     CUT_OFF,
     LOST,
@@ -39,9 +39,11 @@ from daemon.onboard.triangulation.findings import (
     HeightModelCheck,
     TriangulationFinding,
     findings_of,
+    live_ties,
 )
 from daemon.onboard.triangulation.flown_lines import FlownLines
 from daemon.onboard.triangulation.ground_coverage import GroundCoverage, coverage_of
+from daemon.onboard.triangulation.height_model_check import check_heights, read_relief
 from daemon.onboard.triangulation.measured_images import measured_image, oriented
 from daemon.orientation.exterior_orientation import (
     NavigationSource,
@@ -51,7 +53,7 @@ from daemon.orientation.exterior_orientation import (
 from daemon.orientation.local_frame import LocalFrame
 from daemon.orientation.navigation_sigmas import NavigationSigmas
 from daemon.planning.plan_readers import read_plan
-from daemon.planning.relief import TerrainRelief, relief_of
+from daemon.planning.relief import TerrainRelief
 from processing import ProcessingError
 from processing.matching.patch_tracks import usable
 from processing.pipelines.live_triangulation import (
@@ -64,7 +66,6 @@ from processing.rig import Rig, load_rig
 FOLDER: Final = "triangulation/live"
 """Below a mission's `export`."""
 _NO_IMAGE: Final = "no stitched image"
-_HEIGHT_SAMPLES: Final = 400
 
 
 class LiveTriangulationError(DaemonError, ValueError):
@@ -137,14 +138,15 @@ class MissionTriangulation:
         self.skipped: dict[int, str] = {}
         self.drifts: tuple[Drift, ...] = ()
         self.findings: tuple[TriangulationFinding, ...] = ()
-        self.heights: HeightModelCheck | None = None
+        self.heights: HeightModelCheck | None
         self.coverage: GroundCoverage | None = None
         self.residuals: tuple[PointResidual, ...] = ()
         self.block_seconds = 0.0
         self.block_count = 0
         self.has_landed = False
         self.is_simulated = False
-        self.relief = self._read_relief()
+        self.relief: TerrainRelief | None
+        self.relief, self.heights = read_relief(self.plan)
         self._control_problem = ""
         self._surveyed, self._measurements = self._read_control()
         self._planned_lines = self._read_plan()
@@ -273,17 +275,17 @@ class MissionTriangulation:
             assert image is not None
             empty = LiveTriangulation(image, 0.0, self.settings)
             self.findings = findings_of(
-                empty, (), skipped=self.skipped, planned_lines=self._planned_lines,
+                live_ties(empty), (), skipped=self.skipped, planned_lines=self._planned_lines,
                 heights=self.heights, has_landed=self.has_landed,
             )  # fmt: skip
             return
-        self.drifts = drifts_of(self.live)
+        self.drifts = live_drifts(self.live)
         self.heights = self._check_heights()
         self.coverage = coverage_of(self.live)
         if self._surveyed is not None and self.frame is not None:
             self.residuals = residuals_of(self.live, self.frame, self._surveyed, self._measurements)
         found = findings_of(
-            self.live,
+            live_ties(self.live),
             self.drifts,
             skipped=self.skipped,
             planned_lines=self._planned_lines,
@@ -291,13 +293,6 @@ class MissionTriangulation:
             has_landed=self.has_landed,
         )
         self.findings = (*found, *control_findings(self.residuals, problem=self._control_problem))
-
-    def _read_relief(self) -> TerrainRelief | None:
-        try:
-            return relief_of(self.plan)
-        except (OSError, DaemonError, ValueError) as error:
-            self.heights = HeightModelCheck(problem=str(error))
-            return None
 
     def _read_control(self) -> tuple[SurveyedPoints | None, ImageMeasurements | None]:
         """Points with which the block is compared; what is wrong with a table is a finding."""
@@ -325,16 +320,4 @@ class MissionTriangulation:
         if self.relief is None or self.live is None or self.frame is None:
             return self.heights
         _, xyz, sigma = self.live.tied_points()
-        if not len(xyz):
-            return self.heights
-        step = max(1, len(xyz) // _HEIGHT_SAMPLES)
-        differences = []
-        for latitude, longitude, height in self.frame.to_geodetic(xyz[::step]):
-            place = self.relief.system.place(float(latitude), float(longitude), float(height))
-            model = self.relief.model.at(np.array([[place.east_m, place.north_m]]))
-            differences.append(place.height_m - float(model[0]))
-        known = np.array(differences)
-        known = known[np.isfinite(known)]
-        if not len(known):
-            return HeightModelCheck(problem="it does not cover the block")
-        return HeightModelCheck(float(np.median(known)), float(np.median(sigma[:, 2])))
+        return check_heights(self.relief, self.frame, xyz, sigma) or self.heights

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -74,7 +74,8 @@ class MatchingWork:
         return replace(self, threads=threads)
 
     def open(self) -> MatchingAction:
-        """Nothing is loaded before the first image."""
+        """Load the kernels by matching two small images."""
+        _match_noise(self.settings)
         return MatchingAction(self)
 
 
@@ -97,11 +98,16 @@ class MatchingAction:
         """
         work = self._work
         return match_image(
-            task.number, self._pixels, work.image, work.station_m, work.rotation, work.ground_m,
+            task.number, self.pixels, work.image, work.station_m, work.rotation, work.ground_m,
             work.settings,
         )  # fmt: skip
 
-    def _pixels(self, k: int) -> Picture:
+    def pixels(self, k: int) -> Picture:
+        """Pixels of an image, NaN without data.
+
+        Raises:
+            RasterError: the image cannot be read.
+        """
         if k in self._images:
             self._images.move_to_end(k)
             return self._images[k]
@@ -116,6 +122,15 @@ class MatchingAction:
         if len(self._images) > CACHED_IMAGES:
             self._images.popitem(last=False)
         return self._images[k]
+
+
+def _match_noise(settings: BlockMatching) -> None:
+    """Match two images of noise, so that kernels are loaded for the arguments of a block."""
+    image = VirtualImage(400, 300, 10.0, 10.0)
+    noise = np.random.default_rng(1).normal(8000.0, 500.0, (300, 400)).astype(np.float32)
+    station_m = np.array([[0.0, 0.0, 100.0], [0.2, 0.0, 100.0]])
+    rotation = np.tile(np.eye(3), (2, 1, 1))
+    match_image(0, lambda _k: noise, image, station_m, rotation, 0.0, settings)
 
 
 def match_mission_block(
@@ -133,16 +148,25 @@ def match_mission_block(
         TriangulationError: an image could not be matched, with the cause.
     """
     refuse_large_block(6 * len(block.names))
+    work = _work(block, settings)
+    done = compute(work, [BatchTask(k) for k in range(len(work.files))])
+    if done.failures:
+        causes = (f"{block.names[one.exposure]}: {one.cause}" for one in done.failures)
+        raise TriangulationError(f"{block.mission.path}: not matched: {'; '.join(causes)}")
+    return joined_matches([done.results[k] for k in range(len(work.files))])
+
+
+def image_loader(block: ImageBlock, settings: BlockMatching) -> Callable[[int], Picture]:
+    """Reads pixels of a block's images by index, NaN without data; keeps the latest dozen."""
+    return _work(block, settings).open().pixels
+
+
+def _work(block: ImageBlock, settings: BlockMatching) -> MatchingWork:
     files = [
         MatchedFile(eo.exposure, "pan" if eo.is_virtual else eo.cone, eo.is_virtual)
         for eo in block.oriented
     ]
     mission = Mission(block.mission.path.absolute(), block.mission.id)
-    work = MatchingWork(
+    return MatchingWork(
         mission, block.image, files, block.station_m, block.rotation, block.ground_m, settings
     )
-    done = compute(work, [BatchTask(k) for k in range(len(files))])
-    if done.failures:
-        causes = (f"{block.names[one.exposure]}: {one.cause}" for one in done.failures)
-        raise TriangulationError(f"{block.mission.path}: not matched: {'; '.join(causes)}")
-    return joined_matches([done.results[k] for k in range(len(files))])

@@ -71,7 +71,8 @@ def triangulation_of(
     rms_px = np.sqrt(np.mean((residual[tie] / pixel_mm) ** 2, axis=0))
     sigma_px = (network.image_points.sigma_mm[tie] / pixel_mm).mean(axis=0)
     return {
-        "exposures": len(block.names),
+        "exposures": len(network.stations.names),
+        "images": len(block.names),
         "lines": len(set(block.lines)),
         "gsd_m": block.gsd_m,
         "crs": block.crs,
@@ -257,3 +258,5 @@ def print_triangulation(console: Console, found: Mapping[str, Any]) -> None:
         console.print(table)
     else:
         console.print("No control and no check points: --points and --measured give them")
+    for one in found.get("findings", ()):
+        console.print(f"{one['name']}: {one['sentence']}", markup=False, highlight=False)

@@ -7,9 +7,10 @@ and the orientations in the requested coordinate system. Matching is in
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,13 +20,20 @@ from daemon.mission.exposure import Exposure
 from daemon.mission.exposure_batch import ExposureFailure, for_each_exposure
 from daemon.mission.layout import Mission
 from daemon.mission.store.level0 import check_tiff
-from daemon.orientation.exterior_orientation import ExteriorOrientation, sealed_exposures
+from daemon.onboard.triangulation.findings import LOST, NOT_PROCESSED
+from daemon.onboard.triangulation.measured_images import camera_temperature_c
+from daemon.orientation.exterior_orientation import (
+    ExteriorOrientation,
+    MissingOrientation,
+    sealed_exposures,
+)
 from daemon.orientation.local_frame import LocalFrame
 from daemon.orientation.navigation_sigmas import NavigationSigmas
 from daemon.orientation.orientation_inputs import read_orientation_inputs
-from daemon.postflight.adjustment.csv_tables import CsvTable, read_table
 from daemon.postflight.adjustment.project import CheckPoints, Project
 from daemon.postflight.adjustment.project_file import ProjectFile
+from daemon.postflight.triangulation.block_points import BlockPoints, no_block_points
+from daemon.postflight.triangulation.head_arrangement import HeadArrangement, arrangement_of
 from daemon.postflight.triangulation.stitching_of_exposures import stitching_patterns_of
 from processing.bundle.adjust import AdjustmentSettings, adjust
 from processing.bundle.flown_network import (
@@ -53,9 +61,6 @@ from processing.rig import Rig, VirtualImage, load_rig
 Array = NDArray[np.float64]
 
 TIE_SIGMA_PX = 0.03
-MEASURED_SIGMA_PX = 0.3
-GEODETIC = ("latitude_deg", "longitude_deg", "height_m")
-SIGMAS = ("sx_m", "sy_m", "sz_m")
 
 
 class TriangulationError(DaemonError, ValueError):
@@ -86,6 +91,8 @@ class ImageBlock:
     """Images of one geometry, stitched or of heads, with a start orientation in a local frame.
 
     `failures` are exposures whose record or images cannot be read; they are not in the block.
+    `skipped` are exposures without image, instant or orientation, with the reason. `temperature_c`
+    (n,) is that of the camera, NaN if unknown.
     """
 
     mission: Mission
@@ -98,16 +105,23 @@ class ImageBlock:
     rotation: Array
     ground_m: float
     failures: tuple[ExposureFailure, ...] = ()
+    skipped: Mapping[int, str] = field(default_factory=dict)
+    temperature_c: Array = field(default_factory=lambda: np.zeros(0))
 
     @property
     def names(self) -> tuple[str, ...]:
         return tuple(eo.name for eo in self.oriented)
 
     @property
-    def camera(self) -> str:
-        """Name of the images' common camera."""
+    def cameras(self) -> tuple[str, ...]:
+        """Names of the cameras: the stitched one, or one for each head."""
         heads = dict.fromkeys(eo.cone for eo in self.oriented if not eo.is_virtual)
-        return "-".join(heads) or "stitched"
+        return tuple(heads) or ("stitched",)
+
+    @property
+    def arrangement(self) -> HeadArrangement:
+        """Exposures, and the heads of the images."""
+        return arrangement_of(self.rig, self.oriented, self.station_m, self.rotation)
 
     @property
     def lines(self) -> tuple[str, ...]:
@@ -142,12 +156,14 @@ def block_of(
     image = _common_image(rig, heads)
     files = [f"{name}.tif" for name in heads or ("pan",)]
     read = sealed_exposures(mission)
-    candidates = {
-        number: exposure
-        for number, exposure in read.results.items()
-        if exposure.mark_gps_ns is not None
-        and all((mission.level2(number) / file).exists() for file in files)
-    }
+    skipped: dict[int, str] = {}
+    candidates = {}
+    for number, exposure in read.results.items():
+        reason = _why_not(mission, number, exposure, files)
+        if reason:
+            skipped[number] = reason
+        else:
+            candidates[number] = exposure
 
     def with_usable_images(number: int) -> Exposure:
         for file in files:
@@ -168,9 +184,14 @@ def block_of(
     inputs = read_orientation_inputs(
         mission, exposures, crs=crs, trajectory_file=trajectory_file, mount_file=mount_file
     )
-    oriented = [
-        eo for eo in inputs.oriented(exposures) if (eo.cone in heads if heads else eo.is_virtual)
-    ]
+    oriented = []
+    for exposure in exposures:
+        for eo in inputs.of(exposure):
+            if isinstance(eo, MissingOrientation):
+                skipped[eo.exposure] = eo.reason
+            elif eo.cone in heads if heads else eo.is_virtual:
+                oriented.append(eo)
+    skipped = {k: v for k, v in skipped.items() if k not in {eo.exposure for eo in oriented}}
     if len(oriented) < 2:
         raise TriangulationError(
             f"{mission.path}: {len(oriented)} exposures have an attitude; direct georeferencing is "
@@ -188,8 +209,20 @@ def block_of(
     )
     return ImageBlock(
         mission, rig, image, tuple(oriented), inputs.crs, frame, station, rotation,
-        inputs.ground_height_m, failures,
+        inputs.ground_height_m, failures, skipped,
+        np.array([camera_temperature_c(usable.results[eo.exposure]) for eo in oriented]),
     )  # fmt: skip
+
+
+def _why_not(mission: Mission, number: int, exposure: Exposure, files: Sequence[str]) -> str:
+    """Why an exposure takes no part; empty if it does."""
+    if exposure.state == "lost" or not exposure.frames:
+        return LOST
+    if exposure.mark_gps_ns is None:
+        return "no instant"
+    if not all((mission.level2(number) / file).exists() for file in files):
+        return NOT_PROCESSED
+    return ""
 
 
 def _common_image(rig: Rig, heads: Sequence[str]) -> VirtualImage:
@@ -218,22 +251,20 @@ def project_of(
     tied: BlockTiePoints,
     options: TriangulationSettings,
     *,
-    points_file: Path | None = None,
-    measured_file: Path | None = None,
+    surveyed: BlockPoints | None = None,
 ) -> Project:
     """Everything as an adjustment project in the local frame.
 
     Raises:
         TriangulationError: no tie points, or a set that the rig cannot have.
-        daemon.postflight.adjustment.csv_tables.ProjectError: control files with mistakes.
     """
     if not len(tied.image):
         raise TriangulationError(
             "no tie points were found: do the images overlap, and is the orientation right to a "
             "few pixels? Try --search with more pixels"
         )
-    surveyed = _surveyed(block, points_file, measured_file)
-    n, pitch = len(block.names), block.image.pitch_mm
+    surveyed = surveyed or no_block_points()
+    pitch = block.image.pitch_mm
     ties = tied.points
     names = (*(f"t{k}" for k in range(ties)), *surveyed.names)
     xyz = np.full((len(names), 3), np.nan)
@@ -245,26 +276,28 @@ def project_of(
     point = np.concatenate([tied.point, surveyed.point + ties])
     px = np.concatenate([tied.px, surveyed.px])
     spread = np.concatenate([np.full(len(tied.image), TIE_SIGMA_PX), surveyed.sigma_px]) * pitch
-    file = _file(block, options)
+    arrangement = block.arrangement
+    file = _file(block, arrangement, options)
     try:
-        camera = with_self_calibration(
-            CameraModel(block.camera, block.image.f_mm, pixel_mm=pitch),
-            options.parameters,
-            parts_of(block.rig) if options.parameters.startswith("sensors") else (),
-            master_cone=block.rig.master_cone,
-            interior=options.interior,
+        cameras = tuple(
+            with_self_calibration(
+                CameraModel(name, block.image.f_mm, pixel_mm=pitch),
+                options.parameters,
+                parts_of(block.rig) if options.parameters.startswith("sensors") else (),
+                master_cone=block.rig.master_cone,
+                interior=options.interior,
+            )
+            for name in block.cameras
         )
     except ValueError as error:
         raise TriangulationError(str(error)) from error
-    every = np.arange(n)
-    flown = _flown(block, options)
+    flown = _flown(block, arrangement, options)
+    exposure, head = arrangement.exposure, arrangement.head
     network = Network(
-        cameras=(camera,),
+        cameras=cameras,
         stations=flown.stations,
         attitudes=flown.attitudes,
-        images=Images(
-            block.names, every, every, np.zeros(n, np.int64), np.zeros(n, dtype=np.int64)
-        ),
+        images=Images(block.names, exposure, exposure, head, head),
         points=Points(names, xyz, sigma, np.zeros(len(names), bool)),
         image_points=ImagePoints(
             image, point, image_mm(block.image, px), np.stack([spread, spread], axis=1)
@@ -285,23 +318,28 @@ def project_of(
     return Project(file.name, file, network, settings, checks)
 
 
-def _flown(block: ImageBlock, options: TriangulationSettings) -> FlownExposures:
+def _flown(
+    block: ImageBlock, arrangement: HeadArrangement, options: TriangulationSettings
+) -> FlownExposures:
     """Observations and unknowns of navigation, as in flight."""
     names = tuple(dict.fromkeys(block.lines))
+    own = [block.oriented[k] for k in arrangement.first]
     lines = GnssLines(
         tuple(line or "line" for line in names),
-        np.array([names.index(line) for line in block.lines], dtype=np.int64),
-        np.array([eo.gps_ns - block.oriented[0].gps_ns for eo in block.oriented]) * 1e-9,
+        np.array([names.index(eo.line_id) for eo in own], dtype=np.int64),
+        np.array([eo.gps_ns - own[0].gps_ns for eo in own]) * 1e-9,
         options.drift,
     )
     sigmas = options.sigmas
     measured = MeasuredOrientations(
-        block.station_m,
-        block.rotation,
-        np.array([sigmas.of_position(eo) for eo in block.oriented]),
-        np.tile(sigmas.about_camera_rad, (len(block.names), 1)),
+        arrangement.position_m,
+        arrangement.rotation,
+        np.array([sigmas.of_position(eo) for eo in own]),
+        np.tile(sigmas.about_camera_rad, (len(own), 1)),
     )
-    return flown_exposures(block.names, measured, sigmas.prior, lines=lines)
+    return flown_exposures(
+        arrangement.names, measured, sigmas.prior, lines=lines, heads=arrangement.heads
+    )
 
 
 def weight_by_residuals(project: Project, ties: int, progress: Progress | None = None) -> Project:
@@ -334,69 +372,10 @@ def weight_by_residuals(project: Project, ties: int, progress: Progress | None =
     )
 
 
-@dataclass(frozen=True)
-class _Surveyed:
-    names: tuple[str, ...]
-    roles: tuple[str, ...]
-    xyz_m: Array
-    sigma_m: Array
-    image: NDArray[np.int64]
-    point: NDArray[np.int64]
-    px: Array
-    sigma_px: Array
-
-
-def _surveyed(block: ImageBlock, points_file: Path | None, measured_file: Path | None) -> _Surveyed:
-    none = np.zeros(0, np.int64)
-    if points_file is None or measured_file is None:
-        if points_file is not None or measured_file is not None:
-            raise TriangulationError(
-                "--points and --measured go together: where points are on the ground, and where "
-                "in the images"
-            )
-        empty = np.zeros((0, 3))
-        return _Surveyed((), (), empty, empty, none, none, np.zeros((0, 2)), np.zeros(0))
-    table = read_table(points_file, ("point", "role", *GEODETIC), SIGMAS)
-    names = table.names("point")
-    roles = table.text("role")
-    for role, line in zip(roles, table.lines, strict=True):
-        if role not in ("control", "check"):
-            table.add_problem(line, f"role is {role!r}; control or check is right")
-    place = np.array([table.numbers(c) for c in GEODETIC])
-    sigma = np.array([table.numbers(c, 0.02) for c in SIGMAS]).T.reshape(-1, 3)
-    seen = read_table(measured_file, ("image", "point", "column_px", "row_px"), ("sigma_px",))
-    image = _index(seen, "image", block.names)
-    point = _index(seen, "point", names)
-    px = np.array([seen.numbers("column_px"), seen.numbers("row_px")]).T.reshape(-1, 2)
-    spread = np.array(seen.numbers("sigma_px", MEASURED_SIGMA_PX))
-    problems = [*table.problems, *seen.problems]
-    if problems or not np.isfinite(place).all() or not np.isfinite(px).all():
-        raise TriangulationError("; ".join(problems) or "an empty cell where a number is needed")
-    return _Surveyed(
-        tuple(names),
-        tuple(roles),
-        block.frame.from_geodetic(*place),
-        sigma,
-        image,
-        point,
-        px,
-        spread,
-    )
-
-
-def _index(table: CsvTable, column: str, names: Sequence[str]) -> NDArray[np.int64]:
-    at = {name: k for k, name in enumerate(names)}
-    found = []
-    for name, line in zip(table.text(column), table.lines, strict=True):
-        if name not in at:
-            table.add_problem(line, f"{column} {name!r} is not there")
-        found.append(at.get(name, 0))
-    return np.array(found, dtype=np.int64)
-
-
-def _file(block: ImageBlock, options: TriangulationSettings) -> ProjectFile:
-    camera = {
-        "name": block.camera,
+def _file(
+    block: ImageBlock, arrangement: HeadArrangement, options: TriangulationSettings
+) -> ProjectFile:
+    camera: dict[str, Any] = {
         "f_mm": block.image.f_mm,
         "pixel_um": block.image.pitch_um,
         "width_px": block.image.width_px,
@@ -416,15 +395,16 @@ def _file(block: ImageBlock, options: TriangulationSettings) -> ProjectFile:
                 "gnss": options.drift,
                 "image_sigma_um": TIE_SIGMA_PX * block.image.pitch_um,
             },
-            "camera": [camera],
+            "camera": [{"name": name} | camera for name in block.cameras],
             "head": [
                 {
-                    "name": MOUNTING,
+                    "name": name,
                     "rotation": "free",
                     "offset": "free",
                     "rotation_sigma_deg": options.sigmas.boresight_mdeg * 1e-3,
                     "offset_sigma_m": options.sigmas.lever_arm_m,
                 }
+                for name in [place.name for place in arrangement.heads] or [MOUNTING]
             ],
         }
     )

@@ -41,17 +41,24 @@ from daemon.postflight.replay.flight_replay import ReplayResult
 from daemon.postflight.triangulation.matching_work import match_mission_block
 from daemon.postflight.triangulation.triangulation import (
     TriangulationError,
+    TriangulationSettings,
     block_of,
+    project_of,
+    weight_by_residuals,
 )
+from processing.bundle.adjust import adjust
+from processing.bundle.camera_orientations import camera_orientations
+from processing.bundle.initial_values import completed
+from processing.geometry.rotation import vectors_from_rotations
 from processing.matching.block_matching import BlockMatching
 from processing.rig import load_rig, shipped_rigs
 from sim_hw.processes.exposures import EPOCH_GPS_NS, FIRST_AFTER_S, write_exposures
 from sim_hw.world import true_camera
 from sim_hw.world.world import World, WorldSettings
+from tests.daemon.orientation.oblique_ground import CRS, hill, seen_pixels
 
 RUN = CliRunner()
 EXPOSURES, LINES = 2, 2
-CRS = "EPSG:32633"
 
 
 @pytest.fixture(scope="module")
@@ -253,20 +260,25 @@ def test_obliques_of_the_same_direction_are_tied_where_both_see_the_same_ground(
     size = np.array(errors)
     assert float(np.sqrt(np.mean(size**2))) < 0.08
     assert float(np.abs(size).max()) < 0.5
+    project = project_of(block, tied, TriangulationSettings())
+    network = project.network
+    assert len(network.stations.names) == EXPOSURES * LINES
+    assert [head.name for head in network.heads] == [camera.name for camera in network.cameras]
+    done = adjust(completed(weight_by_residuals(project, tied.points).network), project.settings)
+    adjusted = camera_orientations(done)
+    between = [
+        a.T @ b for a, b in zip(adjusted.rotation[::2], adjusted.rotation[1::2], strict=True)
+    ]
+    true = rotations[0].T @ rotations[1]
+    assert block.oriented[0].cone == "5" and block.oriented[1].cone == "8"
+    assert np.abs(np.array(between) - between[0]).max() < 1e-9, "one rigid body"
+    sigma = np.sqrt(done.cofactor.diagonal()[done.layout.head_rotation].max()) * done.sigma0
+    off = vectors_from_rotations((true.T @ between[0])[None])[0]
+    assert np.abs(off).max() < 4.5 * np.sqrt(2.0) * sigma < 1e-3
     with pytest.raises(TriangulationError, match="same pixels and principal distance"):
         block_of(mission, crs=CRS, trajectory_file=trajectory, heads=("5", "nadir"))
     with pytest.raises(TriangulationError, match="--head"):
         block_of(mission, crs=CRS, trajectory_file=trajectory)
-
-
-def hill(path: Path, here: tuple[float, float, float], top_m: float) -> Path:
-    """A plateau so high above what was planned, as an ESRI ASCII grid."""
-    to_grid = pyproj.Transformer.from_crs("EPSG:4979", CRS, always_xy=True)
-    east, north, height = to_grid.transform(here[1], here[0], here[2])
-    row = " ".join([f"{height + top_m:.3f}"] * 80)
-    corner = f"xllcorner {east - 2000}\nyllcorner {north - 2000}\ncellsize 50\n"
-    path.write_text(f"ncols 80\nnrows 80\n{corner}" + "\n".join([row] * 80))
-    return path
 
 
 def _oriented(folder: Path) -> dict[str, dict]:
@@ -451,7 +463,9 @@ def test_intersected_points_err_as_their_sigmas_say(flown, tmp_path: Path) -> No
             ray = rotation @ np.array([*xy, -cone.lens.f_mm])
             ground = world.terrain.intersect(true_camera.projection_centre_m(cone, pose), ray)
             seen = [
-                row for row in (_seen(world, rig, n, p, ground) for n, p in poses.items()) if row
+                row
+                for row in (seen_pixels(world, rig, n, p, ground) for n, p in poses.items())
+                if row
             ]
             if len({row[0][:6] for row in seen}) < 2:
                 continue
@@ -478,16 +492,3 @@ def test_intersected_points_err_as_their_sigmas_say(flown, tmp_path: Path) -> No
         assert (np.array(p["of_image_m"]) < np.array(p["sigma_m"])).all()
     assert np.abs(ratios).max() < 4.5
     assert 0.2 < np.mean(np.square(ratios)) < 3.0
-
-
-def _seen(world, rig, name, pose, ground):
-    """Image, column and row in strict perspective where the true head sees a ground point."""
-    cone = rig.cone(name.split("_")[1])
-    rotation = (
-        pose.enu_from_body @ true_camera.BODY_FROM_CAMERA @ world.camera.master_from_cone(cone)
-    )
-    seen = (ground - true_camera.projection_centre_m(cone, pose)) @ rotation
-    x, y = -cone.lens.f_mm * seen[:2] / seen[2] / 7.2e-3
-    column, row = x + (416 - 1) / 2, (278 - 1) / 2 - y
-    inside = seen[2] < 0 and 3 < column < 412 and 3 < row < 274
-    return (name, column, row) if inside else None

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pyproj
 import pytest
+import tifffile
 from typer.testing import CliRunner
 
 from daemon.cli import app
@@ -16,6 +18,10 @@ from daemon.mission.layout import Mission, MissionError
 from daemon.mission.store.level0 import tiff_parts
 from daemon.orientation.local_frame import LocalFrame
 from daemon.postflight.adjustment.project import read_project
+from daemon.postflight.triangulation.block_points import read_block_points
+from daemon.postflight.triangulation.point_transfer import transferred
+from daemon.postflight.triangulation.triangulation import block_of
+from processing.matching.block_matching import BlockMatching
 from processing.rig import shipped_rigs
 from sim_hw.processes.exposures import EPOCH_GPS_NS, FIRST_AFTER_S
 from sim_hw.world import true_camera
@@ -28,6 +34,7 @@ from sim_hw.world.world import World, WorldSettings
 
 RUN = CliRunner()
 EACH, LINES = 4, 2
+DRIFT_DEG_H = 3.0
 
 
 @pytest.fixture(scope="module")
@@ -110,6 +117,93 @@ def test_check_points_err_as_predicted_and_matching_by_hundredths_of_a_pixel(rep
     for rms, predicted in zip(t["checks"]["rms_m"], t["checks"]["predicted_m"], strict=True):
         assert rms < 2.0 * predicted
     assert t["systematic_most_um"] < 1.0
+
+
+def test_a_point_measured_in_one_image_is_found_in_the_others(flown) -> None:
+    folder = flown[0]
+    block = block_of(Mission.open(folder / "mission"), trajectory_file=folder / "trajectory.csv")
+    tables = (folder / "surveyed/points.csv", folder / "surveyed/measured.csv")
+    every = read_block_points(block.names, block.frame, *tables)
+    _, first = np.unique(every.point, return_index=True)
+    alone = replace(
+        every, image=every.image[first], point=every.point[first], px=every.px[first],
+        sigma_px=every.sigma_px[first],
+    )  # fmt: skip
+    found = transferred(block, alone, BlockMatching())
+    at = {(i, p): px for i, p, px in zip(every.image, every.point, every.px, strict=True)}
+    new = slice(len(first), None)
+    pairs = list(zip(found.image[new], found.point[new], found.px[new], strict=True))
+    # Each was measured by hand with 0.05 px, in all images that show it well inside.
+    errors = np.array([px - at[i, p] for i, p, px in pairs if (i, p) in at])
+    assert len(errors) > 0.6 * (len(every.point) - len(first))
+    assert np.sqrt(np.mean(errors**2)) < 0.15 and np.abs(errors).max() < 0.6
+    assert len(set(zip(found.image, found.point, strict=True))) == len(found.image)
+    has_more = np.isin(np.arange(len(every.names)), found.point[new])
+    expected_m = np.hypot(0.02, 0.05 * block.gsd_m)
+    assert found.sigma_m[has_more, :2] == pytest.approx(expected_m, rel=0.05)
+    assert found.sigma_m[:, 2] == pytest.approx(every.sigma_m[:, 2])
+
+
+def test_nothing_is_wrong_with_a_good_block_and_its_drifts_are_small(report) -> None:
+    t = report["triangulation"]
+    assert t["findings"] == []
+    drifts = {one["name"]: one for one in t["drifts"]}
+    assert abs(drifts["time offset"]["value"]) < 4.0 * drifts["time offset"]["sigma"]
+    assert "time offset per hour" in drifts
+    # One flying height, and no probe: neither is estimated.
+    assert not {n for n in drifts if n.startswith("principal") or n.endswith("per K")}
+
+
+def test_a_strip_alone_a_failed_height_model_and_a_cut_flight_are_named(
+    flown, tmp_path: Path
+) -> None:
+    mission = tmp_path / "mission"
+    shutil.copytree(flown[0] / "mission", mission)
+    for number in range(EACH + 1, 2 * EACH + 1):
+        shutil.rmtree(mission / f"L0/{number:06d}")
+    (mission / f"L2/{EACH:06d}/pan.tif").unlink()
+    record = mission / f"L0/{EACH - 1:06d}/exposure.json"
+    record.write_text(json.dumps(json.loads(record.read_text()) | {"mark_gps_ns": None}))
+    (mission / "model.asc").write_text("no grid")
+    text = (mission / "service.toml").read_text()
+    (mission / "service.toml").write_text(
+        text + 'elevation = "model.asc"\nelevation_crs = "EPSG:32633"\n'
+    )
+    done = RUN.invoke(
+        app,
+        ["triangulate", str(mission), "--trajectory", str(flown[0] / "trajectory.csv"), "--json"],
+    )
+    assert done.exit_code == 0, done.output + str(done.exception)
+    found = {one["name"]: one for one in json.loads(done.stdout)["triangulation"]["findings"]}
+    assert found["NO_IMAGE"]["exposures"] == [EACH] and found["NO_GNSS"]["exposures"] == [EACH - 1]
+    assert "not processed" in found["NO_IMAGE"]["sentence"]
+    assert "lever arm along the camera's x" in found["SINGLE_STRIP"]["sentence"]
+    assert "model.asc" in found["HEIGHT_MODEL_FAILED"]["sentence"]
+
+
+def test_a_drifting_inertial_unit_and_water_are_named_after_landing(flown, tmp_path: Path) -> None:
+    mission = tmp_path / "mission"
+    shutil.copytree(flown[0] / "mission", mission)
+    trajectory = tmp_path / "trajectory.csv"
+    lines = (flown[0] / "trajectory.csv").read_text().splitlines()
+    rows = [line.split(",") for line in lines[1:]]
+    first = int(rows[0][0])
+    for row in rows:
+        row[6] = repr(float(row[6]) + DRIFT_DEG_H * (int(row[0]) - first) * 1e-9 / 3600.0)
+    trajectory.write_text("\n".join([lines[0], *(",".join(row) for row in rows)]) + "\n")
+    path = mission / "L2/000002/pan.tif"
+    sea = np.random.default_rng(1).normal(3000.0, 20.0, tifffile.imread(path).shape)
+    parts = tiff_parts([sea.astype(np.uint16) & 0xFFFE], {"bands": ["pan"]})
+    path.write_bytes(b"".join(bytes(p) for p in parts))
+    done = RUN.invoke(app, ["triangulate", str(mission), "--trajectory", str(trajectory), "--json"])
+    assert done.exit_code == 0, done.output + str(done.exception)
+    t = json.loads(done.stdout)["triangulation"]
+    found = {one["name"]: one for one in t["findings"]}
+    assert found["UNTIED_EXPOSURES"]["exposures"] == [2]
+    assert "ATTITUDE_DRIFT" in found
+    drifts = {one["name"]: one for one in t["drifts"]}
+    heading = abs(drifts["attitude about the camera's z per hour"]["value"])
+    assert heading == pytest.approx(1e3 * DRIFT_DEG_H, rel=0.2)
 
 
 def test_adjusted_orientations_are_those_of_the_true_camera(flown, report) -> None:
