@@ -93,6 +93,38 @@ def test_images_of_two_cameras_keep_an_interior_orientation_each() -> None:
     assert ratio == pytest.approx(1.5, rel=2e-3)
 
 
+def test_hovering_at_a_place_does_not_keep_a_block_from_being_oriented() -> None:
+    """Seven images of one place have more common points than any pair with a base."""
+    tracks, place, _ = scene(12.0, noise_px=0.0)
+    own = tracks.image == 1
+    random = np.random.default_rng(6)
+    image = np.concatenate([tracks.image, *(np.full(own.sum(), 8 + k) for k in range(6))])
+    point = np.concatenate([tracks.point, np.tile(tracks.point[own], 6)])
+    xy_mm = np.concatenate([tracks.xy_mm, np.tile(tracks.xy_mm[own], (6, 1))])
+    xy_mm = xy_mm + random.normal(0.0, 0.4 * PIXEL, xy_mm.shape)
+    found = orient_photographs([camera()], PhotographTracks(image, point, xy_mm, 14, tracks.points))
+    assert found is not None and found.oriented.all()
+    places = np.concatenate([place, np.repeat(place[1:2], 6, axis=0)])
+    assert np.abs(fit_positions(found.station, places).residual_m).max() < 0.6
+
+
+def test_the_larger_of_two_unconnected_groups_is_oriented() -> None:
+    """The first two images have the most common points, and nothing in common with the others."""
+    tracks, place, _ = scene(12.0)
+    apart = tracks.image < 2
+    count = np.bincount(tracks.point[apart])
+    keep = ~apart | (np.append(count, np.zeros(tracks.points, int))[tracks.point] == 2)
+    point = np.where(apart, tracks.point + tracks.points, tracks.point)[keep]
+    found = orient_photographs(
+        [camera()],
+        PhotographTracks(tracks.image[keep], point, tracks.xy_mm[keep], 8, 2 * tracks.points),
+    )
+    assert found is not None
+    assert np.flatnonzero(found.oriented).tolist() == [2, 3, 4, 5, 6, 7]
+    own = found.oriented
+    assert np.abs(fit_positions(found.station[own], place[own]).residual_m).max() < 0.6
+
+
 def test_unrelated_images_are_left_without_orientation() -> None:
     tracks, place, _ = scene(12.0)
     random = np.random.default_rng(3)
