@@ -132,7 +132,7 @@ def _residuals(fits: Sequence[_Fit], exposure: Indices, place: Complex) -> tuple
     a, b = (exposure[[getattr(f, end) for f in fits]] for end in "ab")
     turn, shift = (np.array([getattr(f, name) for f in fits]) for name in ("turn", "shift"))
     weight = np.sqrt([float(f.weight) for f in fits])
-    inverse = _turned(len(place), a, b, turn, weight)
+    inverse = _turned(place, a, b, turn, weight)
     size = np.abs(inverse)
     known = np.minimum(size[a], size[b]) > _KNOWN_SHARE * np.median(size)
     with np.errstate(all="ignore"):
@@ -143,23 +143,46 @@ def _residuals(fits: Sequence[_Fit], exposure: Indices, place: Complex) -> tuple
     return np.where(known, shift_away, 0.0), np.where(known, turn_away, 0.0)
 
 
-def _turned(count: int, a: Indices, b: Indices, turn: Complex, weight: Array) -> Complex:
-    """Inverse heights times headings, of unit length together, by least absolute residuals."""
-    rows = np.flatnonzero(a != b)
+def _turned(place: Complex, a: Indices, b: Indices, turn: Complex, weight: Array) -> Complex:
+    """Inverse heights times headings, of unit length together, by least absolute residuals.
+
+    They begin with the nearest exposures, which overlap: least squares of all would begin between
+    what is right and what pictures that recur turned agree on.
+    """
+    count, rows = len(place), np.flatnonzero(a != b)
     found = np.zeros(count, np.complex128)
     if not len(rows):
         return found
+    found = _along_nearest(place, a[rows], b[rows], turn[rows], weight[rows])
     design = np.zeros((len(rows), count), np.complex128)
     design[np.arange(len(rows)), a[rows]] = 1.0
     design[np.arange(len(rows)), b[rows]] = -turn[rows]
-    own = weight[rows]
     for _ in range(_ROUNDS):
+        size = np.maximum(np.abs(found[a[rows]]), _KNOWN_SHARE / math.sqrt(count))
+        own = weight[rows] / np.maximum(np.abs(design @ found) / size, _TURN_SIGMA)
         normal = (design.conj().T * own) @ design
         met = np.flatnonzero(normal.diagonal().real > 0.0)
         found[met] = np.linalg.eigh(normal[np.ix_(met, met)])[1][:, 0]
-        size = np.maximum(np.abs(found[a[rows]]), _KNOWN_SHARE / math.sqrt(count))
-        own = weight[rows] / np.maximum(np.abs(design @ found) / size, _TURN_SIGMA)
     return found
+
+
+def _along_nearest(place: Complex, a: Indices, b: Indices, turn: Complex, weight: Array) -> Complex:
+    """Turns carried from exposure to exposure along the pairs that lie closest together."""
+    found = np.zeros(len(place), np.complex128)
+    parent = np.arange(len(place))
+    order = np.lexsort([-weight, np.abs(place[a] - place[b])])
+    members = {k: [k] for k in range(len(place))}
+    found[np.unique([a, b])] = 1.0
+    for k in order:
+        into, other = parent[a[k]], parent[b[k]]
+        if into == other:
+            continue
+        # v_a = turn v_b: what hangs on b is turned and scaled to what hangs on a.
+        moved = members.pop(other)
+        found[moved] *= found[a[k]] / (turn[k] * found[b[k]])
+        parent[moved] = into
+        members[into] += moved
+    return found / max(float(np.linalg.norm(found)), _RIDGE)
 
 
 def _shifted(

@@ -37,20 +37,30 @@ def matched(images: FlightImages) -> tuple[list[Array], Matches]:
 
 
 def planted(
-    px: list[Array], true: Matches, count: int, random: np.random.Generator
+    px: list[Array],
+    true: Matches,
+    count: int,
+    random: np.random.Generator,
+    *,
+    points: int = 80,
+    quarters: int | None = None,
 ) -> tuple[list[Array], Matches]:
-    """Matches of one patch that lies in two images, turned by a multiple of 90 degrees."""
+    """Matches of one patch that lies in two images, turned by a multiple of 90 degrees.
+
+    The multiple is random for each pair, or `quarters` for all.
+    """
     px = [one.copy() for one in px]
     pairs = [p for p in combinations(range(len(px)), 2) if p not in true]
     wrong: Matches = {}
     for k in random.permutation(len(pairs))[:count]:
         a, b = pairs[int(k)]
-        patch = random.uniform(0.0, PATCH_PX, (80, 2))
+        patch = random.uniform(0.0, PATCH_PX, (points, 2))
         place = random.uniform(0.0, (600.0, 300.0), (2, 2))
         turned = patch - PATCH_PX / 2
-        for _ in range(int(random.integers(4))):
+        for _ in range(int(random.integers(4)) if quarters is None else quarters):
             turned = turned @ np.array([[0.0, 1.0], [-1.0, 0.0]])
-        wrong[a, b] = np.column_stack([np.arange(80) + len(px[a]), np.arange(80) + len(px[b])])
+        rows = np.arange(points)
+        wrong[a, b] = np.column_stack([rows + len(px[a]), rows + len(px[b])])
         px[a] = np.concatenate([px[a], patch + place[0]])
         px[b] = np.concatenate([px[b], turned + PATCH_PX / 2 + place[1]])
     return px, wrong
@@ -71,6 +81,21 @@ def test_planted_pairs_are_found_and_true_ones_stay(roll_deg: float) -> None:
         inclined.cones, images.head, images.exposure, images.position_m, px, {**true, **wrong}
     )
     assert not found & true.keys()
+    assert len(found & wrong.keys()) > 0.9 * len(wrong)
+
+
+@pytest.mark.parametrize("quarters", range(4))
+def test_planted_pairs_that_agree_on_one_turn_do_not_turn_part_of_the_flight(quarters: int) -> None:
+    """As in a mosaic of a few pictures, whose matches are stronger than the true ones."""
+    images = flown(true_rig(RIG, 3), FlightPlan(LINES), 5)
+    px, true = matched(images)
+    random = np.random.default_rng(7)
+    count = int(0.3 * len(true))
+    px, wrong = planted(px, true, count, random, points=200, quarters=quarters)
+    found = contradicting_pairs(
+        RIG.cones, images.head, images.exposure, images.position_m, px, {**true, **wrong}
+    )
+    assert len(found & true.keys()) < 0.1 * len(true)
     assert len(found & wrong.keys()) > 0.9 * len(wrong)
 
 
