@@ -51,7 +51,7 @@ def spread_defects(
     row, column = np.divmod(spoilt[np.diff(spoilt, prepend=-1) > 0], width)
     mask = np.zeros((height, -(-width // 8)), np.uint8)
     np.bitwise_or.at(mask, (row, column // 8), np.uint8(1) << (column % 8).astype(np.uint8))
-    return mask, np.column_stack([row, column]).astype(np.int32)
+    return mask, np.stack([row, column]).astype(np.int32).T
 
 
 @compiled_kernel(inline="always")
