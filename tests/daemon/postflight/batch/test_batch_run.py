@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -13,7 +17,7 @@ from daemon.postflight.batch.capacity import plan_processes
 from daemon.postflight.batch.executor import BatchExecutor, BatchTask
 from daemon.postflight.batch.in_process import InProcessExecutor
 from daemon.postflight.batch.local_processes import LocalProcessExecutor
-from tests.daemon.postflight.batch.toy_work import ToyWork, attempts_of
+from tests.daemon.postflight.batch.toy_work import ToyAction, ToyWork, attempts_of
 
 EXECUTORS: dict[str, Callable[[], BatchExecutor]] = {
     "in process": lambda: InProcessExecutor(2),
@@ -115,3 +119,39 @@ def test_processes_are_limited_by_cores_memory_and_exposures(
         2_000_000_000, tasks, cores=cores, available_nbytes=available_nbytes, threads=threads
     )
     assert (plan.processes, plan.threads) == expected
+
+
+KERNEL = """
+from numba import njit
+
+@njit(cache=True)
+def doubled(x):
+    return 2.0 * x
+"""
+
+
+@dataclass(frozen=True)
+class CompilingWork(ToyWork):
+    """Calls a kernel when it is opened, and notes which process did."""
+
+    def open(self) -> ToyAction:
+        sys.path.insert(0, str(self.attempts))
+        module = import_module("kernel_of_a_test")
+        assert module.doubled(1.5) == 3.0
+        with (self.attempts / "opened").open("a") as opened:
+            opened.write(f"{os.getpid()}\n")
+        return super().open()
+
+
+def test_a_process_that_compiled_kernels_computes_nothing(tmp_path: Path) -> None:
+    (tmp_path / "kernel_of_a_test.py").write_text(KERNEL)
+    executor = LocalProcessExecutor(1)
+    executor.start(CompilingWork(tmp_path))
+    first, second = (int(line) for line in (tmp_path / "opened").read_text().split())
+    assert first != second and executor.pids == (second,)
+    executor.close(5.0)
+    executor = LocalProcessExecutor(1)
+    executor.start(CompilingWork(tmp_path))
+    assert executor.pids == (int((tmp_path / "opened").read_text().split()[-1]),)
+    assert len((tmp_path / "opened").read_text().split()) == 3
+    executor.close(5.0)
