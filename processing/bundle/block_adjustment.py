@@ -7,7 +7,7 @@ estimated afterwards from the same equations (`added_parameters`).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -118,7 +118,8 @@ def adjust_images(
         ties: image points; points are numbered by the rows of `xyz_m`.
         xyz_m: (p, 3) starting values; points without an image point are ignored.
         prior: of the mounting; None holds it.
-        reject_beyond: standardised residual beyond which an image point is left out.
+        reject_beyond: standardised residual beyond which an observation is left out; with a sigma0
+            below one, in standard deviations as given.
         rounds: adjustments that may leave something out.
         start: stations (n, 3) and rotations (n, 3, 3) to begin with; None: as measured.
 
@@ -153,7 +154,11 @@ def adjust_images(
         gnss=flown.gnss,
         measured_attitudes=flown.measured_attitudes,
     )  # fmt: skip
-    result = adjust(network, AdjustmentSettings(reject_beyond=reject_beyond, max_rounds=rounds))
+    settings = AdjustmentSettings(reject_beyond=reject_beyond, max_rounds=rounds)
+    result = adjust(network, settings)
+    if result.sigma0 < 1.0 and result.excluded.others:
+        # Measured orientations keep their standard deviations where image points fit better.
+        result = adjust(network, replace(settings, reject_beyond=reject_beyond / result.sigma0))
     return _of(result, points, prior)
 
 
