@@ -45,6 +45,7 @@ from processing.rig import Rig
 Array = NDArray[np.float64]
 
 TIE_SIGMA_PX: Final = 0.7
+_ROLL_MAX_DEG: Final = 1.0
 ITERATIONS_MAX: Final = 300
 """Blocks of few lines without control come to rest slowly."""
 EXIF_LINE: Final = "EXIF"
@@ -291,6 +292,7 @@ def photographs_section(
         "height_per_percent_m": 0.01 * height_m,
         "position_shift_m": [float(v) for v in result.state.shift[0]] if len(gnss.lines) else None,
         "position_rms_m": [float(v) for v in np.sqrt(np.mean(away**2, axis=0))],
+        "roll_sigma_deg": roll_sigma_deg(gnss.position_m, float(np.sqrt(np.mean(away[:, 2] ** 2)))),
         "control_points": controls,
         "control_not_measured": unmeasured(control),
         "control_rejected": [
@@ -354,6 +356,12 @@ def photograph_cautions(section: Mapping[str, Any]) -> list[str]:
             "stated standard deviations hold for these parameters only. Lines across, two heights "
             "or control points determine it"
         )
+    if section["roll_sigma_deg"] > _ROLL_MAX_DEG and section["control_points"] < 3:
+        found.append(
+            f"positions of EXIF are nearly on one line: they fix the roll of the block about it to "
+            f"{section['roll_sigma_deg']:.1f} degrees only, so that the ground may slope by as "
+            "much. Fly a second line or give three control points (--points)"
+        )
     for camera in section["cameras"]:
         found += _camera_cautions(camera, is_only=len(section["cameras"]) == 1)
     return found
@@ -384,6 +392,25 @@ def _camera_cautions(section: Mapping[str, Any], *, is_only: bool) -> list[str]:
             f"({section['f_exif_px']:.0f} px to {section['f_px']:.0f} px)"
         )
     return found
+
+
+def roll_sigma_deg(position_m: Array, height_rms_m: float) -> float:
+    """How well heights of positions fix the roll of a block about its main direction.
+
+    Args:
+        position_m: shape (n, 3).
+        height_rms_m: of their heights against the block; at least 1 m is taken.
+
+    Returns:
+        Standard deviation, degrees; 90 where they fix nothing.
+
+    Example:
+        >>> line = np.array([[0.0, 0.0, 0.0], [50.0, 10.0, 0.0], [100.0, 0.0, 0.0]])
+        >>> round(roll_sigma_deg(line, 2.0), 1)
+        13.8
+    """
+    across = np.linalg.svd(position_m[:, :2] - position_m[:, :2].mean(axis=0), compute_uv=False)
+    return float(np.degrees(np.arctan2(max(height_rms_m, 1.0), across[1])))
 
 
 def f_and_ground_height(result: Adjustment) -> tuple[float, float]:

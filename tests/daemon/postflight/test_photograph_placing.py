@@ -7,6 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from daemon.postflight.triangulation.photograph_block import _placed
+from daemon.postflight.triangulation.photograph_project import roll_sigma_deg
 from daemon.postflight.triangulation.triangulation import TriangulationError
 from processing.bundle.incremental_orientation import OrientedBlock
 from processing.geometry.rotation import rotation_matrix
@@ -52,6 +53,20 @@ def test_photographs_without_a_position_are_placed_with_the_others() -> None:
     position[[2, 5]] = np.nan
     placed, wrong = _placed(own, position)
     assert np.abs(placed.station[[2, 5]] - truth).max() < 5.0 and not wrong.any()
+
+
+def test_a_single_line_hardly_fixes_the_roll() -> None:
+    """Against the mean square of the roll of lines fitted to heights with errors of 2 m."""
+    random = np.random.default_rng(4)
+    line = np.column_stack([20.0 * np.arange(12), random.normal(0.0, 5.0, 12), np.zeros(12)])
+    design = np.column_stack([line[:, :2], np.ones(12)])
+    slopes = [
+        np.linalg.lstsq(design, random.normal(0.0, 2.0, 12), rcond=None)[0][1] for _ in range(2000)
+    ]
+    expected = np.degrees(np.sqrt(np.mean(np.square(slopes))))
+    assert roll_sigma_deg(line, 2.0) == pytest.approx(expected, rel=0.1)
+    two = np.concatenate([line, line + np.array([0.0, 60.0, 0.0])])
+    assert roll_sigma_deg(two, 2.0) < 1.0 < roll_sigma_deg(line, 2.0)
 
 
 def test_positions_of_other_photographs_are_refused() -> None:
