@@ -21,7 +21,9 @@ CATALOG: Final = PAGE / "messages" / "en" / "server.json"
 PREFIX: Final = "server."
 SENTENCE_MAX: Final = 2000
 """Characters; a longer sentence is shown as it is."""
-DEPTH_MAX: Final = 6
+DEPTH_MAX: Final = 4
+LINES_MAX: Final = 16
+"""Further lines of a sentence; they count as parts of it, not as depth."""
 LISTS: Final = ("missing", "problems", "reasons", "notes", "recovery")
 """Keys of lists of sentences."""
 FURTHER: Final = ("poweroff",)
@@ -191,7 +193,9 @@ def _match(sentence: str, depth: int) -> Message | None:
         values = template.match(sentence)
         if values is None:
             continue
-        parameters = {name: _parameter(value, depth + 1) for name, value in values.items()}
+        is_lines = "\n" in template.literals and sentence.count("\n") <= LINES_MAX
+        below = depth if is_lines else depth + 1
+        parameters = {name: _parameter(value, below) for name, value in values.items()}
         has_meaning = any(not isinstance(one, str) for one in parameters.values())
         if template.is_frame and not has_meaning:
             continue

@@ -10,6 +10,7 @@ import pytest
 from daemon.onboard.monitoring.server_messages import (
     CATALOG,
     NUMBERS,
+    SENTENCE_MAX,
     english,
     message_of,
     with_messages,
@@ -116,6 +117,20 @@ def test_the_records_of_the_api_have_messages_next_to_their_sentences() -> None:
 def test_a_long_sentence_of_a_device_costs_no_time() -> None:
     """Matching is linear: what a device sends cannot hold up the page."""
     for text in ("; ".join(["a (b"] * 400), "the " * 500, ": " * 900, "(" * 1900, "7 m of " * 250):
+        assert message_of(text) is None or english(message_of(text) or {}) == text
+
+
+def test_every_line_of_a_sentence_is_translated_and_many_lines_are_no_danger() -> None:
+    line = (
+        "SU07: features.A = 1 is refused (A is 0 and read-only); choose a value that the head has"
+    )
+    for count in (2, 10, 300):
+        text = "\n".join([line] * count)[:SENTENCE_MAX]
+        message = message_of(text)
+        assert message is not None and english(message) == text
+        codes = list(codes_of(message))
+        assert count == 300 or codes.count("device.choose_value") == count
+    for text in ("a\n" * 900, "SU07: it is lost\n" * 100, "\n" * 1900):
         assert message_of(text) is None or english(message_of(text) or {}) == text
 
 
