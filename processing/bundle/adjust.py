@@ -107,7 +107,7 @@ class AdjustmentSettings:
     free_datum: FreeDatum = "unknowns"
     datum_names: tuple[str, ...] = ()
     retained: tuple[str, ...] = ()
-    dense_columns: int = 6_000
+    dense_columns: int = 2_000
 
     @property
     def is_snooping(self) -> bool:
