@@ -1,8 +1,8 @@
 """Gain of a head: which feature it is, its unit, and its value for a gain in dB.
 
 The standard gives the gain no unit. It is taken as dB or as a factor only where the description
-states it, by its unit or its text; otherwise the head keeps its lowest gain, which is recorded as of
-unknown unit.
+states it, by its unit or its text; otherwise the head keeps its lowest gain, which is recorded as
+of unknown unit.
 
 Source: GenICam SFNC 2.7, Gain (unit "-"); names before SFNC 2 from the descriptions of the heads.
 """
