@@ -19,7 +19,7 @@ from processing.geometry.placement import SensorPlacement, raw_from_vip_mm, vip_
 from processing.image.compiled_kernel import compiled_kernel
 from processing.image.line_means import BUNDLE_PX, LineMeans
 from processing.quality.figures.image import BlockFigures
-from processing.quality.frame_rectangles import Side, changed_rectangles
+from processing.quality.frame_rectangles import Side, changed_rectangles, sharp_step
 from processing.quality.ground_steps import (
     MAX_SHARED,
     SAMPLES,
@@ -329,6 +329,28 @@ def _isolated(edges: Iterable[_Edge], every: Sequence[_Edge], reach_px: float) -
             yield edge
 
 
+def _shows_elsewhere(
+    view: GroundView, edge: _Edge, name: str, means: Mapping[str, LineMeans]
+) -> bool:
+    """Whether another head has a sharp edge at the same place, whatever the ground next to it."""
+    ends = np.array([[edge.first, edge.at + 0.5], [edge.last, edge.at + 0.5]])
+    across = int(edge.axis == "rows")
+    ground = vip_mm_from_raw(view.placements[name], ends if across else ends[:, ::-1])
+    sign = math.copysign(1.0, edge.step)
+    for other, lines in means.items():
+        with np.errstate(invalid="ignore"):
+            there = raw_from_vip_mm(view.placements[other], ground)
+        if other == name or not np.isfinite(there).all():
+            continue
+        at, near = float(there[:, across].mean()), math.ceil(view.reach_px(other))
+        first, last = sorted(int(end) for end in there[:, 1 - across])
+        places = (math.floor(at) - near, math.floor(at) + near)
+        steps = sharp_step(view.rig.sensor(other), lines, edge.axis, (first, last), places)
+        if max(sign * step for step in steps) > MAX_SHARED * abs(edge.relative):
+            return True
+    return False
+
+
 def _rectangle(view: GroundView, sensor: Sensor, lines: LineMeans) -> Iterator[BlockEdge]:
     """The clearest side of a rectangle of sharp sides that no other head shows, if there is one."""
     for sides in itertools.islice(changed_rectangles(sensor, lines), CANDIDATES):
@@ -423,6 +445,8 @@ def _unshared(
         )
     )
     if max(others + pan) > MAX_SHARED * abs(own) and not by_all_colours:
+        return None
+    if not by_all_colours and _shows_elsewhere(view, edge, name, means):
         return None
     counts = level1_counts_per_dn(sensor.bits)
     return BlockEdge(

@@ -91,6 +91,32 @@ def changed_rectangles(sensor: Sensor, lines: LineMeans) -> Iterator[tuple[Side,
                 yield sides
 
 
+def sharp_step(
+    sensor: Sensor, lines: LineMeans, axis: Axis, extent: tuple[int, int], places: tuple[int, int]
+) -> tuple[float, float]:
+    """The largest sharp fall and rise between two of some neighbouring lines.
+
+    Args:
+        sensor: of the frame.
+        lines: means of bundles of its pixels.
+        axis: the lines are rows or columns.
+        extent: first and last pixel of the lines.
+        places: first and last line.
+
+    Returns:
+        Both of the signal itself; zeros where the frame does not show these pixels.
+    """
+    of_axis = _Lines("rows", lines.by_row, lines.first_row, sensor.width_px)
+    if axis == "columns":
+        of_axis = _Lines("columns", lines.by_column, 0, sensor.height_px)
+    first = max(places[0] - of_axis.first - 2, 0)
+    part = of_axis.means[of_axis.bundles(*extent), first : places[1] - of_axis.first + 4]
+    if not len(part) or part.shape[1] < 6:
+        return 0.0, 0.0
+    size = _sizes(_curved(part)) / max(float(part.mean()), 1.0)
+    return min(float(size.min()), 0.0), max(float(size.max()), 0.0)
+
+
 @dataclass(frozen=True)
 class _Lines:
     """Means of bundles (bundles, lines) along one axis, whose lines are `length` pixels long."""
@@ -254,9 +280,8 @@ def _side(
     part = lines.means[bundles, start:stop]
     if not len(part) or part.shape[1] < AROUND // 2:
         return None
-    change = np.diff(part.mean(axis=0, dtype=np.float64))
-    curved = change[1:-1] - 0.5 * (change[:-2] + change[2:])
-    size = (2.0 * curved[1:-1] - curved[:-2] - curved[2:]) / 3.0
+    curved = _curved(part)
+    size = _sizes(curved)
     # `size[i]` is of the line `start + i + 2` and the next.
     first, last = max(low - start - 2, 0), min(high - start - 2, len(size) - 1)
     if last < first:
@@ -273,3 +298,14 @@ def _side(
     line = lines.first + start + at + 2
     step, level = float(size[at]), max(float(part[:, at + 2 : at + 4].mean()), 1.0)
     return Side(lines.axis, line, extent[0], extent[1], step, step / level, sigmas)
+
+
+def _curved(means: Array) -> Array:
+    """Changes of the mean of bundles from line to line, less half of those before and after."""
+    change = np.diff(means.mean(axis=0, dtype=np.float64))
+    return np.asarray(change[1:-1] - 0.5 * (change[:-2] + change[2:]))
+
+
+def _sizes(curved: Array) -> Array:
+    """Steps that fit best to the curvature around each line."""
+    return np.asarray((2.0 * curved[1:-1] - curved[:-2] - curved[2:]) / 3.0)

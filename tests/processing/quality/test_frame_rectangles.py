@@ -11,9 +11,10 @@ import pytest
 from numpy.typing import NDArray
 
 from processing.geometry.placement import nominal_placements, vip_mm_from_raw
-from processing.image.line_means import line_means
-from processing.quality.frame_blocks import block_edges, edge_limits
+from processing.image.line_means import LineMeans, line_means
+from processing.quality.frame_blocks import _Edge, _shows_elsewhere, block_edges, edge_limits
 from processing.quality.frame_rectangles import Side, changed_rectangles
+from processing.quality.ground_steps import GroundView
 from processing.rig import find_rig
 
 Array = NDArray[Any]
@@ -92,8 +93,13 @@ def test_a_step_along_one_side_alone_is_no_rectangle() -> None:
     assert _first(GROUND + 3 * STEP * fading) == ()
 
 
-def _named(changed: str, among: str) -> list[str]:
-    """Frames that are named of those over textured ground, where some have the same rectangle."""
+def _seen(
+    changed: str, among: str, *, outlined: str = ""
+) -> tuple[GroundView, dict[str, LineMeans]]:
+    """Frames over textured ground, where some have the same rectangle, and means of their lines.
+
+    Of those that are outlined only two pixels along its sides are changed.
+    """
     temperatures = {cone.probe: cone.calibration_c for cone in RIG.cones}
     placements = nominal_placements(RIG, temperatures, {})
     of_first = placements[changed.split()[0]]
@@ -103,15 +109,24 @@ def _named(changed: str, among: str) -> list[str]:
     for sensor in (RIG.sensor(name) for name in among.split()):
         rough = GROUND[: sensor.height_px, : sensor.width_px]
         signal = 8000.0 + 0.3 * (rough - 8000.0)
-        if sensor.name in changed.split():
+        if sensor.name in (changed + " " + outlined).split():
             rows, columns = np.indices(rough.shape)
             pixels = np.stack((columns.ravel(), rows.ravel()), axis=1).astype(np.float64)
             at = vip_mm_from_raw(placements[sensor.name], pixels)
             inside = (at >= ends.min(axis=0)).all(axis=1) & (at <= ends.max(axis=0)).all(axis=1)
-            signal = rough + STEP * inside.reshape(rough.shape)
+            part = inside.reshape(rough.shape).astype(np.uint8)
+            if sensor.name in outlined.split():
+                part -= cv2.erode(part, np.ones((5, 5), np.uint8))
+            signal = rough + float(STEP) * part
         frames[sensor.name] = _words(signal)
     means = {n: line_means(frame, (0, len(frame) - 1)) for n, frame in frames.items()}
-    found = block_edges(RIG, placements, frames, means, edge_limits(RIG, means))
+    return GroundView(RIG, placements, frames), means
+
+
+def _named(changed: str, among: str) -> list[str]:
+    """Frames that are named of those that `_seen` makes."""
+    view, means = _seen(changed, among)
+    found = block_edges(RIG, view.placements, view.frames, means, edge_limits(RIG, means))
     return [block.sensor for block in found]
 
 
@@ -122,6 +137,13 @@ def test_a_block_below_the_texture_is_named_where_no_other_head_shows_it() -> No
 
 def test_a_rectangle_that_other_heads_show_is_ground() -> None:
     assert _named("R G B N", "R G B N") == []
+
+
+def test_an_edge_that_another_head_shows_is_ground_whatever_lies_next_to_it() -> None:
+    edge = _Edge("rows", ROWS[0] - 1, *COLUMNS, float(STEP), STEP / 8000.0)
+    for outlined, expected in (("", False), ("G", True)):
+        view, means = _seen("R", "R G B N", outlined=outlined)
+        assert _shows_elsewhere(view, edge, "R", means) is expected
 
 
 def test_a_rectangle_that_one_other_head_at_most_sees_is_not_decided() -> None:
