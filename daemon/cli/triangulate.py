@@ -174,8 +174,8 @@ def triangulate(
     from daemon.postflight.adjustment.summary import print_report, report_of
     from daemon.postflight.importers.photographs import is_photographs
     from daemon.postflight.triangulation.block_findings import findings_json
-    from daemon.postflight.triangulation.block_points import read_block_points
     from daemon.postflight.triangulation.matching_work import match_mission_block
+    from daemon.postflight.triangulation.measured_points import read_measured_points
     from daemon.postflight.triangulation.point_transfer import transferred
     from daemon.postflight.triangulation.report import (
         print_triangulation,
@@ -231,7 +231,7 @@ def triangulate(
     block = block_of(
         folder, crs=crs, trajectory_file=trajectory, mount_file=mount, heads=head or ()
     )
-    surveyed = read_block_points(block.names, block.frame, points, measured)
+    surveyed = read_measured_points(block.names, block.frame, points, measured)
     with lock_for(folder, results), ExitStack() as shown:
         try:
             tied = match_mission_block(

@@ -100,9 +100,9 @@ def _outside(found: PhotographBlock, control: GroundControl) -> list[str]:
     size = np.array([(one.width_px, one.height_px) for one in found.sizes])
     end = size[found.camera_of[control.image]] - 0.5
     beyond = np.any((control.px < -0.5) | (control.px > end), axis=1)
-    if not beyond.any():
+    if not np.any(beyond):
         return []
-    fits_turned = (control.px <= end[:, ::-1]).all(axis=1)
+    fits_turned = np.all(control.px <= end[:, ::-1], axis=1)
     largest = size[found.camera_of[control.image][np.argmax(beyond)]]
     cure = "; columns and rows appear exchanged" if fits_turned[beyond].all() else ""
     names = sorted({control.names[k] for k in control.point[beyond]})

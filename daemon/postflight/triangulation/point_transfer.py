@@ -7,8 +7,8 @@ from typing import Final
 
 import numpy as np
 
-from daemon.postflight.triangulation.block_points import BlockPoints
 from daemon.postflight.triangulation.matching_work import image_loader
+from daemon.postflight.triangulation.measured_points import MeasuredPoints
 from daemon.postflight.triangulation.triangulation import ImageBlock
 from processing.matching.block_matching import BlockMatching
 from processing.matching.point_transfer import transfer_points
@@ -17,7 +17,9 @@ TRANSFER_SIGMA_PX: Final = 0.05
 """Standard deviation of a transferred coordinate against the patch that was measured."""
 
 
-def transferred(block: ImageBlock, points: BlockPoints, settings: BlockMatching) -> BlockPoints:
+def transferred(
+    block: ImageBlock, points: MeasuredPoints, settings: BlockMatching
+) -> MeasuredPoints:
     """The points with measurements in all images that show them.
 
     The error of the first measurement is common to all of its transfers: it moves the point on the

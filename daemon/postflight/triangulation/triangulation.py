@@ -32,8 +32,8 @@ from daemon.orientation.navigation_sigmas import NavigationSigmas
 from daemon.orientation.orientation_inputs import read_orientation_inputs
 from daemon.postflight.adjustment.project import CheckPoints, Project
 from daemon.postflight.adjustment.project_file import ProjectFile
-from daemon.postflight.triangulation.block_points import BlockPoints, no_block_points
 from daemon.postflight.triangulation.head_arrangement import HeadArrangement, arrangement_of
+from daemon.postflight.triangulation.measured_points import MeasuredPoints, no_measured_points
 from daemon.postflight.triangulation.stitching_of_exposures import stitching_patterns_of
 from processing.bundle.adjust import AdjustmentSettings, adjust
 from processing.bundle.flown_network import (
@@ -251,7 +251,7 @@ def project_of(
     tied: BlockTiePoints,
     options: TriangulationSettings,
     *,
-    surveyed: BlockPoints | None = None,
+    surveyed: MeasuredPoints | None = None,
 ) -> Project:
     """Everything as an adjustment project in the local frame.
 
@@ -263,7 +263,7 @@ def project_of(
             "no tie points were found: do the images overlap, and is the orientation right to a "
             "few pixels? Try --search with more pixels"
         )
-    surveyed = surveyed or no_block_points()
+    surveyed = surveyed or no_measured_points()
     pitch = block.image.pitch_mm
     ties = tied.points
     names = (*(f"t{k}" for k in range(ties)), *surveyed.names)

@@ -21,12 +21,12 @@ GEODETIC = ("latitude_deg", "longitude_deg", "height_m")
 SIGMAS = ("sx_m", "sy_m", "sz_m")
 
 
-class BlockPointsError(DaemonError, ValueError):
+class MeasuredPointsError(DaemonError, ValueError):
     """Tables of points that cannot be used; the message states what is wrong."""
 
 
 @dataclass(frozen=True)
-class BlockPoints:
+class MeasuredPoints:
     """Points with their places and measurements.
 
     Attributes:
@@ -47,15 +47,15 @@ class BlockPoints:
     sigma_px: Array
 
 
-def no_block_points() -> BlockPoints:
+def no_measured_points() -> MeasuredPoints:
     """No points."""
     none, empty = np.zeros(0, np.int64), np.zeros((0, 3))
-    return BlockPoints((), (), empty, empty, none, none, np.zeros((0, 2)), np.zeros(0))
+    return MeasuredPoints((), (), empty, empty, none, none, np.zeros((0, 2)), np.zeros(0))
 
 
-def read_block_points(
+def read_measured_points(
     images: Sequence[str], frame: LocalFrame, points_file: Path | None, measured_file: Path | None
-) -> BlockPoints:
+) -> MeasuredPoints:
     """Read the two tables; without them there are no points.
 
     Args:
@@ -63,16 +63,16 @@ def read_block_points(
         frame: the block's local frame.
 
     Raises:
-        BlockPointsError: one table without the other, or tables with mistakes.
+        MeasuredPointsError: one table without the other, or tables with mistakes.
         daemon.postflight.adjustment.csv_tables.ProjectError: a table that cannot be read.
     """
     if points_file is None or measured_file is None:
         if points_file is not None or measured_file is not None:
-            raise BlockPointsError(
+            raise MeasuredPointsError(
                 "--points and --measured go together: where points are on the ground, and where "
                 "in the images"
             )
-        return no_block_points()
+        return no_measured_points()
     table = read_table(points_file, ("point", "role", *GEODETIC), SIGMAS)
     names = table.names("point")
     roles = table.text("role")
@@ -88,8 +88,8 @@ def read_block_points(
     spread = np.array(seen.numbers("sigma_px", MEASURED_SIGMA_PX))
     problems = [*table.problems, *seen.problems]
     if problems or not np.isfinite(place).all() or not np.isfinite(px).all():
-        raise BlockPointsError("; ".join(problems) or "an empty cell where a number is needed")
-    return BlockPoints(
+        raise MeasuredPointsError("; ".join(problems) or "an empty cell where a number is needed")
+    return MeasuredPoints(
         tuple(names), tuple(roles), frame.from_geodetic(*place), sigma, image, point, px, spread
     )
 
