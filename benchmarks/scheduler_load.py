@@ -17,7 +17,7 @@ import resource
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +42,9 @@ class SleepingWork:
     seconds: float
     threads: int = 1
     memory_nbytes: int = 1
+
+    def with_threads(self, threads: int) -> SleepingWork:
+        return replace(self, threads=threads)
 
     def open(self) -> SleepingAction:
         return SleepingAction(self.seconds)
