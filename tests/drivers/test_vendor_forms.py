@@ -216,6 +216,15 @@ def test_an_offset_that_centring_locks_is_zero() -> None:
         assert emulated.registers.number_or("OffsetX", -1) == 0
 
 
+def test_the_selected_trigger_stays_selected_since_other_features_depend_on_it() -> None:
+    text = TEXT.replace('"ExposureAuto">', '"ExposureAuto"><pIsLocked>SelectorReg</pIsLocked>')
+    with head(text) as (emulated, driver, _):
+        emulated.registers.nodes.write("SelectorReg", 0)
+        emulated.registers.nodes.write("ExposureAutoReg", 2)
+        driver.bind()
+        assert emulated.registers.symbolic_or("ExposureAuto", "") == "Off"
+
+
 def test_what_cannot_be_switched_off_is_refused() -> None:
     text = with_nodes(enumeration("BalanceWhiteAuto", PLACE, "Once", "Continuous"),
                       "BalanceWhiteAuto")  # fmt: skip

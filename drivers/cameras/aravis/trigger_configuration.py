@@ -101,7 +101,10 @@ def switch_triggers_off(features: Features) -> None:
     Args:
         features: the head's features.
     """
-    for trigger in features.entries("TriggerSelector") or [""]:
+    before = features.text("TriggerSelector")
+    triggers = features.entries("TriggerSelector")
+    # The one that is selected comes last and stays selected: other features may depend on it.
+    for trigger in sorted(triggers, key=lambda entry: entry == before) or [""]:
         with contextlib.suppress(FeatureError):
             if trigger:
                 features.set("TriggerSelector", trigger)
