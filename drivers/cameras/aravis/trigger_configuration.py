@@ -17,6 +17,10 @@ BURST_TRIGGER: Final = "FrameBurstStart"
 BURST_LENGTH: Final = "AcquisitionBurstFrameCount"
 """Frames of a burst; a burst of one frame is a single frame (SFNC 2.7, section 5.5)."""
 ACQUISITION_TRIGGER: Final = "AcquisitionStart"
+NO_SOFTWARE_TRIGGER: Final = (
+    'trigger_source is "software"; the head has no command TriggerSoftware, set trigger_source = '
+    '"line"'
+)
 TRIGGER_DELAYS: Final = ("TriggerDelay", "TriggerDelayAbs")
 STROBES: Final = (
     ("LineSelector", "LineSource", ("ExposureActive", "ExposureStartActive")),
@@ -41,14 +45,9 @@ def write_trigger(writer: FeatureWriter, settings: AravisSettings) -> None:
     if not features.is_implemented("TriggerMode") and not features.entries("TriggerSelector"):
         writer.missing.append("no feature TriggerMode")
         return
-    has_command = features.kind("TriggerSoftware") == "command"
-    if settings.trigger_source == "software" and not (
-        has_command and features.is_implemented("TriggerSoftware")
-    ):
-        writer.refusals.append(
-            'trigger_source is "software"; the head has no command TriggerSoftware, set '
-            'trigger_source = "line"'
-        )
+    is_software = settings.trigger_source == "software"
+    if is_software and features.kind("TriggerSoftware") != "command":
+        writer.refusals.append(NO_SOFTWARE_TRIGGER)
         return
     selectors = features.entries("TriggerSelector")
     frame_trigger = _frame_trigger(writer, selectors)
@@ -79,6 +78,9 @@ def write_trigger(writer: FeatureWriter, settings: AravisSettings) -> None:
     if is_fixed:
         hint = f"its trigger source is fixed at {held}"
     writer.set(key, "TriggerSource", source, hint)
+    # A head may have the command for the selected trigger and source only.
+    if is_software and not features.is_implemented("TriggerSoftware"):
+        writer.refusals.append(NO_SOFTWARE_TRIGGER)
     if settings.trigger_source == "line":
         _write_line(writer, settings)
     delay = features.first_available(TRIGGER_DELAYS)
