@@ -9,7 +9,6 @@ Source: docs/explanation/mathematics/quality.md#rectangles-with-another-offset.
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -154,25 +153,59 @@ def _sharp_edges(lines: _Lines) -> list[_Edge]:
     if len(lines.means) < WINDOW or lines.means.shape[1] < BLOCK:
         return []
     sizes, has_run = _sharp_changes(lines.means, SHARP, WINDOW, SHARP_BUNDLES)
-    edges = []
-    for sign, places in zip((1.0, -1.0), has_run, strict=True):
-        for at in np.flatnonzero(places):
-            size = sign * sizes[:, at]
-            hits = np.convolve(size > SHARP, np.ones(WINDOW, np.int64), "valid")
-            near = np.flatnonzero(hits >= SHARP_BUNDLES)
-            for run in np.split(near, np.flatnonzero(np.diff(near) > WINDOW) + 1):
-                sharp = run[0] + np.flatnonzero(size[run[0] : run[-1] + WINDOW] > SHARP)
-                start, stop = int(sharp[0]), int(sharp[-1]) + 1
-                edges.append(
-                    _Edge(
-                        int(at) + lines.first,
-                        start * lines.pace,
-                        (stop - 1) * lines.pace + BUNDLE_PX - 1,
-                        sign,
-                        float(size[start:stop].mean()) * math.sqrt(stop - start),
-                    )
-                )
+    edges = [
+        _Edge(
+            at + lines.first,
+            start * lines.pace,
+            (stop - 1) * lines.pace + BUNDLE_PX - 1,
+            1.0 - 2.0 * falls,
+            size,
+        )
+        for falls, at, start, stop, size in _runs_of_sharp(
+            sizes, has_run, SHARP, WINDOW, SHARP_BUNDLES
+        )
+    ]
     return sorted(edges, key=lambda edge: -edge.size)[:MAX_EDGES]
+
+
+@compiled_kernel()
+def _runs_of_sharp(
+    sizes: Array, has_run: Array, least: float, window: int, enough: int
+) -> list[tuple[int, int, int, int, float]]:
+    """Runs of bundles with sharp changes of one sign, where windows with enough of them touch.
+
+    Returns:
+        Of each run whether it falls, its line, its first bundle and the one after its last, and
+        its mean size times the square root of its length.
+    """
+    bundles = len(sizes)
+    runs = []
+    for k in range(2):
+        sign = np.float32(1.0 - 2.0 * k)
+        for at in np.flatnonzero(has_run[k]):
+            begin = end = -1
+            for j in range(bundles - window + 2):
+                hits = 0
+                if j <= bundles - window:
+                    for i in range(j, j + window):
+                        hits += sign * sizes[i, at] > least
+                is_near = hits >= enough
+                if begin >= 0 and (j > bundles - window or (is_near and j - end > window)):
+                    start, stop = begin, end + window
+                    while not sign * sizes[start, at] > least:
+                        start += 1
+                    while not sign * sizes[stop - 1, at] > least:
+                        stop -= 1
+                    total = 0.0
+                    for i in range(start, stop):
+                        total += sign * sizes[i, at]
+                    runs.append((k, int(at), start, stop, total / math.sqrt(stop - start)))
+                    begin = -1
+                if is_near:
+                    if begin < 0:
+                        begin = j
+                    end = j
+    return runs
 
 
 @compiled_kernel(fastmath={"reassoc", "contract"})
@@ -220,13 +253,15 @@ def _sharp_changes(means: Array, least: float, window: int, enough: int) -> tupl
 
 def _pairs(edges: Sequence[_Edge], lines: _Lines) -> Iterator[tuple[_Edge | None, _Edge | None]]:
     """Two sides opposite to each other, one of which may be the border of the frame."""
-    for before, after in itertools.permutations(edges, 2):
-        if before.sign == after.sign or after.at - before.at < MIN_SIDE_PX:
-            continue
-        shared = min(before.last, after.last) - max(before.first, after.first)
-        spanned = max(before.last, after.last) - min(before.first, after.first)
-        if shared >= MIN_OVERLAP * spanned:
-            yield before, after
+    at, first, last, sign = (
+        np.array([getattr(edge, name) for edge in edges])
+        for name in ("at", "first", "last", "sign")
+    )
+    shared = np.minimum.outer(last, last) - np.maximum.outer(first, first)
+    spanned = np.maximum.outer(last, last) - np.minimum.outer(first, first)
+    opposite = (shared >= MIN_OVERLAP * spanned) & (np.multiply.outer(sign, sign) < 0.0)
+    for i, j in np.argwhere(opposite & (np.subtract.outer(at, at).T >= MIN_SIDE_PX)):
+        yield edges[i], edges[j]
     for edge in edges:
         if lines.last - edge.at >= MIN_SIDE_PX:
             yield edge, None
@@ -244,16 +279,15 @@ def _closed(
     low = along.last if after is None else after.at
     first, last = max(e.first for e in pair), min(e.last for e in pair)
     reach = 2 * along.pace + BUNDLE_PX
-    sides = [
-        _side(across, (top, low), (first - reach, first + reach), sign),
-        _side(across, (top, low), (last - reach, last + reach), -sign),
-    ]
+    # A side that does not show has to be the border.
+    sides = [_side(across, (top, low), (first - reach, first + reach), sign)]
+    if sides[0] is None and first > reach:
+        return ()
+    sides.append(_side(across, (top, low), (last - reach, last + reach), -sign))
+    if sides[1] is None and last < across.last - reach:
+        return ()
     left = sides[0].at + 1 if sides[0] else across.first
     right = sides[1].at if sides[1] else across.last
-    # A side that does not show has to be the border.
-    shows_or_is_border = [sides[0] or first <= reach, sides[1] or last >= across.last - reach]
-    if not all(shows_or_is_border):
-        return ()
     if not any(sides) or right - left < MIN_SIDE_PX:
         return ()
     if right - left > MAX_SPAN * along.length or low - top > MAX_SPAN * across.length:
@@ -277,27 +311,61 @@ def _side(
     low, high = (place - lines.first for place in places)
     bundles = lines.bundles(*extent)
     start, stop = max(low - AROUND, 0), min(high + AROUND, lines.means.shape[1])
-    part = lines.means[bundles, start:stop]
-    if not len(part) or part.shape[1] < AROUND // 2:
+    if bundles.stop <= bundles.start or stop - start < AROUND // 2:
         return None
-    curved = _curved(part)
-    size = _sizes(curved)
+    at, step, level, sigmas = _sharpest(
+        lines.means, (bundles.start, bundles.stop), (start, stop), (low, high), sign
+    )
+    if sigmas < SIDE_SIGMAS:
+        return None
+    line, relative = lines.first + at, step / max(level, 1.0)
+    return Side(lines.axis, line, extent[0], extent[1], step, relative, sigmas)
+
+
+@compiled_kernel()
+def _sharpest(
+    means: Array,
+    bundles: tuple[int, int],
+    lines: tuple[int, int],
+    places: tuple[int, int],
+    sign: float,
+) -> tuple[int, float, float, float]:
+    """The sharpest edge of a sign between the lines of some places, of the mean of some bundles.
+
+    Returns:
+        The line before it, the step, the level at it, and the step over the standard deviation of
+        the others among `lines`, which is 0 where no edge is as sharp as `MAX_SHAPE` demands.
+    """
+    start, stop = lines
+    count = stop - start
+    mean = np.zeros(count)
+    for k in range(bundles[0], bundles[1]):
+        for i in range(count):
+            mean[i] += means[k, start + i]
+    mean /= bundles[1] - bundles[0]
+    change = mean[1:] - mean[:-1]
+    curved = change[1:-1] - 0.5 * (change[:-2] + change[2:])
+    size = (2.0 * curved[1:-1] - curved[:-2] - curved[2:]) / 3.0
     # `size[i]` is of the line `start + i + 2` and the next.
-    first, last = max(low - start - 2, 0), min(high - start - 2, len(size) - 1)
+    first = max(places[0] - start - 2, 0)
+    last = min(places[1] - start - 2, len(size) - 1)
+    none = 0, 0.0, 0.0, 0.0
     if last < first:
-        return None
-    at = first + int(np.argmax(sign * size[first : last + 1]))
+        return none
+    at = first
+    for i in range(first, last + 1):
+        if sign * size[i] > sign * size[at]:
+            at = i
+    # Most places are none; this is the quickest to see.
+    shape = max(abs(curved[at] + 0.5 * curved[at + 1]), abs(curved[at + 2] + 0.5 * curved[at + 1]))
+    if sign * size[at] <= 0.0 or shape > MAX_SHAPE * abs(curved[at + 1]):
+        return none
     around = np.concatenate((size[: max(at - 2, 0)], size[at + 3 :]))
-    if len(around) < AROUND // 2 or sign * size[at] <= 0.0:
-        return None
-    sigma = _MAD_TO_SIGMA * float(np.median(np.abs(around - np.median(around))))
-    sigmas = sign * float(size[at]) / max(sigma, 1e-3 * abs(float(size[at])))
-    shape = curved[[at, at + 2]] / curved[at + 1] + 0.5
-    if sigmas < SIDE_SIGMAS or np.abs(shape).max() > MAX_SHAPE:
-        return None
-    line = lines.first + start + at + 2
-    step, level = float(size[at]), max(float(part[:, at + 2 : at + 4].mean()), 1.0)
-    return Side(lines.axis, line, extent[0], extent[1], step, step / level, sigmas)
+    if len(around) < AROUND // 2:
+        return none
+    sigma = _MAD_TO_SIGMA * np.median(np.abs(around - np.median(around)))
+    level = 0.5 * (mean[at + 2] + mean[at + 3])
+    return start + at + 2, size[at], level, sign * size[at] / max(sigma, 1e-3 * abs(size[at]))
 
 
 def _curved(means: Array) -> Array:

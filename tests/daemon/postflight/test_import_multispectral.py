@@ -401,16 +401,18 @@ def test_sixteen_bit_photographs_of_phase_one_are_a_block(tmp_path) -> None:
     assert (content["camera"], content["photographs"]) == ("Phase One iXM-100", 3)
     assert content["f_px"] == pytest.approx(4.0 / 0.00376, rel=1e-5)
     assert content["pixel_um"] == pytest.approx(3.76, rel=1e-5)
-    # Another camera in the folder is refused with both named.
+    # Another camera in the folder, of the same model, has its own interior orientation.
     write_image(
         tmp_path / "in/Q.tif", pixels, b"", make="Phase One", model="iXM-100", serial="MM02",
         focal_mm=4.0, per_mm=1 / 0.00376, gps=(47.0, 15.5, 900.0),
     )  # fmt: skip
     done = RUN.invoke(
-        app, ["import", "photographs", str(tmp_path / "in"), "--out", str(tmp_path / "two")]
+        app,
+        ["import", "photographs", str(tmp_path / "in"), "--out", str(tmp_path / "two"), "--json"],
     )
-    sentence = str(done.exception)
-    assert done.exit_code != 0 and "MM01" in sentence and "MM02" in sentence
+    content = json.loads(done.stdout)
+    assert (content["heads"], content["photographs"]) == (["C1", "C2"], 4)
+    assert "MM01" in str(content) and "MM02" in str(content)
 
 
 def test_the_former_name_is_refused_with_the_present_one(tmp_path) -> None:
