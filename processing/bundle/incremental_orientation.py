@@ -206,9 +206,10 @@ class _Growing:
             yield [pairs[k] for pairs in groups if k < len(pairs)]
 
     def _pairs_of(self, group: list[tuple[int, int]]) -> list[_Pair]:
-        """Those with an image that no pair before them has are first."""
+        """Those with an image that no pair before them has are first, those of one place last."""
         first: list[_Pair] = []
         repeated: list[_Pair] = []
+        turned: list[_Pair] = []
         begun: set[int] = set()
         for a, b in group[:_PAIRS_MEASURED]:
             _, at, bt = np.intersect1d(
@@ -219,12 +220,13 @@ class _Growing:
             )
             pair = _Pair(a, b, self._rows[a][at], self._rows[b][bt])
             if self._turned_px(pair.first_rows, pair.second_rows) < _TURNED_MAX_PX:
+                turned.append(pair)
                 continue
             (repeated if {a, b} <= begun else first).append(pair)
             begun |= {a, b}
             if len(first) == _PAIRS_TRIED:
                 break
-        return [*first, *repeated][:_PAIRS_TRIED]
+        return [*first, *repeated, *turned][:_PAIRS_TRIED]
 
     def _turned_px(self, a: Indices, b: Indices) -> float:
         """Median residual of a rotation between two images: small where they have one place."""
