@@ -36,8 +36,8 @@ def test_the_pause_is_in_ticks_of_the_heads_clock_and_rounded_up(
 
 
 def test_the_head_holds_the_rate_and_every_frame_records_the_pause() -> None:
-    with flying(packet_size=1462, stream_rate_mbps=40.0, packet_timeout_ms=100.0) as (pair,):
-        packets = -(-PAYLOAD // (1462 - 36)) + 2
+    with flying(packet_size=1460, stream_rate_mbps=40.0, packet_timeout_ms=100.0) as (pair,):
+        packets = -(-PAYLOAD // (1460 - 36)) + 2
         durations = []
         for number in (1, 2, 3):
             started = time.monotonic()
@@ -45,13 +45,13 @@ def test_the_head_holds_the_rate_and_every_frame_records_the_pause() -> None:
             pair.wait_frames(number)
             durations.append(time.monotonic() - started)
         pause_ns = pair.emulated._registers.integer("GevSCPD")
-    assert pause_ns == 300_000
-    assert {frame.settings["GevSCPD"] for frame in pair.frames} == {300_000}
-    assert min(durations) >= (packets - 1) * 300e-6
+    assert pause_ns == 299_600
+    assert {frame.settings["GevSCPD"] for frame in pair.frames} == {299_600}
+    assert min(durations) >= (packets - 1) * 299e-6
 
 
 def test_without_a_rate_the_head_sends_as_fast_as_it_can() -> None:
-    with flying(packet_size=1462) as (pair,):
+    with flying(packet_size=1460) as (pair,):
         pair.pulse(1)
         pair.wait_frames(1)
         assert pair.emulated._registers.integer("GevSCPD") == 0

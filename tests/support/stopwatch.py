@@ -81,13 +81,18 @@ def _scheduled() -> dict[str, Scheduled]:
     Source: Documentation/scheduler/sched-stats.rst of the kernel, /proc/<pid>/schedstat.
     """
     found = {}
+    for task in _threads():
+        with suppress(OSError, ValueError):
+            run_ns, waited_ns, _ = (task / "schedstat").read_text("ascii").split()
+            found[str(task)] = Scheduled(int(run_ns), int(waited_ns))
+    return found
+
+
+def _threads() -> Iterator[Path]:
+    """The threads of this process and of its living descendants, in /proc."""
     for process in _family(os.getpid()):
         with suppress(OSError):
-            for task in Path(f"/proc/{process}/task").iterdir():
-                with suppress(OSError, ValueError):
-                    run_ns, waited_ns, _ = (task / "schedstat").read_text("ascii").split()
-                    found[str(task)] = Scheduled(int(run_ns), int(waited_ns))
-    return found
+            yield from Path(f"/proc/{process}/task").iterdir()
 
 
 def _family(process: int) -> Iterator[int]:

@@ -19,6 +19,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ import tifffile
 
 from daemon.cli.sim import Emulator, free_first_address, service_toml, simulator_arguments
 from daemon.onboard.monitoring.access.tokens import add_token
+from tests.support.stopwatch import Stopwatch
 from tests.system.demo_mission import ROOT, syntopic
 from tests.system.test_operators_page import Running
 
@@ -148,21 +150,28 @@ def command(page: Mapping[str, Any], token: str, name: str) -> None:
 
 def recorded_command() -> list[bytes]:
     """An operator's signed command to stop, obeyed before the flight; and one of yesterday."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as station:
+        station.settimeout(2)
+        watch = Stopwatch()
+        while True:
+            # What is sent before the service listens is lost.
+            frame = signed_stop(time.time())
+            station.sendto(frame, ("127.0.0.1", MAVLINK_PORT))
+            with suppress(TimeoutError):
+                station.recv(1024)
+                return [frame, signed_stop(time.time() - 86_400.0)]
+            assert watch.is_within(WITHIN_S), "no answer to a signed command"
+
+
+def signed_stop(unix_s: float) -> bytes:
+    """A command to stop that an operator signed at a time."""
     from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-    frames = []
-    for age_s in (0.0, 86_400.0):
-        mav = dialect.MAVLink(None, srcSystem=255, srcComponent=190)
-        mav.signing.secret_key = KEY
-        mav.signing.sign_outgoing = True
-        mav.signing.timestamp = round((time.time() - SIGNING_EPOCH_UNIX_S - age_s) * 1e5)
-        message = mav.command_long_encode(1, 100, STOP_CAPTURE, 0, 0, 0, 0, 0, 0, 0, 0)
-        frames.append(bytes(message.pack(mav)))
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as station:
-        station.settimeout(10)
-        station.sendto(frames[0], ("127.0.0.1", MAVLINK_PORT))
-        station.recv(1024)
-    return frames
+    mav = dialect.MAVLink(None, srcSystem=255, srcComponent=190)
+    mav.signing.secret_key = KEY
+    mav.signing.sign_outgoing = True
+    mav.signing.timestamp = round((unix_s - SIGNING_EPOCH_UNIX_S) * 1e5)
+    return bytes(mav.command_long_encode(1, 100, STOP_CAPTURE, *[0] * 8).pack(mav))
 
 
 def ports_of(pid: int) -> dict[str, list[tuple[str, int]]]:

@@ -18,7 +18,7 @@ from daemon.mission.layout import Mission, MissionError
 from daemon.mission.store.level0 import tiff_parts
 from daemon.orientation.local_frame import LocalFrame
 from daemon.postflight.adjustment.project import read_project
-from daemon.postflight.triangulation.block_points import read_block_points
+from daemon.postflight.triangulation.measured_points import read_measured_points
 from daemon.postflight.triangulation.point_transfer import transferred
 from daemon.postflight.triangulation.triangulation import block_of
 from processing.matching.block_matching import BlockMatching
@@ -123,7 +123,7 @@ def test_a_point_measured_in_one_image_is_found_in_the_others(flown) -> None:
     folder = flown[0]
     block = block_of(Mission.open(folder / "mission"), trajectory_file=folder / "trajectory.csv")
     tables = (folder / "surveyed/points.csv", folder / "surveyed/measured.csv")
-    every = read_block_points(block.names, block.frame, *tables)
+    every = read_measured_points(block.names, block.frame, *tables)
     _, first = np.unique(every.point, return_index=True)
     alone = replace(
         every, image=every.image[first], point=every.point[first], px=every.px[first],

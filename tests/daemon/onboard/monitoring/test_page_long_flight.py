@@ -145,9 +145,11 @@ def test_a_page_opened_late_shows_the_newest_first_and_all_footprints(
     assert first[0] == 340 and first == sorted(first, reverse=True) and len(first) < 300
     assert largest < 3 * PAST_BYTES
     assert not events
-    track = browser.evaluate(
+    history = (
         "import('/telemetry.js').then(({ flight }) => flight.history.map((one) => one.number))"
     )
+    browser.wait_for(f"{history}.then((numbers) => numbers.at(-1) === 340)", WITHIN_S)
+    track = browser.evaluate(history)
     assert track == sorted(track) and track[-1] == 340
 
 
