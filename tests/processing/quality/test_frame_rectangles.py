@@ -13,7 +13,14 @@ from numpy.typing import NDArray
 from processing.geometry.placement import nominal_placements, vip_mm_from_raw
 from processing.image.line_means import LineMeans, line_means
 from processing.quality.frame_blocks import _Edge, _shows_elsewhere, block_edges, edge_limits
-from processing.quality.frame_rectangles import Side, changed_rectangles
+from processing.quality.frame_rectangles import (
+    SHARP,
+    SHARP_BUNDLES,
+    WINDOW,
+    Side,
+    _runs_of_sharp,
+    changed_rectangles,
+)
 from processing.quality.ground_steps import GroundView
 from processing.rig import find_rig
 
@@ -91,6 +98,32 @@ def test_a_step_along_one_side_alone_is_no_rectangle() -> None:
     ramp = np.clip((np.arange(SENSOR.height_px) - ROWS[0]) / 200.0, 0.0, 1.0)[:, None]
     fading = (1.0 - ramp) * _part((ROWS[0], SENSOR.height_px - 1))
     assert _first(GROUND + 3 * STEP * fading) == ()
+
+
+@pytest.mark.parametrize("strength", [3.0, 10.0])
+@pytest.mark.parametrize("turns", range(4))
+def test_a_rectangle_whose_fourth_side_fades_inside_of_the_frame_is_none(
+    turns: int, strength: float
+) -> None:
+    part = _part()
+    columns = np.clip((np.arange(part.shape[1]) - COLUMNS[0]) / 200.0, 0.0, 1.0)
+    faded = part * columns
+    if turns % 2:
+        rows = np.clip((np.arange(part.shape[0]) - ROWS[0]) / 150.0, 0.0, 1.0)
+        faded = part * rows[:, None]
+    if turns >= 2:
+        faded = faded[::-1, ::-1]
+    assert _first(GROUND + strength * STEP * faded) == ()
+
+
+def test_a_side_with_a_gap_is_one_edge_and_distant_ones_are_two() -> None:
+    sizes = np.zeros((60, 3), np.float32)
+    has_run = np.zeros((2, 3), np.bool_)
+    sizes[10:20, 1] = sizes[22:32, 1] = sizes[50:56, 1] = 2.0
+    has_run[0, 1] = True
+    runs = _runs_of_sharp(sizes, has_run, SHARP, WINDOW, SHARP_BUNDLES)
+    assert [run[:4] for run in runs] == [(0, 1, 10, 32), (0, 1, 50, 56)]
+    assert runs[0][4] == pytest.approx(40.0 / np.sqrt(22.0))
 
 
 def _seen(
