@@ -14,6 +14,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.bundle.adjusted_statistics import statistics_of
 from processing.bundle.critical_values import TestName, critical_value, number_of_tests
 from processing.bundle.data_snooping import (
     Excluded,
@@ -21,14 +22,9 @@ from processing.bundle.data_snooping import (
     fitting_again,
     nothing_excluded,
 )
-from processing.bundle.equations import Equations
+from processing.bundle.equation_rows import Equations
 from processing.bundle.free_datum import (
-    DatumFigures,
     FreeDatum,
-    free_motions,
-    in_datum,
-    scaled_directions,
-    state_in_datum,
 )
 from processing.bundle.gauss_newton import (
     Progress,
@@ -37,16 +33,11 @@ from processing.bundle.gauss_newton import (
     iterate,
 )
 from processing.bundle.network import Network, NetworkError, validate
-from processing.bundle.normal_equations import (
-    Cofactor,
-    ReducedEquations,
-    cofactor_matrix,
-    null_directions,
-    reduced_equations,
-)
-from processing.bundle.rank_diagnosis import RankDefect, rank_defects
+from processing.bundle.normal_equations import ReducedEquations
+from processing.bundle.rank_diagnosis import RankDefect
+from processing.bundle.reduced_solution import Cofactor
 from processing.bundle.robust_weights import WeightFunction, robust_exclusions
-from processing.bundle.statistics import ObservationGroup, groups_of, spread_of
+from processing.bundle.statistics import ObservationGroup, groups_of
 from processing.bundle.step_control import points_in_front
 from processing.bundle.undetermined_points import undetermined_points
 from processing.bundle.unknowns import (
@@ -259,6 +250,8 @@ def adjust(
             history,
             max_iterations=settings.max_iterations,
             minimum_norm=settings.minimum_norm,
+            free_datum=settings.free_datum,
+            datum_names=settings.datum_names,
         )
         try:
             if robust:
@@ -274,8 +267,27 @@ def adjust(
             squares = history[-1] if history else 0.0
             report_progress(f"weak points set aside: {int(weak.sum())}", len(history), squares)
             continue
+        solved = statistics_of(run, network, rows, reduced)
         state = run.state
-        result = _figures(run, settings, network, rows, reduced, left_out, selection)
+        result = Adjustment(
+            network=network,
+            layout=layout,
+            settings=settings,
+            state=state,
+            iterations=tuple(history),
+            weight=run.weight,
+            rejected=selection.excluded.image,
+            left_out=left_out,
+            factors=dict(selection.factors),
+            groups=groups_of(
+                solved.equations,
+                solved.residual,
+                solved.redundancy_number,
+                selection.factors,
+            ),
+            excluded=selection.excluded,
+            **vars(solved),
+        )
         what = selection.advance(result, reduced)
         if what is None:
             return replace(
@@ -413,110 +425,3 @@ class _Selection:
             result.test_sigma0,
             limit,
         )
-
-
-def _figures(
-    run: Run,
-    settings: AdjustmentSettings,
-    given: Network,
-    rows: Equations,
-    reduced: ReducedEquations,
-    left_out: Flags,
-    selection: _Selection,
-) -> Adjustment:
-    layout = run.layout
-    if run.minimum_norm and settings.free_datum != "unknowns":
-        rows, reduced = _moved_to_datum(run, settings, given, rows, reduced)
-    run.report_progress("covariances", len(run.history), run.history[-1])
-    found: tuple[RankDefect, ...] = ()
-    directions, motions = None, None
-    if run.minimum_norm:
-        motions = free_motions(layout, run.state, reduced)
-        expected = scaled_directions(motions, reduced)
-        directions, _ = null_directions(reduced, layout.constraints, expected)
-        found = rank_defects(run.network, layout, run.state, reduced, directions=directions)
-    cofactor = cofactor_matrix(reduced, layout.constraints, directions=directions)
-    own, leverage, influence = spread_of(rows, reduced, cofactor)
-    free_points = layout.eliminated_points
-    held = layout.locked[free_points]
-    unknowns = layout.columns + int((~held).sum())
-    observations = len(rows.misclosure)
-    free = 0 if directions is None else directions.shape[1]
-    redundancy = observations - unknowns + len(layout.constraints) + free
-    if redundancy < 0:
-        raise NetworkError(
-            [f"{observations} observations for {unknowns} unknowns: more are needed than that"]
-        )
-    # The corrections at convergence are negligible: misclosures are the residuals, sign reversed.
-    residual = -rows.misclosure
-    sigma0 = float(np.sqrt(residual @ residual / redundancy)) if redundancy > 0 else float("nan")
-    point_cofactor = np.full((len(layout.locked), 3, 3), np.nan)
-    own = np.where(held[:, :, None] | held[:, None, :], 0.0, own)
-    point_cofactor[free_points] = own
-    for point in np.flatnonzero(
-        (layout.retained_points >= 0).any(axis=1) | _fixed_distance_points(layout)
-    ):
-        at = layout.retained_points[point]
-        there = at >= 0
-        point_cofactor[point] = 0.0
-        point_cofactor[point][np.ix_(there, there)] = cofactor[np.ix_(at[there], at[there])]
-    redundancy_number = 1.0 - leverage
-    figures = DatumFigures(cofactor, point_cofactor, influence)
-    if settings.free_datum != "unknowns" and motions is not None and len(motions.combinations):
-        figures = in_datum(
-            given,
-            layout,
-            figures,
-            reduced,
-            rows.point,
-            motions,
-            settings.free_datum,
-            settings.datum_names,
-        )
-    return Adjustment(
-        network=given,
-        layout=layout,
-        settings=settings,
-        state=run.state,
-        sigma0=sigma0,
-        redundancy=redundancy,
-        observations=observations,
-        unknowns=unknowns,
-        iterations=tuple(run.history),
-        cofactors=figures.cofactor,
-        point_cofactor=figures.point_cofactor,
-        equations=rows,
-        residual=residual,
-        redundancy_number=redundancy_number,
-        influence=figures.influence,
-        weight=run.weight,
-        rejected=selection.excluded.image,
-        left_out=left_out,
-        factors=dict(selection.factors),
-        groups=groups_of(rows, residual, redundancy_number, selection.factors),
-        excluded=selection.excluded,
-        rank_defects=found,
-    )
-
-
-def _moved_to_datum(
-    run: Run,
-    settings: AdjustmentSettings,
-    given: Network,
-    rows: Equations,
-    reduced: ReducedEquations,
-) -> tuple[Equations, ReducedEquations]:
-    """Move the block to its datum; rows and reduced equations there, for they hold its scale."""
-    motions = free_motions(run.layout, run.state, reduced)
-    if not len(motions.combinations):
-        return rows, reduced
-    run.state = state_in_datum(
-        given, run.layout, run.state, motions, settings.free_datum, settings.datum_names
-    )
-    rows = run.rows(run.state)
-    return rows, reduced_equations(rows, run.layout)
-
-
-def _fixed_distance_points(layout: ParameterLayout) -> Flags:
-    """Fully held points that distances end at: neither eliminated nor with columns."""
-    return np.asarray(layout.locked.all(axis=1) & (layout.eliminated < 0))

@@ -7,6 +7,7 @@ estimated afterwards from the same equations (`added_parameters`).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -20,8 +21,10 @@ from processing.bundle.flown_network import (
     MountingPrior,
     flown_exposures,
 )
+from processing.bundle.frame_patterns import FramePatterns
 from processing.bundle.initial_values import intersect
 from processing.bundle.network import CameraModel, ImagePoints, Images, Network, Points
+from processing.bundle.residual_weights import block_settings
 from processing.geometry.rotation import vectors_from_rotations
 
 Array = NDArray[np.float64]
@@ -30,6 +33,8 @@ Indices = NDArray[np.int64]
 _IMAGE_GROUPS: Final = (0, 1)
 _GNSS_GROUPS: Final = (4, 5)
 _ATTITUDE_GROUP: Final = 6
+_WEIGHT_ROUNDS: Final = 4
+_WEIGHT_CHANGED: Final = 0.1
 
 
 @dataclass(frozen=True)
@@ -109,6 +114,7 @@ def adjust_images(
     reject_beyond: float = 4.0,
     rounds: int = 8,
     start: tuple[Array, Array] | None = None,
+    patterns: Sequence[FramePatterns | None] = (),
 ) -> BlockAdjustment:
     """Adjust images with their measured orientations and tie points.
 
@@ -122,6 +128,7 @@ def adjust_images(
             below one, in standard deviations as given.
         rounds: adjustments that may leave something out.
         start: stations (n, 3) and rotations (n, 3, 3) to begin with; None: as measured.
+        patterns: what stitching may have left in each image, None where nothing; empty: in none.
 
     Returns:
         Adjusted orientations and points.
@@ -131,6 +138,71 @@ def adjust_images(
 
     Source: docs/explanation/mathematics/bundle.md#adjustment.
     """
+    network, points = _network(f_mm, measured, ties, xyz_m, prior, start, patterns)
+    settings = AdjustmentSettings(reject_beyond=reject_beyond, max_rounds=rounds)
+    result = adjust(network, settings)
+    if result.sigma0 < 1.0 and result.excluded.others:
+        # Measured orientations keep their standard deviations where image points fit better.
+        result = adjust(network, replace(settings, reject_beyond=reject_beyond / result.sigma0))
+    return _of(result, points, prior)
+
+
+def adjust_as_after_landing(
+    f_mm: float,
+    measured: MeasuredOrientations,
+    ties: TieObservations,
+    xyz_m: Array,
+    prior: MountingPrior | None,
+    *,
+    start: tuple[Array, Array] | None = None,
+    patterns: Sequence[FramePatterns | None] = (),
+) -> BlockAdjustment:
+    """Adjust a whole block as the triangulation after landing does.
+
+    Blunders are found with weights that fall with the residual, and image points have the standard
+    deviations that their residuals show. Where those to begin with are right to a tenth in
+    variance, it takes one adjustment.
+
+    Args:
+        f_mm: principal distance.
+        measured: orientations of the images.
+        ties: image points, with the sigmas to begin with.
+        xyz_m: (p, 3) starting values.
+        prior: of the mounting; None holds it.
+        start: as of `adjust_images`.
+        patterns: as of `adjust_images`.
+
+    Returns:
+        Adjusted orientations and points.
+
+    Raises:
+        NetworkError, RankDefectError: as `processing.bundle.adjust.adjust`.
+
+    Source: docs/explanation/mathematics/bundle.md#adjustment.
+    """
+    network, points = _network(f_mm, measured, ties, xyz_m, prior, start, patterns)
+    done = _of(adjust(network, block_settings()), points, prior)
+    for _ in range(_WEIGHT_ROUNDS):
+        factor = np.array(done.image_factors)
+        if (np.abs(factor - 1.0) < _WEIGHT_CHANGED).all():
+            break
+        table = network.image_points
+        weighted = replace(table, sigma_mm=table.sigma_mm * np.sqrt(factor))
+        network = replace(network, image_points=weighted)
+        done = _of(adjust(network, block_settings()), points, prior)
+    return done
+
+
+def _network(
+    f_mm: float,
+    measured: MeasuredOrientations,
+    ties: TieObservations,
+    xyz_m: Array,
+    prior: MountingPrior | None,
+    start: tuple[Array, Array] | None,
+    patterns: Sequence[FramePatterns | None],
+) -> tuple[Network, Indices]:
+    """The network, and the numbers of its points."""
     points, point = np.unique(ties.point, return_inverse=True)
     n = len(measured.position_m)
     names = tuple(str(k) for k in range(n))
@@ -153,13 +225,9 @@ def adjust_images(
         heads=flown.heads,
         gnss=flown.gnss,
         measured_attitudes=flown.measured_attitudes,
+        patterns=tuple(patterns) if any(one is not None for one in patterns) else (),
     )  # fmt: skip
-    settings = AdjustmentSettings(reject_beyond=reject_beyond, max_rounds=rounds)
-    result = adjust(network, settings)
-    if result.sigma0 < 1.0 and result.excluded.others:
-        # Measured orientations keep their standard deviations where image points fit better.
-        result = adjust(network, replace(settings, reject_beyond=reject_beyond / result.sigma0))
-    return _of(result, points, prior)
+    return network, points
 
 
 def intersected(
@@ -217,7 +285,7 @@ def added_parameters(
     if image_mm is not None:
         design += _without_points(result, image_mm)
     into = np.asarray(rows.reduced.T @ design)
-    normal = design.T @ design - into.T @ result.cofactor @ into
+    normal = design.T @ design - into.T @ (result.cofactors @ into)
     normal += np.diag(1.0 / np.square(sigma))
     size = np.sqrt(np.clip(np.diag(design.T @ design) + 1.0 / np.square(sigma), 1e-300, None))
     values, vectors = np.linalg.eigh(normal / size[:, None] / size)
@@ -284,7 +352,7 @@ def adjusted_mounting(result: Adjustment, prior: MountingPrior) -> AdjustedMount
     """
     layout, state = result.layout, result.state
     columns = np.concatenate([layout.head_rotation[0], layout.head_offset[0]])
-    spread = np.sqrt(np.clip(np.diag(result.cofactor)[columns], 0.0, None))
+    spread = np.sqrt(np.clip(result.cofactors[columns, columns], 0.0, None))
     given = np.repeat([prior.boresight_sigma_rad, prior.lever_arm_sigma_m], 3)
     return AdjustedMounting(
         np.concatenate([vectors_from_rotations(state.head_rotation[0][None])[0],

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from processing.bundle.adjust import Adjustment
 from processing.bundle.block_band import BandCofactor
-from processing.bundle.normal_equations import Cofactor
+from processing.bundle.reduced_solution import Cofactor
 
 Array = NDArray[np.float64]
 

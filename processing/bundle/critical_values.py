@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from processing.bundle.equations import Equations
+from processing.bundle.equation_rows import Equations
 from processing.bundle.normal_equations import ReducedEquations
 
 Array = NDArray[np.float64]

@@ -14,9 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.bundle.critical_values import MIN_REDUNDANCY
-from processing.bundle.equations import BehindCameraError, Equations, equations
+from processing.bundle.equation_rows import Equations
+from processing.bundle.equations import equations
+from processing.bundle.image_rows import BehindCameraError
 from processing.bundle.network import Network
-from processing.bundle.normal_equations import Cofactor, ReducedEquations
+from processing.bundle.normal_equations import ReducedEquations
+from processing.bundle.reduced_solution import Cofactor
 from processing.bundle.statistics import observation_cofactors
 from processing.bundle.unknowns import ParameterLayout, ParameterValues
 

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.bundle.network import Network, NetworkError
-from processing.bundle.normal_equations import (
+from processing.bundle.normal_equations import ReducedEquations
+from processing.bundle.reduced_solution import (
     MIN_INFORMATION,
     Cofactor,
-    ReducedEquations,
     constrained_matrix,
     with_product,
 )

@@ -13,19 +13,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing import ProcessingError
-from processing.bundle.equations import BehindCameraError, Equations, equations
-from processing.bundle.free_datum import free_motions, scaled_directions
+from processing.bundle.equation_rows import Equations
+from processing.bundle.equations import equations
+from processing.bundle.free_datum import FreeDatum, free_motions, scaled_directions
+from processing.bundle.image_rows import BehindCameraError
 from processing.bundle.network import Network, NetworkError
-from processing.bundle.normal_equations import (
+from processing.bundle.normal_equations import ReducedEquations, point_normals, reduced_equations
+from processing.bundle.rank_diagnosis import RankDefectError, rank_defects
+from processing.bundle.reduced_solution import (
     GaussNewtonStep,
-    ReducedEquations,
     SingularError,
     cofactor_matrix,
-    point_normals,
-    reduced_equations,
     solve,
 )
-from processing.bundle.rank_diagnosis import RankDefectError, rank_defects
 from processing.bundle.step_control import (
     RECIPROCAL_BELOW,
     Damping,
@@ -83,6 +83,8 @@ class Run:
     history: list[float]
     max_iterations: int
     minimum_norm: bool
+    free_datum: FreeDatum = "unknowns"
+    datum_names: tuple[str, ...] = ()
 
     def rows(self, state: ParameterValues, *, derivatives: bool = True) -> Equations:
         """Rows at a state.

@@ -1,25 +1,23 @@
-"""Normal equations with the object points eliminated (Schur complement), and their solution.
+"""Normal equations with the object points eliminated (Schur complement).
 
 Each point's three columns are first made orthonormal within the point (its own Cholesky factor), so
 that eliminating it needs a product and no inverse. Columns that most rows touch (interior
 orientation) are stored dense, all others sparse. The reduced matrix is dense, of a large block in
-blocks near its diagonal (`block_order`).
+blocks near its diagonal (`block_order`). Its solution is in `reduced_solution`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, sparse
+from scipy import sparse
 
-from processing import ProcessingError
-from processing.bundle.block_band import BandCofactor, BandFactor, BandMatrix
+from processing.bundle.block_band import BandMatrix
 from processing.bundle.eliminated_products import add_products
-from processing.bundle.equations import Equations
+from processing.bundle.equation_rows import Equations
 from processing.bundle.network import NetworkError
 from processing.bundle.unknowns import ParameterLayout
 
@@ -27,25 +25,12 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 Matrix = Array | BandMatrix
-Cofactor = Array | BandCofactor
 
 MAX_COLUMNS = 150_000
 """Beyond this even the equations of the object points do not fit into 16 GiB."""
 
 _DENSE_FILL = 0.04
 _HELD_WEIGHT = 1e6
-_SUBSPACE, _SUBSPACE_STEPS = 16, 6
-MIN_INFORMATION = 1e-11
-"""Of the reduced matrix over the diagonal it had before points were eliminated; a datum defect
-leaves 1e-14."""
-
-
-class SingularError(ProcessingError, ValueError):
-    """The reduced matrix has directions without information; `reduced` is for the diagnosis."""
-
-    def __init__(self, reduced: ReducedEquations) -> None:
-        self.reduced = reduced
-        super().__init__("the normal equations are singular")
 
 
 @dataclass(frozen=True)
@@ -85,20 +70,15 @@ class ReducedEquations:
     @cached_property
     def coupling_sparse(self) -> sparse.csr_array:
         """Products of `point_rows` with the sparse columns, (3p, sparse columns)."""
-        rows = _orthonormal_rows(self.point_rows, self.row_point, len(self.point_factor))
-        return sparse.csr_array(rows.T @ self.design_sparse)
+        return sparse.csr_array(self.orthonormal().T @ self.design_sparse)
 
+    def orthonormal(self) -> sparse.csr_array:
+        """`point_rows` as a sparse matrix.
 
-@dataclass(frozen=True)
-class GaussNewtonStep:
-    """Corrections of columns (c,) and eliminated points (p, 3), and the predicted decrease.
-
-    `predicted_decrease` is the predicted decrease of the weighted sum of squares.
-    """
-
-    dx: Array
-    dpoints: Array
-    predicted_decrease: float
+        Returns:
+            Shape (m, 3p).
+        """
+        return _orthonormal_rows(self.point_rows, self.row_point, len(self.point_factor))
 
 
 def point_normals(equations: Equations, layout: ParameterLayout) -> Array:
@@ -286,275 +266,3 @@ def refuse_large_block(columns: int) -> None:
                 f"adjusted at once, about {MAX_COLUMNS // 6} exposures: split the block"
             ]
         )
-
-
-def constrained_matrix(reduced: ReducedEquations, constraints: Array) -> tuple[Matrix, Array]:
-    """The scaled reduced matrix with constraints added, and the scaled constraint rows of norm 1.
-
-    Adding C'C leaves the solution under C dx = 0 as it is and gives its directions information.
-
-    Args:
-        reduced: from `reduced_equations`.
-        constraints: rows, shape (k, c); constraints @ dx = 0.
-
-    Returns:
-        Matrix, shape (c, c), of unknowns multiplied by `reduced.scale`, and rows, shape (k, c), of
-        the same.
-    """
-    matrix = reduced.matrix
-    if isinstance(matrix, BandMatrix):
-        scaled: Matrix = matrix.scaled(1.0 / reduced.scale)
-    else:
-        scaled = matrix / reduced.scale[:, None] / reduced.scale
-    if not len(constraints):
-        return scaled, constraints
-    rows = constraints / reduced.scale
-    rows = rows / np.linalg.norm(rows, axis=1, keepdims=True)
-    if isinstance(scaled, BandMatrix):
-        return scaled.with_border_rows(rows), rows
-    return scaled + rows.T @ rows, rows
-
-
-def weak_directions(matrix: Matrix) -> Array:
-    """Directions of a scaled matrix with less information than `MIN_INFORMATION`.
-
-    Args:
-        matrix: from `constrained_matrix`.
-
-    Returns:
-        Orthonormal, shape (c, n); at least the weakest.
-    """
-    if isinstance(matrix, BandMatrix):
-        values, vectors = _weakest(matrix)
-    else:
-        values, vectors = linalg.eigh(matrix)
-    return np.asarray(vectors[:, : max(1, int((values < MIN_INFORMATION).sum()))])
-
-
-def null_directions(
-    reduced: ReducedEquations, constraints: Array, expected: Array
-) -> tuple[Array, bool]:
-    """Directions without information.
-
-    Args:
-        reduced: from `reduced_equations`.
-        constraints: rows, shape (k, c).
-        expected: orthonormal directions in the scaled unknowns that have none, shape (c, d).
-
-    Returns:
-        All directions without information, shape (c, n), and whether they are the expected ones;
-        only then no eigenvalues were needed.
-
-    Raises:
-        SingularError: a matrix in blocks has other directions without information.
-    """
-    matrix, _ = constrained_matrix(reduced, constraints)
-    if isinstance(matrix, BandMatrix):
-        if _held(matrix, expected).factor(MIN_INFORMATION) is None:
-            raise SingularError(reduced)
-        return expected, True
-    if len(matrix) and _cholesky(matrix + expected @ expected.T) is not None:
-        return expected, True
-    values, vectors = linalg.eigh(matrix)
-    return np.asarray(vectors[:, values < MIN_INFORMATION]), False
-
-
-def solve(
-    reduced: ReducedEquations, constraints: Array, *, directions: Array | None = None
-) -> GaussNewtonStep:
-    """Solve the reduced equations and go back to the points.
-
-    Args:
-        reduced: from `reduced_equations`.
-        constraints: rows, shape (k, c); constraints @ dx = 0.
-        directions: a free network: the shortest (scaled) correction, without these orthonormal
-            directions, shape (c, d), and others that nothing determines; None: an error.
-
-    Returns:
-        Corrections of columns and points, and the predicted decrease of the sum of squares.
-
-    Raises:
-        SingularError: directions without information.
-    """
-    if len(reduced.right):
-        matrix, rows = constrained_matrix(reduced, constraints)
-        right = reduced.right / reduced.scale
-        inverse = _inverse_action(matrix, reduced, directions)
-        dx = inverse(right)
-        if len(constraints):
-            spread = inverse(rows.T)
-            dx = dx - spread @ np.linalg.lstsq(rows @ spread, rows @ dx, rcond=None)[0]
-        dx = dx / reduced.scale
-    else:
-        dx = np.zeros(0)
-    moved = reduced.design_sparse @ dx[reduced.sparse_columns]
-    orthonormal = _orthonormal_rows(
-        reduced.point_rows, reduced.row_point, len(reduced.point_factor)
-    )
-    back = reduced.point_right - (
-        orthonormal.T @ moved + reduced.coupling_dense @ dx[reduced.dense_columns]
-    )
-    dpoints = np.einsum("pij,pj->pi", reduced.point_factor, back.reshape(-1, 3))
-    predicted_decrease = float(reduced.right @ dx + reduced.point_right @ reduced.point_right)
-    if reduced.damping > 0.0:
-        added = float((reduced.scale * dx) @ (reduced.scale * dx))
-        added += float((reduced.point_diagonal * dpoints**2).sum())
-        predicted_decrease += reduced.damping * added
-    return GaussNewtonStep(dx, dpoints, predicted_decrease)
-
-
-def cofactor_matrix(
-    reduced: ReducedEquations, constraints: Array, *, directions: Array | None = None
-) -> Cofactor:
-    """Cofactors of the columns, constraints and eliminated points taken into account.
-
-    Args:
-        reduced: from `reduced_equations`.
-        constraints: rows, shape (k, c); constraints @ dx = 0.
-        directions: all that nothing determines, orthonormal in the scaled unknowns, shape (c, d);
-            they have no variance. None: an error where there are any.
-
-    Returns:
-        Shape (c, c); times sigma0 squared it is the covariance. Of a matrix in blocks, what is
-        stored of it.
-
-    Raises:
-        SingularError: directions without information.
-    """
-    if not len(reduced.right):
-        return np.zeros((0, 0))
-    matrix, rows = constrained_matrix(reduced, constraints)
-    if isinstance(matrix, BandMatrix):
-        return _band_cofactor(matrix, reduced, rows, directions)
-    if directions is not None:
-        matrix = matrix + directions @ directions.T
-    factor = _factor(matrix, reduced)
-    inverse, info = linalg.lapack.dpotri(factor, lower=1)
-    if info != 0:
-        raise SingularError(reduced)
-    inverse = np.tril(inverse) + np.tril(inverse, -1).T
-    if directions is not None:
-        inverse -= directions @ directions.T
-    if len(constraints):
-        spread = inverse @ rows.T
-        inverse -= spread @ np.linalg.pinv(rows @ spread) @ spread.T
-    return np.asarray(inverse / reduced.scale[:, None] / reduced.scale)
-
-
-def with_product(cofactor: Cofactor, left: Array, right: Array) -> Cofactor:
-    """Cofactors with a product of few columns added.
-
-    Args:
-        cofactor: shape (c, c).
-        left: shape (c, k).
-        right: shape (c, k); left @ right.T is symmetric.
-
-    Returns:
-        The sum.
-    """
-    if isinstance(cofactor, BandCofactor):
-        return cofactor.added(left, right)
-    return np.asarray(cofactor + left @ right.T)
-
-
-def _band_cofactor(
-    matrix: BandMatrix, reduced: ReducedEquations, rows: Array, directions: Array | None
-) -> BandCofactor:
-    if directions is not None:
-        matrix = _held(matrix, directions)
-    factor = matrix.factor(MIN_INFORMATION)
-    if factor is None:
-        raise SingularError(reduced)
-    result = factor.inverse(reduced.scale)
-    if directions is not None:
-        # P Z P with P = 1 - G G', in scaled unknowns; then back to columns.
-        spread = factor.solve(directions)
-        middle = directions.T @ spread
-        left = np.hstack([-directions, -spread, directions @ middle])
-        right = np.hstack([spread, directions, directions])
-        result = result.added(left / reduced.scale[:, None], right / reduced.scale[:, None])
-    if len(rows):
-        of_columns = (rows * reduced.scale).T
-        spread = result @ of_columns
-        result = result.added(-spread @ np.linalg.pinv(of_columns.T @ spread), spread)
-    return result
-
-
-def _held(matrix: BandMatrix, directions: Array) -> BandMatrix:
-    """The matrix with as many unknowns held as there are directions without information."""
-    if not directions.shape[1]:
-        return matrix
-    _, _, pivots = linalg.qr(directions.T, pivoting=True, mode="economic")
-    hold = np.zeros(len(directions))
-    hold[pivots[: directions.shape[1]]] = 1.0
-    return matrix.diagonal_added(hold)
-
-
-def _weakest(matrix: BandMatrix) -> tuple[Array, Array]:
-    """The smallest eigenvalues and their vectors, by subspace iteration."""
-    columns = len(matrix.order.columns)
-    factor = matrix.diagonal_added(np.full(columns, 10.0 * MIN_INFORMATION)).factor(0.0)
-    basis = np.random.default_rng(1).normal(size=(columns, min(_SUBSPACE, columns)))
-    if factor is None:
-        raise ProcessingError("the reduced matrix has negative eigenvalues")
-    for _ in range(_SUBSPACE_STEPS):
-        basis = np.linalg.qr(factor.solve(basis))[0]
-    values, vectors = np.linalg.eigh(basis.T @ (matrix @ basis))
-    return values, basis @ vectors
-
-
-def _factor(matrix: Array, reduced: ReducedEquations) -> Array:
-    """Lower Cholesky factor, refused where a pivot shows a direction without information."""
-    factor = _cholesky(matrix)
-    if factor is None:
-        raise SingularError(reduced)
-    return factor
-
-
-def _cholesky(matrix: Array) -> Array | None:
-    factor, info = linalg.lapack.dpotrf(matrix, lower=1, clean=1)
-    if info != 0 or float(factor.diagonal().min(initial=1.0)) ** 2 < MIN_INFORMATION:
-        return None
-    return np.asarray(factor)
-
-
-def _inverse_action(
-    matrix: Matrix, reduced: ReducedEquations, directions: Array | None
-) -> Callable[[Array], Array]:
-    if isinstance(matrix, BandMatrix):
-        return _band_action(matrix, reduced, directions)
-    if directions is None:
-        factor = _factor(matrix, reduced)
-        return lambda right: np.asarray(linalg.cho_solve((factor, True), right, check_finite=False))
-    # In the directions, the matrix is zero: one there leaves the solution across them as it is.
-    bordered = _cholesky(matrix + directions @ directions.T)
-    if bordered is not None:
-
-        def across(right: Array) -> Array:
-            found = linalg.cho_solve((bordered, True), right, check_finite=False)
-            return np.asarray(found - directions @ (directions.T @ found))
-
-        return across
-    values, vectors = linalg.eigh(matrix)
-    known = values > MIN_INFORMATION
-    eigenvectors, weights = vectors[:, known], 1.0 / values[known]
-    return lambda right: np.asarray(eigenvectors @ ((weights * (eigenvectors.T @ right).T).T))
-
-
-def _band_action(
-    matrix: BandMatrix, reduced: ReducedEquations, directions: Array | None
-) -> Callable[[Array], Array]:
-    if directions is not None:
-        matrix = _held(matrix, directions)
-    factor: BandFactor | None = matrix.factor(MIN_INFORMATION)
-    if factor is None:
-        raise SingularError(reduced)
-    if directions is None:
-        return factor.solve
-
-    def across(right: Array) -> Array:
-        right = right - directions @ (directions.T @ right)
-        found = factor.solve(right)
-        return np.asarray(found - directions @ (directions.T @ found))
-
-    return across

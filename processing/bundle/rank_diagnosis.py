@@ -18,11 +18,8 @@ from scipy import linalg
 from processing import ProcessingError
 from processing.bundle.free_datum import motion_columns
 from processing.bundle.network import Network
-from processing.bundle.normal_equations import (
-    ReducedEquations,
-    constrained_matrix,
-    weak_directions,
-)
+from processing.bundle.normal_equations import ReducedEquations
+from processing.bundle.reduced_solution import constrained_matrix, weak_directions
 from processing.bundle.unknowns import ParameterLayout, ParameterValues, Unknown
 
 Array = NDArray[np.float64]

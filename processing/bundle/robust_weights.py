@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.bundle.data_snooping import Excluded, nothing_excluded
-from processing.bundle.equations import Equations
+from processing.bundle.equation_rows import Equations
 from processing.bundle.gauss_newton import Run, front, robust_step
 from processing.bundle.network import Network
 from processing.bundle.step_control import Damping

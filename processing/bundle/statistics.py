@@ -16,8 +16,9 @@ from scipy import sparse
 
 from processing.bundle.block_band import BandCofactor
 from processing.bundle.eliminated_products import add_spread
-from processing.bundle.equations import Equations
-from processing.bundle.normal_equations import Cofactor, ReducedEquations
+from processing.bundle.equation_rows import Equations
+from processing.bundle.normal_equations import ReducedEquations
+from processing.bundle.reduced_solution import Cofactor
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]

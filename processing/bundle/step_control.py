@@ -13,9 +13,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.bundle.equations import BehindCameraError, Equations
+from processing.bundle.equation_rows import Equations
+from processing.bundle.image_rows import BehindCameraError
 from processing.bundle.network import Network
-from processing.bundle.normal_equations import GaussNewtonStep
+from processing.bundle.reduced_solution import GaussNewtonStep
 from processing.bundle.unknowns import ParameterLayout, ParameterValues, apply_corrections
 
 Array = NDArray[np.float64]

@@ -8,7 +8,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.bundle.equations import BehindCameraError, Equations, equations
+from processing.bundle.equation_rows import Equations
+from processing.bundle.equations import equations
+from processing.bundle.image_rows import BehindCameraError
 from processing.bundle.network import Network
 from processing.bundle.normal_equations import point_normals
 from processing.bundle.unknowns import ParameterLayout, ParameterValues, layout_of

@@ -18,6 +18,7 @@ from typing import Any, Final
 import numpy as np
 from numba.core.dispatcher import Dispatcher
 
+from processing.bundle.smallest_block import adjust_smallest_block
 from processing.pipelines.bands import BandPipeline
 from processing.pipelines.parallel_compilation import (
     COMPILATION_TIMEOUT_S,
@@ -36,6 +37,7 @@ from processing.radiometry.demosaic import demosaic
 from processing.rig import Rig
 
 _KERNEL_MODULES: Final = (
+    "processing.bundle.eliminated_products",
     "processing.image.balance",
     "processing.image.cells",
     "processing.matching.correlation",
@@ -43,6 +45,7 @@ _KERNEL_MODULES: Final = (
     "processing.matching.features",
     "processing.image.line_means",
     "processing.quality.common_windows",
+    "processing.quality.defect_lines",
     "processing.quality.frame_blocks",
     "processing.quality.frame_rectangles",
     "processing.quality.local_sharpness",
@@ -141,7 +144,8 @@ def compile_for(
 
     Recorded variants are compiled in several processes. The pipeline then runs once, which compiles
     whatever else it calls. Without radiometry, as at installation, what a calibrated sensor needs
-    is compiled as well; so is what a Bayer head needs, whether this rig has one or not.
+    is compiled as well. So are what a Bayer head needs, whether this rig has one or not, and what
+    bundle adjustments call.
 
     Args:
         rig: the camera.
@@ -165,6 +169,7 @@ def compile_for(
     if radiometry is None:
         first = (rig.pan_cones or rig.cones)[0].sensors[0]
         radiometry = {first.name: synthetic_radiometry(first)}
+    adjust_smallest_block()
     demosaic(np.zeros((8, 8), np.uint16), "RGGB", out=np.zeros((3, 8, 8), np.uint16))
     if rig.virtual_image is not None:
         complete = PipelineSettings(baselines=True, geometry=True)

@@ -12,7 +12,7 @@ import processing.rig
 from daemon import DaemonError, cli
 from daemon.cli.exit_status import ExitStatus
 from drivers.contract import DeviceError
-from processing.bundle.equations import BehindCameraError
+from processing.bundle.image_rows import BehindCameraError
 from processing.geometry.image_proposal import ProposalError
 from processing.rig import RigError
 

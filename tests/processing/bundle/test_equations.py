@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from processing.bundle.camera_model import ideal_mm
-from processing.bundle.equations import GROUPS, BehindCameraError, equations
+from processing.bundle.equation_rows import GROUPS
+from processing.bundle.equations import equations
+from processing.bundle.image_rows import BehindCameraError
 from processing.bundle.network import CameraModel
 from processing.bundle.unknowns import apply_corrections, initial_values, layout_of
 from processing.geometry.lens import ideal_from_measured
