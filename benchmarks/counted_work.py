@@ -9,13 +9,15 @@ from __future__ import annotations
 import errno
 import os
 import random
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from benchmarks.attempt_notes import BEGUN, COMMITTED, WRITE_FAILED, NoteFile
 from daemon.mission.layout import Mission
 from daemon.mission.store import product_manifests
+from daemon.mission.store.product_manifests import ClaimedElsewhereError
 from daemon.postflight.batch.executor import BatchAction, BatchTask
 from daemon.postflight.batch.level2_work import Level2Work
 
@@ -25,76 +27,84 @@ class CountedWork:
     """Level-2 whose attempts are noted in a file, with a store that fails some calls."""
 
     work: Level2Work
-    attempts: Path
+    notes: Path
     failure_share: float
-
-    @property
-    def threads(self) -> int:
-        return self.work.threads
+    threads: int = 1
 
     @property
     def memory_nbytes(self) -> int:
         return self.work.memory_nbytes
 
-    def with_threads(self, threads: int) -> CountedWork:
-        return replace(self, work=self.work.with_threads(threads))
-
     def open(self) -> CountedAction:
-        _count_commits(self)
-        action = CountedAction(self, self.work.open())
-        action.note("0 opened")
+        notes = NoteFile(self.notes)
+        commit = _CountedCommit(self, notes)
+        product_manifests.commit = commit
+        action = CountedAction(self, replace(self.work, threads=self.threads).open(), notes, commit)
+        notes.add(0, "opened")
         return action
 
 
 class CountedAction:
-    """One line before each computation, with what happens to it."""
+    """One line before each attempt, and one with what became of it."""
 
-    def __init__(self, counted: CountedWork, action: BatchAction) -> None:
+    def __init__(
+        self, counted: CountedWork, action: BatchAction, notes: NoteFile, commit: _CountedCommit
+    ) -> None:
         self._counted, self._action = counted, action
-        flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT
-        self._attempts = os.open(counted.attempts, flags, 0o644)
-
-    def note(self, line: str) -> None:
-        """Add a line to the file."""
-        os.write(self._attempts, f"{line}\n".encode())
+        self._notes, self._commit = notes, commit
 
     def clone(self) -> CountedAction:
-        return CountedAction(self._counted, self._action.clone())
+        return CountedAction(self._counted, self._action.clone(), self._notes, self._commit)
 
     def __call__(self, task: BatchTask) -> Any:
-        mission = self._counted.work.mission
-        _fail_sometimes(self._attempts, task.number, "read", self._counted)
-        is_there = product_manifests.is_complete(
-            Mission(mission, mission.name), task.number, task.payload.key
-        )
-        self.note(f"{task.number} {'recognized' if is_there else 'computed'}")
-        result = self._action(task)
+        number = task.number
+        self._notes.add(number, BEGUN)
+        self._commit.end, self._commit.is_noted = "recognized", False
+        try:
+            if random.random() < self._counted.failure_share:
+                self._commit.end = "read failed"
+                raise _timed_out(self._counted.work.mission)
+            result = self._action(task)
+        except ClaimedElsewhereError:
+            self._commit.end = "claimed elsewhere"
+            raise
+        except Exception:
+            if self._commit.end == "recognized":
+                self._commit.end = "failed"
+            raise
+        finally:
+            if not self._commit.is_noted:
+                self._notes.add(number, self._commit.end)
         return {"exposure": result["exposure"]}
 
 
-def _fail_sometimes(attempts: int, number: int, call: str, counted: CountedWork) -> None:
-    if random.random() < counted.failure_share:
-        os.write(attempts, f"{number} {call} failed\n".encode())
-        where = str(counted.work.mission)
-        raise OSError(errno.ETIMEDOUT, os.strerror(errno.ETIMEDOUT), where)
+class _CountedCommit:
+    """In place of the commit of a process: fails sometimes; `end` is what became of the last."""
 
+    def __init__(self, counted: CountedWork, notes: NoteFile) -> None:
+        real: Callable[..., bool] = product_manifests.commit
+        # So that a second work of a process counts once.
+        self._real: Callable[..., bool] = real._real if isinstance(real, _CountedCommit) else real
+        self._counted, self._notes = counted, notes
+        self.end, self.is_noted = "", False
 
-def _count_commits(counted: CountedWork) -> None:
-    """Replace the commit of this process by one that is noted and fails sometimes."""
-    real = getattr(product_manifests.commit, "counted", product_manifests.commit)
-    attempts = os.open(counted.attempts, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
-
-    def commit(
+    def __call__(
+        self,
         mission: Mission,
         number: int,
         manifest: product_manifests.ProductManifest,
         provenance: Mapping[str, Any],
     ) -> bool:
-        _fail_sometimes(attempts, number, "write", counted)
-        is_committed = bool(real(mission, number, manifest, provenance))
-        if is_committed:
-            os.write(attempts, f"{number} committed\n".encode())
+        if random.random() < self._counted.failure_share:
+            self.end = WRITE_FAILED
+            raise _timed_out(self._counted.work.mission)
+        is_committed = self._real(mission, number, manifest, provenance)
+        # Noted here, so that a kill behind it does not look like one before it.
+        self.end = COMMITTED if is_committed else "committed before"
+        self._notes.add(number, self.end)
+        self.is_noted = True
         return is_committed
 
-    commit.counted = real  # type: ignore[attr-defined]  # so that a second work counts once
-    product_manifests.commit = commit
+
+def _timed_out(where: Path) -> OSError:
+    return OSError(errno.ETIMEDOUT, os.strerror(errno.ETIMEDOUT), str(where))

@@ -4,8 +4,10 @@ A mission of small exposures that differ in their bytes is processed by two plai
 worker processes of a dask cluster, in turn and without faults. Then a copy is processed by the
 cluster while workers and the scheduler are killed at random and calls of the store fail. This
 program starts the scheduler again, as systemd would; `syntopic worker` starts its own processes
-again. At the end all products are compared, none was committed twice, and the number of exposures
-computed again is explained by kills and failed writes; otherwise the status is 1.
+again. At the end all products are compared, none was committed twice, and every computation that
+was repeated is explained by a kill or a failed write; otherwise the status is 1.
+
+With `--hold-s` the program ends after so many seconds with status 75; the same command continues.
 """
 
 from __future__ import annotations
@@ -21,22 +23,27 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from statistics import median
-from typing import Any
+from typing import Any, Final
 
 import distributed
 
+from benchmarks import attempt_notes
+from benchmarks.attempt_notes import NoteFile, attempts_of, read_notes
 from benchmarks.counted_work import CountedWork
 from benchmarks.store_mission import flown
 from daemon.cli.benchmark.measurement import machine
 from daemon.cli.process import as_flown
 from daemon.configuration.model import ProcessingSection
+from daemon.mission.canonical_json import canonical_bytes
 from daemon.mission.layout import Mission
 from daemon.mission.store import product_manifests
+from daemon.mission.store.durable import replace_file
 from daemon.planning.overlaps import overlaps_of
 from daemon.postflight.batch.batch_run import BatchCounts, BatchOutcome, run_batch
 from daemon.postflight.batch.cluster_address import ClusterAddress
@@ -51,33 +58,44 @@ PORT = 18_790
 STORE_FAILURE_SHARE = 0.01
 RATIO_MAX = 1.18
 """Seconds of the cluster over those of two plain processes, without kills."""
+LAST_KILL_SHARE = 0.95
+"""Of the exposures: an exposure that lost two processes is tried alone at the end of a run."""
+CONTINUE_STATUS: Final = 75
+"""Source: sysexits.h, EX_TEMPFAIL."""
 
 
 class Killer(threading.Thread):
-    """Kills workers and the scheduler at random, and starts the scheduler again."""
+    """Kills workers and the scheduler at random, and starts the scheduler again.
 
-    def __init__(self, worker_command: int, kills: int, scheduler_kills: int, mean_s: float):
+    A kill is due when so many exposures are done as the plan says, however fast the machine is.
+    """
+
+    def __init__(self, plan: Sequence[tuple[int, str]] = (), notes: NoteFile | None = None):
         super().__init__(daemon=True)
-        self.worker_command, self.mean_s = worker_command, mean_s
-        self.plan = ["worker"] * kills + ["scheduler"] * scheduler_kills
-        random.shuffle(self.plan)
-        self.done: Counter[str] = Counter()
+        self.worker_command = 0
+        self.plan, self.notes = plan, notes
+        self.exposures_done = 0
         self.scheduler = started_scheduler()
         self.is_ended = threading.Event()
 
     def run(self) -> None:
-        for what in self.plan:
-            if self.is_ended.wait(random.expovariate(1.0 / self.mean_s)):
-                return
-            if what == "scheduler":
+        for due, what in self.plan:
+            while self.exposures_done < due:
+                if self.is_ended.wait(0.05):
+                    return
+            if what == attempt_notes.SCHEDULER_KILLED:
                 self.scheduler.kill()
                 self.scheduler.wait()
+                self.note(what, self.scheduler.pid)
                 self.scheduler = started_scheduler()
-                self.done[what] += 1
             elif victim := self._next_victim():
                 with suppress(ProcessLookupError):
                     os.kill(victim, signal.SIGKILL)
-                    self.done[what] += 1
+                    self.note(what, victim)
+
+    def note(self, what: str, process: int) -> None:
+        if self.notes is not None:
+            self.notes.add(0, what, process)
 
     def _next_victim(self) -> int | None:
         """A worker that has loaded its work; None at the end of the run."""
@@ -92,6 +110,16 @@ class Killer(threading.Thread):
             self.join()
         self.scheduler.kill()
         self.scheduler.wait()
+
+
+def kill_plan(kills: int, scheduler_kills: int, exposures: int, seed: int) -> list[tuple[int, str]]:
+    """When each part is killed, in exposures done, and which one; the same in every program."""
+    generator = random.Random(seed)
+    parts = [attempt_notes.WORKER_KILLED] * kills
+    parts += [attempt_notes.SCHEDULER_KILLED] * scheduler_kills
+    generator.shuffle(parts)
+    due = sorted(generator.randrange(1, int(LAST_KILL_SHARE * exposures)) for _ in parts)
+    return list(zip(due, parts, strict=True))
 
 
 def started_scheduler() -> subprocess.Popen[bytes]:
@@ -156,30 +184,28 @@ class Pace:
 def computed(
     mission: Mission,
     executor: BatchExecutor,
-    attempts: Path,
+    notes: Path,
     failure_share: float,
     workers: int,
-    at_first: Callable[[], None] = lambda: None,
+    each: Callable[[BatchCounts], None] = lambda _counts: None,
 ) -> tuple[BatchOutcome, Pace | None]:
     """The outcome of a run and its pace; None where not all processes loaded their work in time.
 
-    `at_first` is called after the first product.
+    `each` is called after every exposure.
     """
     work = level2_work(mission)
     found = survey(
         work, mission, mission.numbers(), overlaps_of(mission, load_rig(mission.rig_path))
     )
-    counted = CountedWork(work, attempts, failure_share)
+    counted = CountedWork(work, notes, failure_share)
     known: list[tuple[int, float, float]] = []  # exposures done, wall and CPU seconds
-    first = iter([at_first])
 
     def progress(counts: BatchCounts) -> None:
         done = counts.done + counts.failed
-        if done:
-            next(first, lambda: None)()
         is_last = done == len(found.pending)
-        if is_last or (not known and counts_of(attempts)["opened"] >= workers):
+        if is_last or (not known and events_of(notes)["opened"] >= workers):
             known.append((done, time.monotonic(), tree_cpu_s()))
+        each(counts)
 
     outcome = run_batch(executor, counted, found.pending, progress)
     if len(known) < 2:
@@ -202,8 +228,8 @@ def compared(mission: Mission) -> dict[int, str]:
     return found
 
 
-def counts_of(attempts: Path) -> Counter[str]:
-    return Counter(line.partition(" ")[2] for line in attempts.read_text().splitlines())
+def events_of(notes: Path) -> Counter[str]:
+    return Counter(note.event for note in read_notes(notes))
 
 
 def linked(pristine: Mission, root: Path) -> Mission:
@@ -215,6 +241,7 @@ def linked(pristine: Mission, root: Path) -> Mission:
         else:
             shutil.copy2(source, target)
 
+    shutil.rmtree(root, ignore_errors=True)  # what an ended program left
     path = shutil.copytree(pristine.path, root / pristine.id, copy_function=copied)
     return Mission.open(Path(path))
 
@@ -242,25 +269,20 @@ def wait_for_workers(url: str, workers: int) -> None:
         client.wait_for_workers(workers, timeout=300)
 
 
-def without_kills(pristine: Mission, folder: Path, rounds: int, workers: int) -> dict[str, Any]:
+def without_kills(
+    pristine: Mission, folder: Path, rounds: int, workers: int, hold: Hold
+) -> dict[str, Any]:
     """Pace of two plain processes and of the cluster, in turn, and the ratios of medians.
 
     On a machine with other work the ratio of CPU times is the more reliable one.
     """
-    paces: dict[str, list[Pace]] = {"two processes": [], "cluster": []}
+    paces: dict[str, list[dict[str, float]]] = {"two processes": [], "cluster": []}
     for k in range(rounds):
-        plain = linked(pristine, folder / f"plain-{k}")
-        two = LocalProcessExecutor(2)
-        outcome, pace = computed(plain, two, folder / f"plain-{k}.txt", 0.0, 2)
-        assert not outcome.failures and pace is not None, outcome.failures
-        paces["two processes"].append(pace)
-        other = linked(pristine, folder / f"cluster-{k}")
-        with cluster(folder, workers, Killer(0, 0, 0, 1.0)) as executor:
-            outcome, pace = computed(other, executor, folder / f"cluster-{k}.txt", 0.0, workers)
-        assert not outcome.failures and pace is not None, outcome.failures
-        paces["cluster"].append(pace)
-    wall_ms = {name: [one.wall_ms for one in of] for name, of in paces.items()}
-    cpu_ms = {name: [one.cpu_ms for one in of] for name, of in paces.items()}
+        for name, found in paces.items():
+            run = f"{'plain' if name == 'two processes' else 'cluster'}-{k}"
+            found.append(hold.once(run, partial(one_pace, pristine, folder / run, workers)))
+    wall_ms = {name: [one["wall_ms"] for one in of] for name, of in paces.items()}
+    cpu_ms = {name: [one["cpu_ms"] for one in of] for name, of in paces.items()}
     return {
         "wall_ms": wall_ms,
         "ratio": round(median(wall_ms["cluster"]) / median(wall_ms["two processes"]), 3),
@@ -270,70 +292,154 @@ def without_kills(pristine: Mission, folder: Path, rounds: int, workers: int) ->
     }
 
 
-def with_kills(pristine: Mission, plain: Mission, options: argparse.Namespace) -> dict[str, Any]:
+def one_pace(pristine: Mission, root: Path, workers: int) -> dict[str, float]:
+    """Pace of one run: of two processes where the folder's name says plain, else of a cluster."""
+    mission, notes = linked(pristine, root), root.with_suffix(".txt")
+    notes.unlink(missing_ok=True)
+    if root.name.startswith("plain"):
+        outcome, pace = computed(mission, LocalProcessExecutor(2), notes, 0.0, 2)
+    else:
+        with cluster(root.parent, workers, Killer()) as executor:
+            outcome, pace = computed(mission, executor, notes, 0.0, workers)
+    assert not outcome.failures and pace is not None, outcome.failures
+    return vars(pace)
+
+
+class Hold:
+    """Results of steps in a folder, and the end of the time that this program may take.
+
+    Args:
+        folder: of the results.
+        seconds: that the program may take.
+    """
+
+    def __init__(self, folder: Path, seconds: float) -> None:
+        self.folder, self.limit_s = folder, time.monotonic() + seconds
+
+    @property
+    def is_over(self) -> bool:
+        return time.monotonic() > self.limit_s
+
+    def once(self, name: str, step: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+        """The result of a step, computed now or by an earlier program.
+
+        Raises:
+            SystemExit: the time is over.
+        """
+        path = self.folder / f"{name}.json"
+        if not path.exists():
+            self.end_if_over()
+            replace_file(path, canonical_bytes(step()))
+        result: dict[str, Any] = json.loads(path.read_text())
+        return result
+
+    def end_if_over(self) -> None:
+        """End the program where its time is over.
+
+        Raises:
+            SystemExit: it is.
+        """
+        if self.is_over:
+            print("time is over; run the same command again", file=sys.stderr)
+            sys.exit(CONTINUE_STATUS)
+
+
+def with_kills(
+    pristine: Mission, plain: Mission, options: argparse.Namespace, hold: Hold
+) -> dict[str, Any]:
     """A run whose parts die; its figures, and sentences on what does not hold."""
-    copy = linked(pristine, options.folder / "killed")
-    attempts = options.folder / "killed.txt"
-    killer = Killer(0, options.kills, options.scheduler_kills, options.mean_s)
-    with cluster(options.folder, options.workers, killer) as executor:
-        begun_s = time.monotonic()
-        outcome, _ = computed(
-            copy, executor, attempts, STORE_FAILURE_SHARE, options.workers, killer.start
+    root, path = options.folder / "killed", options.folder / "killed.txt"
+    if not path.exists():
+        linked(pristine, root)
+    copy, notes = Mission.open(root / pristine.id), NoteFile(path)
+    plan = kill_plan(options.kills, options.scheduler_kills, options.exposures, options.seed)
+    while pending := unfinished(copy):
+        hold.end_if_over()
+        before = events_of(path)
+        done = before[attempt_notes.WORKER_KILLED] + before[attempt_notes.SCHEDULER_KILLED]
+        killer = Killer(plan[done:], notes)
+        with cluster(options.folder, options.workers, killer) as executor:
+            finished = options.exposures - pending
+
+            def each(
+                counts: BatchCounts, finished: int = finished, killer: Killer = killer
+            ) -> None:
+                killer.exposures_done = finished + counts.done
+                if not killer.is_alive() and not killer.is_ended.is_set():
+                    killer.start()
+                if hold.is_over and not killer.is_ended.is_set():
+                    killer.is_ended.set()
+                    raise KeyboardInterrupt
+
+            outcome, _ = computed(copy, executor, path, STORE_FAILURE_SHARE, options.workers, each)
+        notes.add(0, attempt_notes.STOPPED)
+        replace_file(
+            options.folder / f"killed-{time.time_ns()}.json",
+            canonical_bytes(
+                {**outcome.counts.as_json(), "failures": [f.cause for f in outcome.failures]}
+            ),
         )
-        seconds = time.monotonic() - begun_s
-    noted = counts_of(attempts)
-    again = noted["computed"] - options.exposures
-    commits = Counter(
-        line.partition(" ")[0]
-        for line in attempts.read_text().splitlines()
-        if line.endswith(" committed")
-    )
-    in_work = killer.done["scheduler"] * options.workers
-    bound = killer.done["worker"] + in_work + noted["write failed"]
-    problems = [failure.cause for failure in outcome.failures]
-    if again > bound:
-        problems.append(f"{again} computed again; {bound} at most are explained")
-    if twice := [number for number, count in commits.items() if count > 1]:
-        problems.append(f"committed twice: {twice}")
+    attempts, noted = attempts_of(read_notes(path)), events_of(path)
+    runs = [json.loads(one.read_text()) for one in sorted(options.folder.glob("killed-*.json"))]
+    problems = attempt_notes.violations(attempts)
     if compared(copy) != compared(plain):
         problems.append("products differ from those of two processes")
+    again = {
+        number: [attempt.end for attempt in them[:-1]]
+        for number, them in attempt_notes.repeated(attempts).items()
+    }
     return {
-        "worker_kills": killer.done["worker"],
-        "scheduler_kills": killer.done["scheduler"],
-        "counts": outcome.counts.as_json(),
-        "begun": noted["computed"],
-        "computed_again": again,
-        "computed_again_bound": bound,
+        "worker_kills": noted[attempt_notes.WORKER_KILLED],
+        "scheduler_kills": noted[attempt_notes.SCHEDULER_KILLED],
+        "runs": len(runs),
+        "failures": [cause for run in runs for cause in run["failures"]],
+        "computed": len(attempts),
+        "computed_again": len(attempts) - options.exposures,
+        "causes": dict(Counter(end for ends in again.values() for end in ends)),
+        "most_attempts": max(map(len, again.values()), default=0) + 1,
         "read_failures": noted["read failed"],
-        "write_failures": noted["write failed"],
+        "write_failures": noted[attempt_notes.WRITE_FAILED],
         "recognized": noted["recognized"],
-        "committed_twice": len(twice),
-        "seconds": round(seconds, 2),
         "problems": problems,
     }
+
+
+def unfinished(mission: Mission) -> int:
+    """Exposures without a manifest."""
+    return sum(not product_manifests.committed_keys(mission, n) for n in mission.numbers())
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.killed_workers", description=__doc__
     )
-    parser.add_argument("folder", type=Path, help="new folder for missions")
+    parser.add_argument("folder", type=Path, help="folder of missions, new or to be continued")
     parser.add_argument("--exposures", type=int, default=500)
     parser.add_argument("--workers", type=int, default=8)
     parser.add_argument("--kills", type=int, default=50)
     parser.add_argument("--scheduler-kills", type=int, default=2)
-    parser.add_argument("--mean-s", type=float, default=1.5, help="mean time between kills")
     parser.add_argument("--rounds", type=int, default=3, help="runs in turn without kills")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--side", type=int, default=144, help="pixels of a frame's side")
+    parser.add_argument(
+        "--hold-s", type=float, default=float("inf"), help="seconds of this program"
+    )
     options = parser.parse_args()
     random.seed(options.seed)
-    options.folder.mkdir(parents=True)
-    pristine = flown(options.folder / "flown", options.exposures, options.side)
-    calm = without_kills(pristine, options.folder, options.rounds, options.workers)
+    options.folder.mkdir(parents=True, exist_ok=True)
+    hold = Hold(options.folder, options.hold_s)
+    flown_at = options.folder / "flown"
+
+    def fly() -> dict[str, Any]:
+        shutil.rmtree(flown_at, ignore_errors=True)
+        mission = flown(flown_at, options.exposures, options.side)
+        return {"path": str(mission.path)}
+
+    pristine = Mission.open(Path(hold.once("flown", fly)["path"]))
+    calm = without_kills(pristine, options.folder, options.rounds, options.workers, hold)
     print(json.dumps(calm), file=sys.stderr)
     plain = Mission.open(options.folder / "plain-0" / pristine.id)
-    killed = with_kills(pristine, plain, options)
+    killed = with_kills(pristine, plain, options, hold)
     output: dict[str, Any] = {
         "machine": machine(),
         "load": os.getloadavg()[0],

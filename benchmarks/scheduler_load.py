@@ -17,7 +17,7 @@ import resource
 import subprocess
 import sys
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -42,9 +42,6 @@ class SleepingWork:
     seconds: float
     threads: int = 1
     memory_nbytes: int = 1
-
-    def with_threads(self, threads: int) -> SleepingWork:
-        return replace(self, threads=threads)
 
     def open(self) -> SleepingAction:
         return SleepingAction(self.seconds)

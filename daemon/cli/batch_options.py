@@ -173,7 +173,7 @@ class ExecutorOptions:
 
         placed = self.place(work.memory_nbytes, len(tasks), tasks_per_process)
         with shown_progress(description, len(tasks), 0) as show:
-            return run_batch(placed.executor, work.with_threads(placed.threads), tasks, show)
+            return run_batch(placed.executor, replace(work, threads=placed.threads), tasks, show)
 
     def compute(self, description: str, tasks_per_process: int = 1) -> Compute:
         """The same as a function of work and tasks, which raises KeyboardInterrupt after Ctrl-C.

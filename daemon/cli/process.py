@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -135,7 +136,7 @@ def process(
                 return
             if not (found.pending or found.complete):
                 _refuse_unsuitable(folder, work)
-            placed_work = source.placed(work.with_threads(placed.threads))
+            placed_work = replace(source.placed(work), threads=placed.threads)
             _run(source, placed_work, found, placed, as_json=as_json)
 
 

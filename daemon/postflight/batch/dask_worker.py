@@ -21,6 +21,15 @@ from daemon.products.processing_threads import configure_threads, thread_counts
 JOIN_TIMEOUT_S: Final = 30.0
 RESTART_DELAY_S: Final = 0.5
 FINISH_TIMEOUT_S: Final = 30.0
+SETTINGS: Final = {
+    # Results are small; the memory of an exposure is freed by its own pipeline.
+    **{f"distributed.worker.memory.{name}": False for name in ("target", "spill", "pause")},
+    "distributed.worker.memory.terminate": False,
+    # Both wake the process 50 to 200 times a second to draw diagrams of it.
+    "distributed.worker.profile.enabled": False,
+    "distributed.admin.tick.interval": "1s",
+}
+"""Settings of dask in a worker process."""
 
 _SPAWN = multiprocessing.get_context("spawn")
 
@@ -111,9 +120,7 @@ async def _serve(address: ClusterAddress, memory_nbytes: int, joined: Any, paren
 
     # The parent reports what ends; a worker's own messages repeat it.
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
-    thresholds = dict.fromkeys(("target", "spill", "pause", "terminate"), False)
-    # Results are small; the memory of an exposure is freed by its own pipeline.
-    dask.config.set({f"distributed.worker.memory.{name}": off for name, off in thresholds.items()})
+    dask.config.set(SETTINGS)
     stopping = asyncio.Event()
     asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, stopping.set)
     worker = distributed.Worker(

@@ -7,8 +7,8 @@ returns an outcome for each task. Retries, quarantine and order are in
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, Literal, Protocol, TypeAlias
+from dataclasses import Field, dataclass
+from typing import Any, ClassVar, Literal, Protocol, TypeAlias
 
 
 @dataclass(frozen=True)
@@ -30,19 +30,19 @@ class BatchAction(Protocol):
 
 
 class BatchWork(Protocol):
-    """Description of the work of a command; it can be pickled.
+    """Description of the work of a command: a frozen dataclass that can be pickled.
 
-    `memory_nbytes` is what one task occupies, `threads` the threads of one action.
+    `memory_nbytes` is what one task occupies. `threads` is a field, the threads of one action: an
+    allocation replaces it.
     """
+
+    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
 
     @property
     def memory_nbytes(self) -> int: ...
 
     @property
     def threads(self) -> int: ...
-
-    def with_threads(self, threads: int) -> BatchWork:
-        """The same work with another number of threads of one process."""
 
     def open(self) -> BatchAction:
         """Load calibrations and kernels; called once in each process.

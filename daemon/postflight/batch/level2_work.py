@@ -7,7 +7,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -62,6 +62,7 @@ class Level2Work:
     """What all exposures of a run have in common; it can be pickled.
 
     `identity` is `software_identity` of the command: a worker with another one refuses the work.
+    `threads` is of one process and takes the place of that of `processing`.
     """
 
     mission: Path
@@ -71,10 +72,7 @@ class Level2Work:
     radiometry: Path | None
     identity: Mapping[str, str]
     recomputes: bool = False
-
-    @property
-    def threads(self) -> int:
-        return self.processing.threads
+    threads: int = 1
 
     @property
     def memory_nbytes(self) -> int:
@@ -98,20 +96,12 @@ class Level2Work:
             )
         mission = Mission.open(self.mission, checks_subfolders=False)
         rig = load_rig(self.rig_file or mission.rig_path)
-        processor = processor_for(rig, mission, self.processing, self.radiometry)
+        processing = self.processing.model_copy(update={"threads": self.threads})
+        processor = processor_for(rig, mission, processing, self.radiometry)
         processor.warm_up()
         mount, _ = mount_of(mission)
         geometry = FlightGeometry(mount, self.plan, ground_of(rig, mount, self.plan))
         return Level2Action(self, mission, processor, geometry, self.common)
-
-    def with_threads(self, threads: int) -> Level2Work:
-        """The same work with another number of threads.
-
-        Args:
-            threads: of one process.
-        """
-        section = self.processing.model_copy(update={"threads": threads})
-        return replace(self, processing=section)
 
     @cached_property
     def common(self) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -34,14 +34,6 @@ class PansharpenWork:
         image = load_rig(Mission(self.mission, self.mission.name).rig_path).virtual_image
         pixels = 0 if image is None else image.width_px * image.height_px
         return PROCESS_NBYTES + PIXEL_NBYTES * pixels
-
-    def with_threads(self, threads: int) -> PansharpenWork:
-        """The same work with another number of threads.
-
-        Args:
-            threads: of one process.
-        """
-        return replace(self, threads=threads)
 
     def open(self) -> PansharpenAction:
         """Read the rig.

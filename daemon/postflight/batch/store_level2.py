@@ -63,22 +63,11 @@ class StoreLevel2Work:
 
     url: str
     local: Level2Work
-
-    @property
-    def threads(self) -> int:
-        return self.local.threads
+    threads: int = 1
 
     @property
     def memory_nbytes(self) -> int:
         return self.local.memory_nbytes
-
-    def with_threads(self, threads: int) -> StoreLevel2Work:
-        """The same work with another number of threads.
-
-        Args:
-            threads: of one process.
-        """
-        return replace(self, local=self.local.with_threads(threads))
 
     def open(self) -> StoreLevel2Action:
         """Fetch the mission without its exposures, build the processor and load its kernels.
@@ -107,7 +96,11 @@ class StoreLevel2Work:
 
         plan = self.local.plan.model_copy(update={"elevation": moved(self.local.plan.elevation)})
         return replace(
-            self.local, mission=mission, plan=plan, radiometry=moved(self.local.radiometry)
+            self.local,
+            mission=mission,
+            plan=plan,
+            radiometry=moved(self.local.radiometry),
+            threads=self.threads,
         )
 
 

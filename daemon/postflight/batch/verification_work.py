@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 from daemon.mission.verification.verified_exposure import (
@@ -28,14 +28,6 @@ class VerificationWork:
     @property
     def memory_nbytes(self) -> int:
         return PROCESS_NBYTES + BLOCKS_NBYTES
-
-    def with_threads(self, threads: int) -> VerificationWork:
-        """The same work with another number of threads.
-
-        Args:
-            threads: of one process.
-        """
-        return replace(self, threads=threads)
 
     def open(self) -> VerificationAction:
         """Nothing is loaded."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -97,14 +97,6 @@ class OrientationWork:
     @property
     def memory_nbytes(self) -> int:
         return PROCESS_NBYTES
-
-    def with_threads(self, threads: int) -> OrientationWork:
-        """The same work with another number of threads.
-
-        Args:
-            threads: of one process.
-        """
-        return replace(self, threads=threads)
 
     def open(self) -> OrientationAction:
         """Read trajectory and mount.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from daemon.mission.layout import Mission
@@ -47,14 +47,6 @@ class PictureWork:
         if rig.virtual_image is not None:
             sizes = [(rig.virtual_image.width_px, rig.virtual_image.height_px)]
         return PROCESS_NBYTES + PIXEL_NBYTES * max(width * height for width, height in sizes)
-
-    def with_threads(self, threads: int) -> PictureWork:
-        """The same work with another number of threads.
-
-        Args:
-            threads: of one process.
-        """
-        return replace(self, threads=threads)
 
     def open(self) -> PictureAction:
         """Read trajectory and mount.

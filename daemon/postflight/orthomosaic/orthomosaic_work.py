@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, TypeAlias
 
@@ -73,14 +73,6 @@ class OrthomosaicWork:
     @property
     def memory_nbytes(self) -> int:
         return PROCESS_NBYTES + self.image_nbytes
-
-    def with_threads(self, threads: int) -> OrthomosaicWork:
-        """The same work with another number of threads.
-
-        Args:
-            threads: of one process.
-        """
-        return replace(self, threads=threads)
 
     def open(self) -> OrthomosaicAction:
         """Collect the inputs.

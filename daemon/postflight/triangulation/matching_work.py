@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,14 +64,6 @@ class MatchingWork:
     def memory_nbytes(self) -> int:
         images = min(CACHED_IMAGES, len(self.files)) + 2
         return PROCESS_NBYTES + images * PIXEL_NBYTES * self.image.width_px * self.image.height_px
-
-    def with_threads(self, threads: int) -> MatchingWork:
-        """The same work with another number of threads.
-
-        Args:
-            threads: of one process.
-        """
-        return replace(self, threads=threads)
 
     def open(self) -> MatchingAction:
         """Load the kernels by matching two small images."""

@@ -161,13 +161,14 @@ def test_two_runs_at_once_leave_every_product_set_complete(tmp_path: Path) -> No
     assert len(compared(mission)) == 30
 
 
+@pytest.mark.timeout(300)
 def test_a_killed_worker_and_a_killed_command_leave_nothing_undone(
     processed: Mission, tmp_path: Path
 ) -> None:
     mission = flown_mission(tmp_path, range(1, 61))
     command = [sys.executable, "-m", "daemon", "process", str(mission.path), "--processes", "2"]
     run = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-    limit = time.monotonic() + 60
+    limit = time.monotonic() + 150
     while len(list(mission.path.glob("L2/??????"))) < 5:
         assert time.monotonic() < limit and run.poll() is None
         time.sleep(0.02)

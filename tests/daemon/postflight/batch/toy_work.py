@@ -6,7 +6,7 @@ import errno
 import os
 import signal
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from daemon.mission.store.product_manifests import ClaimedElsewhereError
@@ -21,9 +21,6 @@ class ToyWork:
     threads: int = 1
     memory_nbytes: int = 1
     refuses: bool = False
-
-    def with_threads(self, threads: int) -> ToyWork:
-        return replace(self, threads=threads)
 
     def open(self) -> ToyAction:
         if self.refuses:
