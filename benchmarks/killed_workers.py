@@ -67,7 +67,7 @@ CONTINUE_STATUS: Final = 75
 class Killer(threading.Thread):
     """Kills workers and the scheduler at random, and starts the scheduler again.
 
-    A kill is due when so many exposures are done as the plan says, however fast the machine is.
+    A kill is due when so many exposures are done as the plan states, however fast the machine is.
     """
 
     def __init__(self, plan: Sequence[tuple[int, str]] = (), notes: NoteFile | None = None):
@@ -293,7 +293,7 @@ def without_kills(
 
 
 def one_pace(pristine: Mission, root: Path, workers: int) -> dict[str, float]:
-    """Pace of one run: of two processes where the folder's name says plain, else of a cluster."""
+    """Pace of one run: of two processes where the folder's name begins with plain, else of a cluster."""
     mission, notes = linked(pristine, root), root.with_suffix(".txt")
     notes.unlink(missing_ok=True)
     if root.name.startswith("plain"):
