@@ -5,6 +5,8 @@ PYTHON ?= python3
 BIN := .venv/bin
 # Processes that run tests side by side.
 WORKERS ?= 3
+# Images of containers set it; every program that tests start would compile all its modules again.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: setup wheel demo test test-busy release-check test-v4l2 check audit docs bench attack fuzz
 .PHONY: soak schemas clean
