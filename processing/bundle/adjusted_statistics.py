@@ -70,9 +70,9 @@ def statistics_of(
     if run.minimum_norm:
         motions = free_motions(layout, run.state, reduced)
         expected = scaled_directions(motions, reduced)
-        directions, _ = null_directions(reduced, layout.constraints, expected)
+        directions, _ = null_directions(reduced, expected)
         found = rank_defects(run.network, layout, run.state, reduced, directions=directions)
-    cofactor = cofactor_matrix(reduced, layout.constraints, directions=directions)
+    cofactor = cofactor_matrix(reduced, directions=directions)
     own, leverage, influence = spread_of(rows, reduced, cofactor)
     free_points = layout.eliminated_points
     held = layout.locked[free_points]

@@ -64,6 +64,15 @@ class BandMatrix:
         ]:
             part[:] = np.tril(part) + np.tril(part, -1).T
 
+    def add_to_diagonal(self, values: Array) -> None:
+        """Add values to the diagonal, in place.
+
+        Args:
+            values: by column, shape (c,).
+        """
+        order = self.order
+        self.values[order.row_offset + np.arange(len(order.columns))] += values[order.columns]
+
     def diagonal_added(self, values: Array) -> BandMatrix:
         """The matrix with values added to its diagonal.
 
@@ -73,44 +82,34 @@ class BandMatrix:
         Returns:
             A new matrix.
         """
-        order, result = self.order, self.values.copy()
-        result[order.row_offset + np.arange(len(order.columns))] += values[order.columns]
-        return BandMatrix(order, result)
+        result = BandMatrix(self.order, self.values.copy())
+        result.add_to_diagonal(values)
+        return result
 
-    def scaled(self, factor: Array) -> BandMatrix:
-        """Rows and columns multiplied.
+    def scale(self, factor: Array) -> None:
+        """Multiply rows and columns, in place.
 
         Args:
             factor: by column, shape (c,).
-
-        Returns:
-            A new matrix.
         """
-        result = BandMatrix(self.order, self.values.copy())
         by_place, begin = factor[self.order.columns], self.order.begin
         for k in range(self.order.blocks):
             rows = by_place[begin[k] : begin[k + 1], None]
-            before, own = result.blocks(k)
+            before, own = self.blocks(k)
             before *= rows * by_place[begin[max(k - 1, 0)] : begin[k]]
             own *= rows * by_place[begin[k] : begin[k + 1]]
-        border = result.border()
+        border = self.border()
         border *= by_place[self.order.local :, None] * by_place
-        return result
 
-    def with_border_rows(self, rows: Array) -> BandMatrix:
-        """The matrix with the products of rows added whose entries are in the border.
+    def add_border_rows(self, rows: Array) -> None:
+        """Add the products of rows whose entries are in the border, in place.
 
         Args:
             rows: shape (k, c).
-
-        Returns:
-            A new matrix.
         """
-        result = BandMatrix(self.order, self.values.copy())
         part = rows[:, self.order.columns[self.order.local :]]
-        corner = result.border()[:, self.order.local :]
+        corner = self.border()[:, self.order.local :]
         corner += part.T @ part
-        return result
 
     def __matmul__(self, right: Array) -> Array:
         order = self.order

@@ -13,11 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.bundle.network import Network, NetworkError
-from processing.bundle.normal_equations import ReducedEquations
+from processing.bundle.normal_equations import MIN_INFORMATION, ReducedEquations
 from processing.bundle.reduced_solution import (
-    MIN_INFORMATION,
     Cofactor,
-    constrained_matrix,
     with_product,
 )
 from processing.bundle.unknowns import ParameterLayout, ParameterValues
@@ -105,8 +103,7 @@ def free_motions(
     unit[own, np.arange(int(own.sum()))] = 1.0 / length[own]
     # Orthonormal directions in the scaled space, as combinations of the seven.
     basis, triangle = np.linalg.qr((unit.T @ scaled).T)
-    matrix, _ = constrained_matrix(reduced, layout.constraints)
-    values, vectors = np.linalg.eigh(basis.T @ (matrix @ basis))
+    values, vectors = np.linalg.eigh(basis.T @ (reduced.matrix @ basis))
     null = vectors[:, values < MIN_INFORMATION]
     combinations = (unit @ np.linalg.solve(triangle, null)).T
     ground = state.points - centre

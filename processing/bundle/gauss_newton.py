@@ -148,30 +148,6 @@ def iterate(run: Run) -> tuple[Equations, ReducedEquations]:
     )
 
 
-def solved(run: Run, reduced: ReducedEquations) -> GaussNewtonStep:
-    """Corrections of a run.
-
-    Args:
-        run: variables of the adjustment; with `minimum_norm` its free motions are left out.
-        reduced: its reduced equations.
-
-    Returns:
-        The step.
-
-    Raises:
-        RankDefectError: directions without information.
-    """
-    directions = None
-    if run.minimum_norm:
-        directions = scaled_directions(free_motions(run.layout, run.state, reduced), reduced)
-    try:
-        return solve(reduced, run.layout.constraints, directions=directions)
-    except SingularError as error:
-        raise RankDefectError(
-            rank_defects(run.network, run.layout, run.state, error.reduced)
-        ) from None
-
-
 def _refuse_unseparated_times(run: Run, reduced: ReducedEquations) -> None:
     """Name delays and readout times that the motion of the rig does not separate from the rest."""
     layout = run.layout
@@ -179,10 +155,7 @@ def _refuse_unseparated_times(run: Run, reduced: ReducedEquations) -> None:
     times = times[times >= 0]
     if not times.size:
         return
-    try:
-        cofactor = cofactor_matrix(reduced, layout.constraints)
-    except SingularError as error:
-        raise RankDefectError(rank_defects(run.network, layout, run.state, error.reduced)) from None
+    cofactor = cofactor_matrix(reduced)
     lost = times[np.sqrt(cofactor.diagonal()[times]) > _USELESS_TIME_S]
     if not lost.size:
         return
@@ -237,8 +210,18 @@ class _Trial:
     def step(self, damping: float) -> tuple[ReducedEquations, GaussNewtonStep]:
         """Reduced equations with damping, and the corrections."""
         held = self._held if self._held.any() else None
-        reduced = reduced_equations(self._rows, self._run.layout, damping, held)
-        return reduced, solved(self._run, reduced)
+        run, directions = self._run, None
+        reduced = reduced_equations(self._rows, run.layout, damping, held)
+        if run.minimum_norm:
+            motions = free_motions(run.layout, run.state, reduced)
+            directions = scaled_directions(motions, reduced)
+        try:
+            return reduced, solve(reduced, directions=directions)
+        except SingularError:
+            # Again, for a factor of blocks is written in the place of the matrix.
+            reduced = reduced_equations(self._rows, run.layout, damping, held)
+            found = rank_defects(run.network, run.layout, run.state, reduced)
+            raise RankDefectError(found) from None
 
     def take(self, step: GaussNewtonStep, damping: Damping) -> bool:
         """Take the step, or a damped one that lowers the sum of squares; whether there is one."""

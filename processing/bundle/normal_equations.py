@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from processing.bundle.block_band import BandMatrix
+from processing.bundle.block_band import BandFactor, BandMatrix
 from processing.bundle.eliminated_products import add_products
 from processing.bundle.equation_rows import Equations
 from processing.bundle.network import NetworkError
@@ -29,6 +29,10 @@ Matrix = Array | BandMatrix
 MAX_COLUMNS = 150_000
 """Beyond this even the equations of the object points do not fit into 16 GiB."""
 
+MIN_INFORMATION = 1e-11
+"""Of the reduced matrix over the diagonal it had before points were eliminated; a datum defect
+leaves 1e-14."""
+
 _DENSE_FILL = 0.04
 _HELD_WEIGHT = 1e6
 
@@ -38,8 +42,13 @@ class ReducedEquations:
     """Normal equations of the columns after elimination of the points.
 
     Attributes:
-        matrix, right: (c, c), (c,): reduced normal equations; in the blocks of `layout.order`.
+        matrix: (c, c) reduced normal matrix of the unknowns multiplied by `scale`, with C'C of
+            the constraint rows added: that leaves the solution under C dx = 0 as it is and gives
+            its directions information. In the blocks of `layout.order`; `band_factor` overwrites
+            it.
+        right: (c,) right-hand side of the unknowns as they are.
         scale: (c,) square roots of the diagonal before elimination.
+        constraints: (k, c) rows of norm 1 of the scaled unknowns.
         point_factor: (p, 3, 3) inverse transposed Cholesky factor of each point: point rows times
             it are orthonormal.
         point_rows: (m, 3) those rows.
@@ -55,6 +64,7 @@ class ReducedEquations:
     matrix: Matrix
     right: Array
     scale: Array
+    constraints: Array
     point_factor: Array
     point_rows: Array
     row_point: Indices
@@ -66,6 +76,15 @@ class ReducedEquations:
     design_dense: Array
     damping: float
     point_diagonal: Array
+
+    @cached_property
+    def band_factor(self) -> BandFactor | None:
+        """Factor of a matrix in blocks, in its place; None: directions without information.
+
+        The matrix of a large block takes gigabytes and is not stored twice.
+        """
+        assert isinstance(self.matrix, BandMatrix)
+        return self.matrix.factor(MIN_INFORMATION)
 
     @cached_property
     def coupling_sparse(self) -> sparse.csr_array:
@@ -196,14 +215,26 @@ def reduced_equations(
         border[np.ix_(of_thin[tied] - order.local, of_dense)] += across[tied, :-1]
         border[np.ix_(of_dense - order.local, of_dense)] += own_dense
         if damping > 0.0:
-            matrix = matrix.diagonal_added(damping * diagonal)
+            matrix.add_to_diagonal(damping * diagonal)
+    scale = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+    constraints = layout.constraints / scale
+    constraints /= np.linalg.norm(constraints, axis=1, keepdims=True)
+    if isinstance(matrix, BandMatrix):
+        matrix.scale(1.0 / scale)
+        matrix.add_border_rows(constraints)
+    else:
+        matrix /= scale[:, None]
+        matrix /= scale
+        if len(constraints):
+            matrix += constraints.T @ constraints
     right = np.zeros(columns)
     right[thin] = across[:, -1]
     right[dense] = design_dense.T @ equations.misclosure - coupling_dense.T @ point_right
     return ReducedEquations(
         matrix=matrix,
         right=right,
-        scale=np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0)),
+        scale=scale,
+        constraints=constraints,
         point_factor=factor,
         point_rows=own,
         row_point=equations.point,

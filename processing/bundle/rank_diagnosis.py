@@ -19,7 +19,7 @@ from processing import ProcessingError
 from processing.bundle.free_datum import motion_columns
 from processing.bundle.network import Network
 from processing.bundle.normal_equations import ReducedEquations
-from processing.bundle.reduced_solution import constrained_matrix, weak_directions
+from processing.bundle.reduced_solution import weak_directions
 from processing.bundle.unknowns import ParameterLayout, ParameterValues, Unknown
 
 Array = NDArray[np.float64]
@@ -81,8 +81,7 @@ def rank_defects(
     Source: docs/explanation/mathematics/bundle.md#rank-and-free-networks.
     """
     if directions is None:
-        matrix, _ = constrained_matrix(reduced, layout.constraints)
-        directions = weak_directions(matrix)
+        directions = weak_directions(reduced.matrix)
     none = directions
     if not none.shape[1]:
         return ()

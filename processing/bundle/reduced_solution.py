@@ -14,23 +14,19 @@ from scipy import linalg
 
 from processing import ProcessingError
 from processing.bundle.block_band import BandCofactor, BandFactor, BandMatrix
-from processing.bundle.normal_equations import Matrix, ReducedEquations
+from processing.bundle.normal_equations import MIN_INFORMATION, Matrix, ReducedEquations
 
 Array = NDArray[np.float64]
 
 Cofactor = Array | BandCofactor
 
 _SUBSPACE, _SUBSPACE_STEPS = 16, 6
-MIN_INFORMATION = 1e-11
-"""Of the reduced matrix over the diagonal it had before points were eliminated; a datum defect
-leaves 1e-14."""
 
 
 class SingularError(ProcessingError, ValueError):
-    """The reduced matrix has directions without information; `reduced` is for the diagnosis."""
+    """The reduced matrix has directions without information."""
 
-    def __init__(self, reduced: ReducedEquations) -> None:
-        self.reduced = reduced
+    def __init__(self) -> None:
         super().__init__("the normal equations are singular")
 
 
@@ -46,38 +42,11 @@ class GaussNewtonStep:
     predicted_decrease: float
 
 
-def constrained_matrix(reduced: ReducedEquations, constraints: Array) -> tuple[Matrix, Array]:
-    """The scaled reduced matrix with constraints added, and the scaled constraint rows of norm 1.
-
-    Adding C'C leaves the solution under C dx = 0 as it is and gives its directions information.
-
-    Args:
-        reduced: from `reduced_equations`.
-        constraints: rows, shape (k, c); constraints @ dx = 0.
-
-    Returns:
-        Matrix, shape (c, c), of unknowns multiplied by `reduced.scale`, and rows, shape (k, c), of
-        the same.
-    """
-    matrix = reduced.matrix
-    if isinstance(matrix, BandMatrix):
-        scaled: Matrix = matrix.scaled(1.0 / reduced.scale)
-    else:
-        scaled = matrix / reduced.scale[:, None] / reduced.scale
-    if not len(constraints):
-        return scaled, constraints
-    rows = constraints / reduced.scale
-    rows = rows / np.linalg.norm(rows, axis=1, keepdims=True)
-    if isinstance(scaled, BandMatrix):
-        return scaled.with_border_rows(rows), rows
-    return scaled + rows.T @ rows, rows
-
-
 def weak_directions(matrix: Matrix) -> Array:
     """Directions of a scaled matrix with less information than `MIN_INFORMATION`.
 
     Args:
-        matrix: from `constrained_matrix`.
+        matrix: of `ReducedEquations`.
 
     Returns:
         Orthonormal, shape (c, n); at least the weakest.
@@ -89,14 +58,11 @@ def weak_directions(matrix: Matrix) -> Array:
     return np.asarray(vectors[:, : max(1, int((values < MIN_INFORMATION).sum()))])
 
 
-def null_directions(
-    reduced: ReducedEquations, constraints: Array, expected: Array
-) -> tuple[Array, bool]:
+def null_directions(reduced: ReducedEquations, expected: Array) -> tuple[Array, bool]:
     """Directions without information.
 
     Args:
         reduced: from `reduced_equations`.
-        constraints: rows, shape (k, c).
         expected: orthonormal directions in the scaled unknowns that have none, shape (c, d).
 
     Returns:
@@ -106,10 +72,10 @@ def null_directions(
     Raises:
         SingularError: a matrix in blocks has other directions without information.
     """
-    matrix, _ = constrained_matrix(reduced, constraints)
+    matrix = reduced.matrix
     if isinstance(matrix, BandMatrix):
         if _held(matrix, expected).factor(MIN_INFORMATION) is None:
-            raise SingularError(reduced)
+            raise SingularError
         return expected, True
     if len(matrix) and _cholesky(matrix + expected @ expected.T) is not None:
         return expected, True
@@ -117,14 +83,11 @@ def null_directions(
     return np.asarray(vectors[:, values < MIN_INFORMATION]), False
 
 
-def solve(
-    reduced: ReducedEquations, constraints: Array, *, directions: Array | None = None
-) -> GaussNewtonStep:
+def solve(reduced: ReducedEquations, *, directions: Array | None = None) -> GaussNewtonStep:
     """Solve the reduced equations and go back to the points.
 
     Args:
         reduced: from `reduced_equations`.
-        constraints: rows, shape (k, c); constraints @ dx = 0.
         directions: a free network: the shortest (scaled) correction, without these orthonormal
             directions, shape (c, d), and others that nothing determines; None: an error.
 
@@ -135,11 +98,10 @@ def solve(
         SingularError: directions without information.
     """
     if len(reduced.right):
-        matrix, rows = constrained_matrix(reduced, constraints)
-        right = reduced.right / reduced.scale
-        inverse = _inverse_action(matrix, reduced, directions)
+        right, rows = reduced.right / reduced.scale, reduced.constraints
+        inverse = _inverse_action(reduced, directions)
         dx = inverse(right)
-        if len(constraints):
+        if len(rows):
             spread = inverse(rows.T)
             dx = dx - spread @ np.linalg.lstsq(rows @ spread, rows @ dx, rcond=None)[0]
         dx = dx / reduced.scale
@@ -158,14 +120,11 @@ def solve(
     return GaussNewtonStep(dx, dpoints, predicted_decrease)
 
 
-def cofactor_matrix(
-    reduced: ReducedEquations, constraints: Array, *, directions: Array | None = None
-) -> Cofactor:
+def cofactor_matrix(reduced: ReducedEquations, *, directions: Array | None = None) -> Cofactor:
     """Cofactors of the columns, constraints and eliminated points taken into account.
 
     Args:
         reduced: from `reduced_equations`.
-        constraints: rows, shape (k, c); constraints @ dx = 0.
         directions: all that nothing determines, orthonormal in the scaled unknowns, shape (c, d);
             they have no variance. None: an error where there are any.
 
@@ -178,19 +137,19 @@ def cofactor_matrix(
     """
     if not len(reduced.right):
         return np.zeros((0, 0))
-    matrix, rows = constrained_matrix(reduced, constraints)
+    matrix, rows = reduced.matrix, reduced.constraints
     if isinstance(matrix, BandMatrix):
-        return _band_cofactor(matrix, reduced, rows, directions)
+        return _band_cofactor(matrix, reduced, directions)
     if directions is not None:
         matrix = matrix + directions @ directions.T
     factor = _factor(matrix, reduced)
     inverse, info = linalg.lapack.dpotri(factor, lower=1)
     if info != 0:
-        raise SingularError(reduced)
+        raise SingularError
     inverse = np.tril(inverse) + np.tril(inverse, -1).T
     if directions is not None:
         inverse -= directions @ directions.T
-    if len(constraints):
+    if len(rows):
         spread = inverse @ rows.T
         inverse -= spread @ np.linalg.pinv(rows @ spread) @ spread.T
     return np.asarray(inverse / reduced.scale[:, None] / reduced.scale)
@@ -213,13 +172,9 @@ def with_product(cofactor: Cofactor, left: Array, right: Array) -> Cofactor:
 
 
 def _band_cofactor(
-    matrix: BandMatrix, reduced: ReducedEquations, rows: Array, directions: Array | None
+    matrix: BandMatrix, reduced: ReducedEquations, directions: Array | None
 ) -> BandCofactor:
-    if directions is not None:
-        matrix = _held(matrix, directions)
-    factor = matrix.factor(MIN_INFORMATION)
-    if factor is None:
-        raise SingularError(reduced)
+    factor, rows = _band_factor(matrix, reduced, directions), reduced.constraints
     result = factor.inverse(reduced.scale)
     if directions is not None:
         # P Z P with P = 1 - G G', in scaled unknowns; then back to columns.
@@ -235,10 +190,23 @@ def _band_cofactor(
     return result
 
 
+def _band_factor(
+    matrix: BandMatrix, reduced: ReducedEquations, directions: Array | None
+) -> BandFactor:
+    """Factor with the directions held, in a copy, or without any, in the place of the matrix."""
+    if directions is None:
+        factor = reduced.band_factor
+    else:
+        factor = _held(matrix, directions).factor(MIN_INFORMATION)
+    if factor is None:
+        raise SingularError
+    return factor
+
+
 def _held(matrix: BandMatrix, directions: Array) -> BandMatrix:
-    """The matrix with as many unknowns held as there are directions without information."""
+    """A copy with as many unknowns held as there are directions without information."""
     if not directions.shape[1]:
-        return matrix
+        return matrix.diagonal_added(np.zeros(len(directions)))
     _, _, pivots = linalg.qr(directions.T, pivoting=True, mode="economic")
     hold = np.zeros(len(directions))
     hold[pivots[: directions.shape[1]]] = 1.0
@@ -262,7 +230,7 @@ def _factor(matrix: Array, reduced: ReducedEquations) -> Array:
     """Lower Cholesky factor, refused where a pivot shows a direction without information."""
     factor = _cholesky(matrix)
     if factor is None:
-        raise SingularError(reduced)
+        raise SingularError
     return factor
 
 
@@ -274,8 +242,9 @@ def _cholesky(matrix: Array) -> Array | None:
 
 
 def _inverse_action(
-    matrix: Matrix, reduced: ReducedEquations, directions: Array | None
+    reduced: ReducedEquations, directions: Array | None
 ) -> Callable[[Array], Array]:
+    matrix = reduced.matrix
     if isinstance(matrix, BandMatrix):
         return _band_action(matrix, reduced, directions)
     if directions is None:
@@ -299,11 +268,7 @@ def _inverse_action(
 def _band_action(
     matrix: BandMatrix, reduced: ReducedEquations, directions: Array | None
 ) -> Callable[[Array], Array]:
-    if directions is not None:
-        matrix = _held(matrix, directions)
-    factor: BandFactor | None = matrix.factor(MIN_INFORMATION)
-    if factor is None:
-        raise SingularError(reduced)
+    factor = _band_factor(matrix, reduced, directions)
     if directions is None:
         return factor.solve
 
