@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import ClassVar, Final
 
 from drivers import DriverError
-from drivers.cameras.aravis.byte_order import swapped_sentence
 from drivers.cameras.aravis.camera import AravisCamera, ClockLatch
 from drivers.cameras.aravis.camera_access import ControlDeniedError
 from drivers.cameras.aravis.frame_record import frame_record, frame_status
@@ -30,7 +29,8 @@ from drivers.cameras.aravis.gvcp import (
 from drivers.cameras.aravis.library import OPENING, aravis_error
 from drivers.cameras.aravis.ptp import SLAVE
 from drivers.cameras.aravis.settings import AravisSettings
-from drivers.cameras.aravis.stream import FrameStream, ReceivedFrame, unreadable_chunks_sentence
+from drivers.cameras.aravis.stream import FrameStream, ReceivedFrame
+from drivers.cameras.aravis.stream_faults import restarted_sentence, stream_faults
 from drivers.cameras.head_device import HeadDevice
 from drivers.contract import (
     DeviceError,
@@ -494,37 +494,16 @@ class AravisHead(AravisSettings, HeadDevice):
         self._of_stream = now
         if now["underruns"] > before["underruns"]:
             self._report_underrun()
-        if now["kernel_drops"] > before["kernel_drops"]:
-            self.emitter.emit_throttled(
-                "kernel-drops",
-                f"The kernel dropped {now['kernel_drops']} packets of the head {self.name}, since "
-                "the buffer of their socket was full. Raise net.core.rmem_max and "
-                "socket_buffer_bytes, and end other programs.",
-            )
-        if now["other_senders"] > before["other_senders"]:
-            self._report_other_senders(session, now["other_senders"])
-        if now["chunks_unreadable"] > before["chunks_unreadable"]:
-            self.emitter.emit_throttled("chunks-unreadable", unreadable_chunks_sentence(self.name))
-        if now["frames_swapped"] > before["frames_swapped"]:
-            self.emitter.emit_throttled(
-                "byte-order", swapped_sentence(self.name, str(self.byte_order))
-            )
+        for event, sentence in stream_faults(
+            self.name,
+            before,
+            now,
+            others=session.stream.others or f"only {self.address} is accepted",
+            byte_order=str(self.byte_order),
+        ):
+            self.emitter.emit_throttled(event, sentence)
         if session.stream.restart_if_behind():
-            self.emitter.emit_throttled(
-                "stream-restarted",
-                f"The head {self.name} numbered its frames out of order, so they were dropped as "
-                "old. The stream was restarted; one exposure may have no frame. Check the head's "
-                "power supply and firmware.",
-            )
-
-    def _report_other_senders(self, session: _Session, count: int) -> None:
-        details = session.stream.others or f"only {self.address} is accepted"
-        self.emitter.emit_throttled(
-            "other-sender",
-            f"{count} datagrams of other senders arrived at the ports of head {self.name} and were "
-            f"dropped, {details}. Disconnect the other sender, or connect the heads to a separate "
-            "network.",
-        )
+            self.emitter.emit_throttled("stream-restarted", restarted_sentence(self.name))
 
     # Closing
 

@@ -77,23 +77,6 @@ def bits_of(pixel_format: str) -> int:
     return int(found[1]) if found else 16
 
 
-def swapped_sentence(head: str, byte_order: str) -> str:
-    """What it means that pixels come in the other byte order, and the remedy.
-
-    Args:
-        head: name of the head.
-        byte_order: as it is configured.
-
-    Returns:
-        Sentences for the operator.
-    """
-    other = "big" if byte_order == "little" else "little"
-    return (
-        f"The head {head} sends the bytes of its pixels in the other order: byte_order is "
-        f'"{byte_order}". Its images cannot be used. Set byte_order = "{other}".'
-    )
-
-
 def _roughness(sample: NDArray[Any]) -> float:
     """Mean difference of horizontal neighbours."""
     import numpy as np

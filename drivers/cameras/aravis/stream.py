@@ -330,22 +330,6 @@ class FrameStream:
         stream.set_property("frame-retention", round(settings.frame_retention_ms * 1e3))
 
 
-def unreadable_chunks_sentence(head: str) -> str:
-    """What it means that chunk data cannot be read, and the remedy.
-
-    Args:
-        head: name of the head.
-
-    Returns:
-        Sentences for the operator.
-    """
-    return (
-        f"The head {head} sent frames whose chunk data cannot be read. They are used with the time "
-        "of their leader packet and without an exposure counter. Update the head's firmware, or "
-        "set chunks = false."
-    )
-
-
 def receive_buffer_limit() -> int:
     """The largest socket buffer that the kernel grants.
 
