@@ -153,7 +153,9 @@ def completed(network: Network) -> Network:
     if problems:
         raise NetworkError(problems)
     missing = np.asarray(np.isnan(xyz).any(axis=1))
-    # Points that no two images see take no part; any place does.
+    # Exposures without image points and points that no two images see take no part; any place does.
+    station[np.isnan(station).any(axis=1)] = 0.0
+    attitude[np.isnan(attitude).any(axis=(1, 2))] = np.eye(3)
     xyz[missing] = np.nanmean(xyz, axis=0) if not missing.all() else 0.0
     return replace(
         network,

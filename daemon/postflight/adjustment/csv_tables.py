@@ -122,7 +122,7 @@ def read_table(path: Path, needed: Sequence[str], known: Sequence[str]) -> CsvTa
         if not bare:
             continue
         if bare.startswith("#"):
-            if _is_row(bare, columns) and len(problems) < _MAX_PROBLEMS:
+            if is_row(bare, columns) and len(problems) < _MAX_PROBLEMS:
                 name = bare.split(",")[0]
                 problems.append(
                     f"{path.name}:{number}: {name!r} looks like a name, and # begins a remark: "
@@ -157,8 +157,16 @@ def read_table(path: Path, needed: Sequence[str], known: Sequence[str]) -> CsvTa
     return CsvTable(path.name, columns, rows, lines, header)
 
 
-def _is_row(remark: str, columns: Sequence[str]) -> bool:
-    """Whether a line that begins with # has the cells of a row and no space after the #."""
+def is_row(remark: str, columns: Sequence[str]) -> bool:
+    """Whether a line that begins with # has the cells of a row and no space after the #.
+
+    Args:
+        remark: the line.
+        columns: of the table.
+
+    Returns:
+        True where a name that begins with # was probably meant.
+    """
     return len(columns) > 1 and remark[1:2].isalnum() and remark.count(",") == len(columns) - 1
 
 

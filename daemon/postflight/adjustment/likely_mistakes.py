@@ -1,4 +1,4 @@
-"""Mistakes that explain a bad adjustment: control of another unit, mirrored image coordinates.
+"""Mistakes that explain a bad adjustment: attitudes, units, mirrored coordinates, separate blocks.
 
 The trials cost an adjustment and are made only where sigma0 is far off or nothing converged.
 """
@@ -11,8 +11,15 @@ from typing import Final
 
 import numpy as np
 
+from daemon.postflight.adjustment.given_projections import (
+    misplaced_control,
+    principal_distance_ratio,
+    turned_attitudes,
+)
+from daemon.postflight.adjustment.separate_blocks import unplaced_blocks
 from processing import ProcessingError
-from processing.bundle.adjust import AdjustmentSettings, adjust
+from processing.bundle.adjust import Adjustment, AdjustmentSettings, adjust
+from processing.bundle.camera_model import principal_distance_mm
 from processing.bundle.initial_values import completed
 from processing.bundle.network import Network, NetworkError
 from processing.bundle.rank_diagnosis import RankDefect
@@ -24,6 +31,8 @@ _BETTER: Final = 0.2
 """Share of the sigma0 as given below which they explain it."""
 
 _MAX_ITERATIONS: Final = 15
+_OTHER_DISTANCE: Final = 1.2
+"""Ratio of principal distances from which another one is tried."""
 
 _UNITS: Final = (
     (1000.0, "millimetres"),
@@ -38,10 +47,10 @@ _MAX_PAIRS_OF: Final = 60
 
 
 def likely_mistakes(network: Network, sigma0: float | None) -> list[str]:
-    """Compare the scale of the control with that of the exposures, and mirror image coordinates.
+    """Turn attitudes, mirror image coordinates, compare scales, and try another principal distance.
 
-    A rotation by 180 degrees, such as both signs reversed, is taken by the attitudes and is no
-    mistake.
+    A rotation of image coordinates by 180 degrees, such as both signs reversed, is taken by the
+    attitudes and is no mistake where these are not given.
 
     Args:
         network: as given, before starting values were completed.
@@ -50,7 +59,13 @@ def likely_mistakes(network: Network, sigma0: float | None) -> list[str]:
     Returns:
         A sentence for what explains the observations; otherwise empty.
     """
-    return _control_of_another_unit(network) or _mirrored(network, sigma0)
+    return (
+        turned_attitudes(network)
+        or _mirrored(network, sigma0)
+        or _another_principal_distance(network, sigma0)
+        or _control_of_another_unit(network)
+        or misplaced_control(network)
+    )
 
 
 def control_sentences(network: Network, defects: Sequence[RankDefect]) -> tuple[str, ...]:
@@ -61,8 +76,11 @@ def control_sentences(network: Network, defects: Sequence[RankDefect]) -> tuple[
         defects: directions that nothing determines.
 
     Returns:
-        One sentence in place of those of the rotations and the scale about the control points.
+        One sentence for each block that nothing places, or one in place of those of the rotations
+        and the scale about the control points.
     """
+    if unplaced := unplaced_blocks(network):
+        return tuple(unplaced)
     seen = np.unique(network.image_points.point)
     known = np.asarray((np.nan_to_num(network.points.sigma_m, nan=-1.0) >= 0.0).all(axis=1))
     control = [network.points.names[k] for k in seen if known[k] and not _is_direction(network, k)]
@@ -128,18 +146,44 @@ def _control_of_another_unit(network: Network) -> list[str]:
     ]
 
 
-def _mirrored(network: Network, sigma0: float | None) -> list[str]:
+def _explaining(network: Network, sigma0: float | None) -> Adjustment | None:
+    """The adjustment of a changed network if its sigma0 is better by far than that as given."""
     limit = SUSPICIOUS_SIGMA0 if sigma0 is None else _BETTER * sigma0
+    try:
+        settings = AdjustmentSettings(max_iterations=_MAX_ITERATIONS)
+        result = adjust(completed(network), settings)
+    except (ProcessingError, ValueError, ArithmeticError, np.linalg.LinAlgError):
+        return None
+    return result if result.redundancy > 0 and result.sigma0 < limit else None
+
+
+def _another_principal_distance(network: Network, sigma0: float | None) -> list[str]:
+    """Free principal distances, from that which the given orientations and coordinates have."""
+    ratio = principal_distance_ratio(network)
+    if 1.0 / _OTHER_DISTANCE < ratio < _OTHER_DISTANCE:
+        return []
+    cameras = tuple(
+        replace(camera, f_mm=camera.f_mm * ratio, free=camera.free | {"df"})
+        for camera in network.cameras
+    )
+    result = _explaining(replace(network, cameras=cameras), sigma0)
+    if result is None:
+        return []
+    found = [
+        f"{principal_distance_mm(camera, result.state.interior[k]):.5g} mm (f_mm {given.f_mm:g})"
+        for k, (camera, given) in enumerate(zip(cameras, network.cameras, strict=True))
+    ]
+    return [
+        f"the principal distance is wrong: estimated, it is {', '.join(found)} and sigma0 is "
+        f"{result.sigma0:.4g}"
+    ]
+
+
+def _mirrored(network: Network, sigma0: float | None) -> list[str]:
     table = network.image_points
     mirrored = replace(table, xy_mm=table.xy_mm * np.array([1.0, -1.0]))
-    try:
-        result = adjust(
-            completed(replace(network, image_points=mirrored)),
-            AdjustmentSettings(max_iterations=_MAX_ITERATIONS),
-        )
-    except (ProcessingError, ValueError, ArithmeticError, np.linalg.LinAlgError):
-        return []
-    if result.redundancy <= 0 or not result.sigma0 < limit:
+    result = _explaining(replace(network, image_points=mirrored), sigma0)
+    if result is None:
         return []
     return [
         "image coordinates are mirrored: y points down (as rows of pixels do), x and y are "

@@ -14,6 +14,7 @@ from daemon.postflight.adjustment.head_time_report import print_times, times_of
 from daemon.postflight.adjustment.likely_mistakes import SUSPICIOUS_SIGMA0
 from daemon.postflight.adjustment.project import CheckPoints
 from daemon.postflight.adjustment.reliability_report import reliability_summary, unit_of
+from daemon.postflight.adjustment.separate_blocks import separate_blocks
 from daemon.terminal.console import Console, light_table
 from processing.bundle.adjust import Adjustment
 from processing.bundle.adjustment_results import (
@@ -33,6 +34,7 @@ from processing.bundle.self_calibration import parameter_count
 Array = NDArray[np.float64]
 
 _GRADS_PER_RAD = 200.0 / math.pi
+_LEFT_OUT_SHARE = 0.25
 _MAX_LISTED = 20
 
 
@@ -404,7 +406,21 @@ def _cautions(result: Adjustment) -> list[str]:
             f"sigma0 is {result.sigma0:.5g}: image coordinates may be of another unit, y may point "
             "down, a sigma may be of another unit, or blunders are in the observations (--reject)"
         )
+    groups = separate_blocks(result.network)
+    if len(groups) > 1:
+        counts = ", ".join(str(len(group)) for group in groups[:5])
+        found.append(
+            f"the images form {len(groups)} blocks that no object point connects ({counts} "
+            "images): each rests on its own control"
+        )
     points, seen = result.network.points, result.network.image_points.point
+    several = np.bincount(seen, minlength=len(points.names)) >= 2
+    lost = int((several & result.left_out).sum())
+    if result.sigma0 <= SUSPICIOUS_SIGMA0 and lost > _LEFT_OUT_SHARE * several.sum():
+        found.append(
+            f"{lost} of {int(several.sum())} object points in two or more images are left out, for "
+            "their rays do not fix them: are images, or their starting positions, at one place?"
+        )
     control = np.flatnonzero((np.nan_to_num(points.sigma_m, nan=-1.0) >= 0.0).any(axis=1))
     tied = np.concatenate([result.network.distances.point_a, result.network.distances.point_b])
     used = np.union1d(seen, tied)

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from daemon.mission.foreign_files import ForeignFileError, read_regular_file, within
 from daemon.mission.foreign_xml import XmlError, parse_xml
-from daemon.postflight.adjustment.csv_tables import ProjectError
+from daemon.postflight.adjustment.csv_tables import ProjectError, is_row
 from daemon.postflight.adjustment.project import CheckPoints
 from daemon.postflight.adjustment.project_file import AdjustSection, CameraSection, ProjectFile
 from daemon.postflight.importers.dbat_settings import HERE, filtered, read_settings
@@ -42,6 +42,12 @@ Array = NDArray[np.float64]
 
 _MAX_BYTES = 100_000_000
 ELEMENTS_MAX = 10_000
+_TEXTS = {"id", "im", "label", "path"}
+"""Columns that are no numbers."""
+
+_SIGMAS = ("sx", "sy", "sz", "sxy", "sxyz")
+_WHERE = "where"
+"""Key of a row for its file and line."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +86,12 @@ def _imported(script: Path, root: ElementTree.Element) -> ImportedProject:
     camera = _camera(script, given)
     if _text(script, camera, "unit") != "mm":
         raise ProjectError([f"{script.name}: a camera in {camera.findtext('unit')} is not read"])
-    width, height = (int(v) for v in _text(script, camera, "image").split(","))
+    size = _text(script, camera, "image").split(",")
+    if len(size) != 2 or not all(cell.strip().isdigit() and int(cell) > 0 for cell in size):
+        raise ProjectError(
+            [f"{script.name}: <image> is {','.join(size)!r}; width and height in pixels are right"]
+        )
+    width, height = (int(cell) for cell in size)
     sensor = _text(script, camera, "sensor").split(",")
     pixel_mm = float(sensor[1]) / height
     if sensor[0].strip() != "auto":
@@ -89,9 +100,13 @@ def _imported(script: Path, root: ElementTree.Element) -> ImportedProject:
             raise ProjectError([f"{script.name}: sensor {sensor} has no square pixels"])
     if _text(script, camera, "model") != "3":
         raise ProjectError([f"{script.name}: only lens model 3 can be imported"])
+    focal = _text(script, camera, "focal")
+    _refuse_value(f"{script.name}: <focal>", focal, is_sigma=False)
+    if float(focal) <= 0.0:
+        raise ProjectError([f"{script.name}: <focal> is {focal}; it is positive"])
     section = CameraSection(
         name=_text(script, camera, "name"),
-        f_mm=float(_text(script, camera, "focal")),
+        f_mm=float(focal),
         xp_mm=width / 2.0 * pixel_mm,
         yp_mm=-height / 2.0 * pixel_mm,
         model="centred",
@@ -161,9 +176,14 @@ def _network(
     point_names = list(dict.fromkeys([*control, *(row["id"] for row in seen)]))
     image_at = {name: k for k, name in enumerate(image_names)}
     point_at = {name: k for k, name in enumerate(point_names)}
-    missing = sorted({row["im"] for row in seen} - set(image_names))
+    missing = {row["im"]: row[_WHERE] for row in reversed(seen) if row["im"] not in image_at}
     if missing:
-        raise ProjectError([f"{script.name}: image points of images {missing[:5]} not listed"])
+        raise ProjectError(
+            [
+                f"{where}: image {name!r} is not among the images"
+                for name, where in [*missing.items()][:5]
+            ]
+        )
     uv = np.array([[float(row["x"]), float(row["y"])] for row in seen])
     sigma = np.array([_image_sigma(script, row) for row in seen]).reshape(-1, 2) * pixel_mm
     xyz, known = np.full((len(point_names), 3), np.nan), np.full((len(point_names), 3), np.nan)
@@ -201,10 +221,13 @@ def _network(
 
 
 def _image_sigma(script: Path, row: Mapping[str, str]) -> tuple[float, float]:
+    own = [float(row[name]) for name in ("sx", "sy") if name in row and "sxy" not in row]
     if "sxy" in row:
-        return float(row["sxy"]), float(row["sxy"])
-    if "sx" in row and "sy" in row:
-        return float(row["sx"]), float(row["sy"])
+        own = [float(row["sxy"])] * 2
+    if len(own) == 2:
+        if min(own) <= 0.0:
+            raise ProjectError([f"{row[_WHERE]}: a standard deviation of 0; it is positive"])
+        return own[0], own[1]
     raise ProjectError(
         [f"{script.name}: image points have no standard deviation; give a column or attribute sxy"]
     )
@@ -293,15 +316,40 @@ def _tables(
 def _rows(path: Path, columns: Sequence[str], constant: Mapping[str, str]) -> list[dict[str, str]]:
     rows = []
     for number, line in enumerate(_text_of(path).splitlines(), 1):
-        if not line.strip() or line.lstrip().startswith("#"):
+        bare = line.strip()
+        if bare.startswith("#") and is_row(bare, columns):
+            raise ProjectError(
+                [
+                    f"{path.name}:{number}: {bare.split(',')[0]!r} looks like a name, and # begins "
+                    "a remark: write a space after the # of a remark, or rename it"
+                ]
+            )
+        if not bare or bare.startswith("#"):
             continue
         cells = [cell.strip() for cell in line.split(",")]
         if len(cells) != len(columns):
             raise ProjectError(
                 [f"{path.name}:{number}: {len(cells)} values; {len(columns)} are right"]
             )
-        rows.append({**constant, **dict(zip(columns, cells, strict=True))})
+        row = {**constant, **dict(zip(columns, cells, strict=True))}
+        for column in row.keys() - _TEXTS:
+            _refuse_value(f"{path.name}:{number}: {column}", row[column], column in _SIGMAS)
+        rows.append({**row, _WHERE: f"{path.name}:{number}"})
+    if not rows:
+        raise ProjectError([f"{path.name}: no rows; a file of a script has some"])
     return rows
+
+
+def _refuse_value(what: str, text: str, is_sigma: bool) -> None:
+    """Refuse what is no number, and a negative standard deviation."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise ProjectError([f"{what} is {text!r}; a number is right"])
+    if is_sigma and value < 0.0:
+        raise ProjectError([f"{what} is {text}; a standard deviation is not negative"])
 
 
 def _at_base(script: Path, given: ElementTree.Element) -> Path:

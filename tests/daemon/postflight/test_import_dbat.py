@@ -192,3 +192,51 @@ def test_an_image_or_control_point_twice_is_refused_by_name(folder: Path) -> Non
     name = last.split(",")[0].strip()
     with pytest.raises(ProjectError, match=f"images {name} more than once"):
         import_dbat(folder / "script.xml")
+
+
+def _marks(folder: Path, line: int, new: str) -> None:
+    path = folder / "marks.txt"
+    lines = path.read_text().splitlines()
+    lines[line - 1] = new
+    path.write_text("\n".join(lines) + "\n")
+
+
+@pytest.mark.parametrize(
+    ("new", "sentence"),
+    [
+        ("6,1,12.5,abc", r"marks.txt:5: y is 'abc'; a number is right"),
+        ("6,1,nan,3.0", r"marks.txt:5: x is 'nan'; a number is right"),
+        ("#6,1,12.5,3.0", r"marks.txt:5: '#6' looks like a name"),
+        ("6,77,12.5,3.0", r"marks.txt:5: image '77' is not among the images"),
+        ("6,1,12.5", r"marks.txt:5: 3 values; 4 are right"),
+    ],
+)
+def test_a_wrong_row_is_one_sentence_with_file_and_line(folder: Path, new, sentence) -> None:
+    _marks(folder, 5, new)
+    with pytest.raises(ProjectError, match=sentence) as caught:
+        import_dbat(folder / "script.xml")
+    assert len(caught.value.problems) == 1
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "sentence"),
+    [
+        ("script.xml", 'sxy="0.5"', 'sxy="0"', r"marks.txt:1: a standard deviation of 0"),
+        ("script.xml", 'sxy="0.5"', 'sxy="-1"', r"marks.txt:1: sxy is -1; a standard deviation"),
+        ("script.xml", 'sxy="0.5"', 'sxy="a"', r"marks.txt:1: sxy is 'a'; a number"),
+        ("camera.xml", "<focal>.*</focal>", "<focal>0</focal>", r"<focal> is 0; it is positive"),
+        ("camera.xml", "<focal>.*</focal>", "<focal>x</focal>", r"<focal> is 'x'; a number"),
+        ("camera.xml", "<image>.*</image>", "<image>0,9</image>", r"<image> is '0,9'; width"),
+        ("camera.xml", "<image>.*</image>", "<image>9</image>", r"<image> is '9'; width"),
+        ("marks.txt", r"(?s).*", "# nothing\n", r"marks.txt: no rows"),
+    ],
+)
+def test_a_value_that_cannot_be_is_one_sentence(folder: Path, file, old, new, sentence) -> None:
+    path = folder / file
+    text = path.read_text()
+    changed = re.sub(old, new, text, count=1)
+    assert changed != text
+    path.write_text(changed)
+    with pytest.raises(ProjectError, match=sentence) as caught:
+        import_dbat(folder / "script.xml")
+    assert len(caught.value.problems) == 1
