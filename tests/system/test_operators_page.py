@@ -229,7 +229,8 @@ def test_a_flight_is_flown_from_the_page(
         record_property("trigger_to_verdict_s", [round(value, 2) for value in latencies_s])
         print(f"trigger to verdict on the page: {[round(value, 2) for value in latencies_s]} s")
         browser.wait_for("document.querySelectorAll('#rows tr').length === 4", 10)
-        browser.wait_for(f"document.querySelector('.line-label')?.innerText === '{LINE}'", 10)
+        planned = "import('/map.js').then((map) => map.planShown().line.join())"
+        browser.wait_for(f"{planned}.then((lines) => lines === '{LINE}')", 10)
         assert browser.text("#rows tr td:nth-child(3)") == LINE
         browser.wait_for("document.querySelector('#quicklook').naturalWidth > 0", 20)
         pictures_folder = os.environ.get("SYNTOPIC_PICTURES")

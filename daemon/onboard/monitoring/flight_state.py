@@ -19,6 +19,7 @@ from daemon.onboard.flight.fault_latches import (
     FaultLatches,
 )
 from daemon.onboard.flight.phases import Phase
+from daemon.onboard.monitoring.finite_values import finite
 from daemon.onboard.monitoring.live_map_state import LiveMapState
 from daemon.onboard.monitoring.previews import Preview
 
@@ -102,6 +103,7 @@ class FlightState:
 
     def apply(self, event: Mapping[str, Any]) -> None:
         """Apply one event of the service; an unknown kind is only listed."""
+        event = finite(event)
         if event.get("event") == "guidance":
             self.guidance = {key: value for key, value in event.items() if key != "event"}
             self.guidance_count += 1

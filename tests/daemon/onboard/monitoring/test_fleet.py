@@ -110,7 +110,7 @@ def test_what_needs_a_token_is_not_served_to_other_machines_without_one(
     assert len(served) == 4
 
 
-def test_the_reason_of_a_lost_connection_is_shown(tmp_path: Path) -> None:
+def test_the_reason_of_a_lost_connection_is_shown_and_that_values_are_old(tmp_path: Path) -> None:
     chromium()
     broken = FleetMember(parse_service_address("127.0.0.1:1"), AccessOptions(), _refused)
     broken.start()
@@ -125,8 +125,11 @@ def test_the_reason_of_a_lost_connection_is_shown(tmp_path: Path) -> None:
             browser.wait_for(
                 "document.querySelector('#aircraft .problem')?.innerText === 'token rejected'", 30
             )
-        server.should_exit = True
-        thread.join(30)
+            # What is shown stays, and the page states since when it is old.
+            server.should_exit = True
+            thread.join(30)
+            browser.wait_for("!document.querySelector('#connection-lost').hidden", 30)
+            assert "frozen" in browser.text("#connection-lost")
 
 
 def _refused(*_: Any) -> Iterator[dict[str, Any] | None]:

@@ -15,6 +15,9 @@ from tests.daemon.onboard.monitoring.page_service import WITHIN_S, Service
 from tests.support.browser import Browser, chromium
 from tests.support.npm import npm_package
 
+PLAN_SHOWN = "import('/map.js').then((map) => map.planShown())"
+"""Labels of the plan that are seen, by kind, and the number of areas of gaps."""
+
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -91,12 +94,12 @@ def test_a_flight_is_seen_as_it_happens(service: Service, browser: Browser) -> N
 def test_the_planned_line_is_on_the_map_with_the_holes_in_what_was_flown(
     service: Service, browser: Browser
 ) -> None:
-    browser.wait_for("document.querySelector('.line-label')?.innerText === 'A1'", WITHIN_S)
+    browser.wait_for(f"{PLAN_SHOWN}.then(({{ line }}) => line.join() === 'A1')", WITHIN_S)
     # Planned positions are thousands in a large plan: pixels of one canvas, no elements.
     browser.wait_for(
         """(({ width, height }, context) => context.getImageData(0, 0, width, height).data
             .some((value, k) => k % 4 === 3 && value))
-            (...[document.querySelector("#map .leaflet-places-pane canvas")]
+            (...[document.querySelector("#map .leaflet-plan-pane canvas")]
                 .flatMap((canvas) => [canvas, canvas.getContext("2d")]))""",
         WITHIN_S,
     )
@@ -106,7 +109,7 @@ def test_the_planned_line_is_on_the_map_with_the_holes_in_what_was_flown(
         for event in flight_events.exposure(number, "good", line="A1", north_m=north_m):
             service.emit(event)
     browser.wait_for("document.querySelectorAll('#segments tr').length === 1", WITHIN_S)
-    line, from_m, to_m, hectares, why, _ = browser.evaluate(
+    line, from_m, to_m, hectares, why = browser.evaluate(
         "[...document.querySelectorAll('#segments td')].map((cell) => cell.innerText)"
     )
     assert line == "A1"
@@ -115,8 +118,9 @@ def test_the_planned_line_is_on_the_map_with_the_holes_in_what_was_flown(
     assert float(hectares) > 0.5
     assert "of 2 images" in why
     assert "1 gap to re-fly" in browser.text("#coverage")
-    assert browser.evaluate("document.querySelectorAll('#map .gap-area').length") >= 1
-    assert "A1" in browser.text(".gap-label")
+    shown = browser.evaluate(PLAN_SHOWN)
+    assert shown["areas"] >= 1
+    assert shown["gap"] == ["✖ A1"]
     reported = browser.evaluate(
         "fetch('/api/v1/advice/fly-again.geojson').then((answer) => answer.json())"
     )
@@ -293,11 +297,13 @@ def test_axe_finds_nothing_serious(browser: Browser) -> None:
 def test_a_head_that_sends_no_image_draws_its_hole_on_the_map(
     service: Service, browser: Browser
 ) -> None:
-    pieces = browser.evaluate("document.querySelectorAll('#map .gap-area').length")
+    # What is in view is counted.
+    browser.evaluate("document.querySelector('#map-follow[aria-pressed=false]')?.click()")
+    pieces = browser.evaluate(f"{PLAN_SHOWN}.then(({{ areas }}) => areas)")
     for number, north_m in enumerate((816, 884, 952, 1020), start=20):
         for event in flight_events.exposure(number, "usable", line="A1", north_m=north_m):
             service.emit(event | ({"missing": ["SU00"]} if event["event"] == "sealed" else {}))
-    browser.wait_for(f"document.querySelectorAll('#map .gap-area').length > {pieces}", WITHIN_S)
+    browser.wait_for(f"{PLAN_SHOWN}.then(({{ areas }}) => areas > {pieces})", WITHIN_S)
     browser.wait_for("document.querySelector('#segments').innerText.includes('SU00')", WITHIN_S)
     assert "pan: " in browser.text("#segments")
     assert "of 2 images" in browser.text("#segments")

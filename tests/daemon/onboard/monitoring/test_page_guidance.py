@@ -239,7 +239,7 @@ def test_manual_verdict_and_retake_are_two_touches(service: Service, browser: Br
         {"event": "retake", "line": "A1 R1", "of": "A1", "number": 4, "at": at, "places_m": [5.0]}
     )
     browser.wait_for(
-        "document.querySelector('#map .retake-label')?.innerText.includes('A1 R1')", WITHIN_S
+        "import('/map.js').then((map) => map.planShown().retake.join() === '↻ A1 R1')", WITHIN_S
     )
 
 

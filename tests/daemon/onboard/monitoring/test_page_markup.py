@@ -31,7 +31,7 @@ PLANTED = "document.querySelectorAll('.planted, meta[http-equiv], [onerror], [on
 SHOWN_IN = (
     *("#missing", "#devices", "#faults", "#findings", "#temperatures", "#exposure-now"),
     *("#exposure-control", "#overlaps", "#disks", "#recovery", "#rows", "#chart-temperature"),
-    *("#segments", "#map .line-label", "#map .gap-label"),
+    "#segments",
 )
 HOSTILE_SVG = f"""<svg xmlns="http://www.w3.org/2000/svg" xmlns:h="http://www.w3.org/1999/xhtml"
  onload="window.planted=1"><script>window.planted=1</script><foreignObject>

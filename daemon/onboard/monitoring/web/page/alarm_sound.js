@@ -10,7 +10,8 @@ const LOUDNESS = 0.5;
 
 let context = null;
 let severity = null;
-let soundedMs = 0;
+// By a clock that no correction of the time sets back.
+let soundedMs = -Infinity;
 
 export const isSoundOn = () => localStorage.getItem("sound") !== "off";
 
@@ -54,7 +55,7 @@ export function soundFor(severities, isTest = false) {
   severity = next;
   document.body.dataset.sounding = next && isSoundOn() ? next : "";
   if (!next || !isSoundOn()) return undefined;
-  if (!isWorse && Date.now() - soundedMs < PATTERNS[next].repeatMs) return undefined;
-  soundedMs = Date.now();
+  if (!isWorse && performance.now() - soundedMs < PATTERNS[next].repeatMs) return undefined;
+  soundedMs = performance.now();
   return play(PATTERNS[next]);
 }

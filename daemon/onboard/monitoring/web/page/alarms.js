@@ -4,6 +4,7 @@ import { by, button, element, redraw } from "./dom.js";
 import { knows, locale, serverLanguage, serverText, t } from "./i18n.js";
 import { clock, span } from "./format.js";
 import { setBadge } from "./tabs.js";
+import { timeOfDay } from "./time_of_day.js";
 import { isSoundOn, setSound, soundFor, unlockSound } from "./alarm_sound.js";
 
 const MARKS = { warning: "✖", caution: "▲", info: "ℹ" };
@@ -30,8 +31,11 @@ function shelve(alarm, minutes) {
   sessionStorage.setItem(STORE, JSON.stringify([...shelved]));
 }
 
+// One that would last longer than any shelving is of a clock that was set back since.
 function dropExpired() {
-  for (const [id, untilMs] of shelved) if (untilMs <= Date.now()) shelve({ id }, 0);
+  const nowMs = Date.now();
+  const latestMs = nowMs + 60e3 * Math.max(...SHELVE_MINUTES);
+  for (const [id, untilMs] of shelved) if (untilMs <= nowMs || untilMs > latestMs) shelve({ id }, 0);
 }
 
 const secondsSince = (nowNs, thenNs) => nowNs == null || thenNs == null ? null : (Number(nowNs) - Number(thenNs)) * 1e-9;
@@ -49,7 +53,7 @@ function ofPage(alarm) {
   return {
     id: `page ${alarm.code}`, code: alarm.code, severity: alarm.severity, device: "", isService: false, isActive: true,
     isAcknowledged: alarm.isAcknowledged, by: "", count: 1, isPrevious: false, detail: t(`alarm.${alarm.code}.text`, alarm.params), detailLanguage: locale,
-    ageS: (Date.now() - alarm.sinceMs) / 1000, clearedS: null, untilMs: shelved.get(`page ${alarm.code}`) ?? null, aircraft: "",
+    ageS: (performance.now() - alarm.sinceMs) / 1000, clearedS: null, untilMs: shelved.get(`page ${alarm.code}`) ?? null, aircraft: "",
   };
 }
 
@@ -82,7 +86,7 @@ function stateText(alarm) {
   }
   if (alarm.count > 1) parts.push(t("alarm.count", { n: alarm.count }));
   if (alarm.isAcknowledged) parts.push(alarm.by ? t("alarm.acknowledged_by", { name: alarm.by }) : t("alarm.acknowledged"));
-  if (alarm.untilMs) parts.push(t("alarm.shelved_until", { time: clock(new Date(alarm.untilMs)) }));
+  if (alarm.untilMs) parts.push(t("alarm.shelved_until", { time: clock(timeOfDay(alarm.untilMs)) }));
   return parts.join(" · ");
 }
 
@@ -134,7 +138,7 @@ function item(alarm, feed) {
 
 // What changes every second is left out of the key; it is drawn with the next change or every ten seconds.
 function keyOf(alarms) {
-  const tens = Math.floor(Date.now() / 10e3);
+  const tens = Math.floor(performance.now() / 10e3);
   return JSON.stringify([tens, alarms.map((one) => ({ ...one, ageS: 0, clearedS: one.clearedS == null ? null : 0 }))]);
 }
 
@@ -191,6 +195,9 @@ function draw(feed) {
   for (const id of silenced.keys()) if (!active.has(id)) silenced.delete(id);
   drawList(alarms, feed);
   drawBar(alarms, feed);
+  // Seen while another tab of the browser is in front.
+  const worst = alarms.find((one) => one.isActive && !one.isAcknowledged && !one.untilMs && one.severity !== "info");
+  document.title = `${worst ? `${MARKS[worst.severity]} ` : ""}${document.title.replace(/^[✖▲] /, "")}`;
   setBadge("alarms", alarms.filter((one) => one.isActive && !one.untilMs).length);
   const hasLanded = feed.flight.brief?.phase === "landed";
   soundFor((hasLanded ? [] : soundingOf(alarms)).map((one) => one.severity));

@@ -1,11 +1,12 @@
 // Values for experts, each with one line of explanation, its limit and a colour; and charts over the flight.
 
-import { by, element, redraw, text, updateRows } from "./dom.js";
+import { by, element, redraw, text } from "./dom.js";
 import { serverText, t } from "./i18n.js";
 import { angle, number, percent, sigma, speed } from "./format.js";
 import { lastWhere } from "./feed.js";
 import { fetchJson } from "./http.js";
 import { presentPosition } from "./lamps.js";
+import { VisibleRows } from "./visible_rows.js";
 import { drawCharts, fitCharts } from "./charts.js";
 
 const MARKS = { good: "●", caution: "▲", warning: "■", absent: "○" };
@@ -70,8 +71,6 @@ function values({ brief }) {
   return listed.map(([code, shown, state, id]) => [code, shown, shown === "–" ? { state: "absent", limit: state.limit } : state, id]);
 }
 
-const ROWS_SHOWN = 100;
-
 // Figures of the stitching and of time, one row for each of the last exposures.
 function cellsOf(one) {
   const f = one.figures || {};
@@ -82,12 +81,12 @@ function cellsOf(one) {
 
 const rowOf = (one) => element("tr", {}, ...cellsOf(one).map((content) => element("td", { textContent: content })));
 
-function drawRows(flight) {
-  const newest = [...flight.exposures.values()].sort((a, b) => b.number - a.number).slice(0, ROWS_SHOWN);
-  updateRows(by("expert-rows"), newest, (one) => JSON.stringify(cellsOf(one)), rowOf);
+function drawRows(table, flight) {
+  table.set([...flight.exposures.values()].sort((a, b) => b.number - a.number));
 }
 
 export function start(_root, feed) {
+  const table = new VisibleRows(by("expert-rows"), (one) => JSON.stringify(cellsOf(one)), rowOf);
   feed.subscribe((record, isFirstRecord) => {
     const { status = {} } = feed.flight.brief;
     const position = presentPosition(feed.flight);
@@ -102,7 +101,7 @@ export function start(_root, feed) {
       element("dt", {}, element("span", { textContent: t(`expert.${code}`) }),
         element("span", { id: id || "", textContent: `${MARKS[state] || ""} ${shown}` })),
       element("dd", { textContent: [t(`expert.${code}.text`), limitText(code), limit].filter(Boolean).join(" ") }))));
-    if (isFirstRecord || !record || record.exposures) drawRows(feed.flight);
+    if (isFirstRecord || !record || record.exposures) drawRows(table, feed.flight);
     if (isFirstRecord || !record || record.history) drawCharts();
     if (!record) fitCharts();
   });

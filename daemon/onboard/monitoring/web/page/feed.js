@@ -41,7 +41,7 @@ export const feed = {
   // An alarm that the page itself detects: `code` is an entry of the catalogs, alarm.CODE and alarm.CODE.action.
   raiseAlarm({ code, params = {}, severity = "caution" }) {
     const known = pageAlarms.get(code);
-    pageAlarms.set(code, { code, params, severity, sinceMs: known?.sinceMs ?? Date.now(),
+    pageAlarms.set(code, { code, params, severity, sinceMs: known?.sinceMs ?? performance.now(),
       isAcknowledged: known?.isAcknowledged ?? false });
     if (!known || known.severity !== severity || JSON.stringify(known.params) !== JSON.stringify(params)) feed.refresh();
   },

@@ -6,6 +6,8 @@ import { clock, number } from "./format.js";
 import { fetchJson } from "./http.js";
 
 const REFRESH_MS = 1000;
+// A service that does not answer is as good as none.
+const TIMEOUT_MS = 3000;
 const MARKS = { good: "●", caution: "▲", warning: "✖" };
 const STATE_OF_SEVERITY = { warning: "warning", caution: "caution" };
 
@@ -40,13 +42,18 @@ function alarm(one) {
 }
 
 let unreachable = 0;
+let lastSeen = "–";
 
 async function update() {
-  const fleet = await fetchJson("/api/v1/fleet");
+  const fleet = await fetchJson("/api/v1/fleet", AbortSignal.timeout(TIMEOUT_MS));
   by("clock").textContent = `${clock(new Date())} UTC`;
   unreachable = fleet ? 0 : unreachable + 1;
-  document.body.classList.toggle("connection-lost", unreachable > 3);
+  const isLost = unreachable > 1;
+  document.body.classList.toggle("connection-lost", isLost);
+  by("connection-lost").hidden = !isLost;
+  if (isLost) by("connection-lost").textContent = t("link.lost", { time: lastSeen });
   if (!fleet) return;
+  lastSeen = clock(new Date());
   redraw(by("aircraft"), JSON.stringify(fleet), () => fleet.aircraft.map((one) => row(one, fleet.alarms)));
   redraw(by("faults"), JSON.stringify(fleet.alarms), () => fleet.alarms.length ? fleet.alarms.map(alarm)
     : [element("li", { className: "none", textContent: t("alarm.none") })]);
@@ -55,5 +62,7 @@ async function update() {
 fill();
 document.body.dataset.ready = "";
 document.documentElement.dataset.theme = localStorage.getItem("cabin") === "dark" ? "dark" : "";
-update();
-setInterval(update, REFRESH_MS);
+for (;;) {
+  await update();
+  await new Promise((resolve) => setTimeout(resolve, REFRESH_MS));
+}

@@ -23,7 +23,7 @@ export function cellsOf(frame) {
   const before = frame.stage === "approach";
   const cells = [
     { key: "line", label: t(frame.is_captured ? "guidance.line" : "guidance.next_line"),
-      value: `${frame.line}${frame.is_reversed ? " ⇄" : ""}` },
+      value: `${frame.line}${frame.is_reversed ? " ⇄" : ""}`, describe: frame.line },
     { key: "across", label: t("guidance.across", { limit: length(frame.limits.across_m) }),
       value: frame.is_captured
         ? `${length(Math.abs(frame.across_m))}${arrowOf(frame.across_m)}` : `${angle(frame.bearing_deg)} · ${way(frame.start_distance_m)}`,

@@ -3,7 +3,8 @@
 import { by, button, element, redraw } from "./dom.js";
 import { serverLanguage, serverText, t } from "./i18n.js";
 import { bytes, clock, distance, number, percent, temperature } from "./format.js";
-import { fetchJson, fetchOk } from "./http.js";
+import { fetchAdvice } from "./advice.js";
+import { fetchOk } from "./http.js";
 
 const FILES = { "fly-again.geojson": "GeoJSON", "fly-again.kml": "KML", "fly-again.waypoints": "MAVLink", "fly-again.csv": "CSV" };
 const ACTIONS = ["verify", "copy", "report", "shutdown"];
@@ -12,22 +13,23 @@ const REFRESH_IN_FLIGHT_MS = 60000;
 const GPS_EPOCH_UNIX_S = 315964800;
 
 // The last advice and its files, since the service may have ended when they are wanted.
-const kept = { mission: null, advice: null, files: new Map(), atMs: 0 };
+const kept = { mission: null, advice: null, files: new Map(), atMs: -Infinity };
 let temperatureRange = null;
 
 // Forget what was kept of another mission. A reconnection to the same mission keeps it.
 function followMission(id) {
   if (id === kept.mission) return;
-  Object.assign(kept, { mission: id, advice: null, files: new Map(), atMs: 0 });
+  Object.assign(kept, { mission: id, advice: null, files: new Map(), atMs: -Infinity });
   temperatureRange = null;
 }
 
 async function keep(hasLanded) {
-  if (Date.now() - kept.atMs < (hasLanded ? REFRESH_MS : REFRESH_IN_FLIGHT_MS)) return;
-  kept.atMs = Date.now();
+  if (performance.now() - kept.atMs < (hasLanded ? REFRESH_MS : REFRESH_IN_FLIGHT_MS)) return;
+  kept.atMs = performance.now();
   const { mission } = kept;
-  const advice = await fetchJson("/api/v1/advice");
-  if (mission !== kept.mission || !advice?.segments) return;
+  const advice = await fetchAdvice();
+  // The files of an unchanged advice are those that were kept.
+  if (mission !== kept.mission || !advice || (advice === kept.advice && kept.files.size === Object.keys(FILES).length)) return;
   kept.advice = advice;
   for (const name of Object.keys(FILES)) {
     const blob = await (await fetchOk(`/api/v1/advice/${name}`))?.blob();
@@ -164,7 +166,7 @@ export function start(root, feed) {
     for (const one of record?.history || []) noteTemperatures(one);
     const hasLanded = feed.flight.brief.phase === "landed";
     if (hasLanded && root.hidden) {
-      kept.atMs = 0;
+      kept.atMs = -Infinity;
       feed.showTab("flight");
     }
     if (record && feed.isLinked && (hasLanded || record.exposures)) await keep(hasLanded);

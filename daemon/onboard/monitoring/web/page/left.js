@@ -4,6 +4,7 @@ import { element, redraw } from "./dom.js";
 import { t } from "./i18n.js";
 import { bytes, clock, distance, number, span } from "./format.js";
 import { fetchJson } from "./http.js";
+import { noteTime } from "./time_of_day.js";
 import { presentPosition } from "./lamps.js";
 
 const REFRESH_MS = 10000;
@@ -58,7 +59,11 @@ export function start(root, feed) {
         element("dd", {}, `${MARKS[state] ?? ""}${value} `, element("small", { textContent: detail || "" })))));
   };
   const update = async () => {
-    if (feed.flight.brief && feed.isLinked) remaining = await fetchJson("/api/v1/remaining") ?? remaining;
+    if (feed.flight.brief && feed.isLinked) {
+      const found = await fetchJson("/api/v1/remaining");
+      noteTime(found?.light?.now_unix_s ?? null);
+      remaining = found ?? remaining;
+    }
     if (feed.flight.brief) draw();
   };
   feed.subscribe((_record, isFirstRecord) => {

@@ -2,14 +2,15 @@
 
 import { flight, restore } from "./telemetry.js";
 import { onGuidance } from "./guidance.js";
+import { presentPosition } from "./lamps.js";
 import { startLayers } from "./map_layers.js";
 import { OlderLayer } from "./map_older.js";
+import { PlanLayer } from "./map_plan.js";
+import { near } from "./longitudes.js";
 import { isMeasuring, startMeasuring } from "./map_measure.js";
 import { startNoData } from "./map_no_data.js";
 
 const COLOURS = { good: "--good", usable: "--caution", refly: "--warning", lost: "--warning" };
-// Of a line with more positions only the line is drawn.
-const PLACES_MAX = 200;
 const DASHES = { good: null, usable: "6 3", refly: "2 4", lost: "1 7" };
 
 // Leaflet parses a string as HTML.
@@ -60,102 +61,40 @@ const older = new OlderLayer(flight.older, styleOfVerdict).addTo(map);
 export const footprintCount = () => footprints.size + flight.older.size;
 export const footprintLayers = () => [...footprints.values()];
 
-const plan = L.layerGroup().addTo(map);
-// Planned exposure positions, thousands of them, on one canvas below the lines.
-map.createPane("places").style.zIndex = 390;
-map.getPane("places").style.pointerEvents = "none";
-const places = L.layerGroup().addTo(map);
-const placesCanvas = L.canvas({ pane: "places" });
-const gaps = L.layerGroup().addTo(map);
+// Above the footprints, so that nothing covers a label.
+const plan = new PlanLayer().addTo(map);
 let planBounds = null;
-
-// Direction of a line's label: opposite to the line, so that it covers no other line.
-function behind([[lat0, lon0], [lat1, lon1]]) {
-  const [north, east] = [lat1 - lat0, (lon1 - lon0) * Math.cos(lat0 * Math.PI / 180)];
-  if (Math.abs(north) > Math.abs(east)) return north > 0 ? "bottom" : "top";
-  return east > 0 ? "left" : "right";
-}
-
-let planned = null;
 let drawnState = "";
-const lineState = () => JSON.stringify(flight.brief?.status?.lines || {});
 
-// State of a line: flown, current, next, or only planned.
-function styleOfLine(id) {
-  const { flown = [], current, next } = flight.brief?.status?.lines || {};
-  if (id === current) return { color: colour("--accent"), weight: 5, dashArray: null };
-  if (id === next) return { color: colour("--accent"), weight: 4, dashArray: "14 6" };
-  if (flown.includes(id)) return { color: colour("--soft"), weight: 3, dashArray: null };
-  return { color: colour("--soft"), weight: 2, dashArray: "8 6" };
-}
-
-function drawRetakes(retakes) {
-  for (const one of retakes) {
-    L.polyline(one.at, { color: colour("--accent"), weight: 8, opacity: 0.5, interactive: false }).addTo(plan);
-    L.circleMarker(one.at[0], { radius: 2, color: colour("--accent"), interactive: false })
-      .bindTooltip(label(`↻ ${one.line}`), { permanent: true, direction: "left", className: "retake-label" }).addTo(plan);
-  }
-}
-
-// The lines with their ids and states, and retakes.
-function drawLines() {
-  plan.clearLayers();
-  drawnState = lineState();
-  for (const line of planned?.lines || []) {
-    L.polyline(line.at, { ...styleOfLine(line.id), interactive: false }).addTo(plan);
-    L.circleMarker(line.at[0], { radius: 2, color: colour("--soft"), interactive: false })
-      .bindTooltip(label(line.id), { permanent: true, direction: behind(line.at), className: "line-label" }).addTo(plan);
-  }
-  drawRetakes(planned?.retakes || []);
-}
-
-function drawPlaces() {
-  places.clearLayers();
-  const style = { pane: "places", renderer: placesCanvas, radius: 2, weight: 1, color: colour("--soft"), interactive: false };
-  for (const { at: [[lat0, lon0], [lat1, lon1]], places_m: placesM } of planned?.lines || []) {
-    if (placesM.length > PLACES_MAX) continue;
-    const scale = Math.cos(lat0 * Math.PI / 180);
-    const length = 111320 * Math.hypot(lat1 - lat0, (lon1 - lon0) * scale) || 1;
-    for (const place of placesM) {
-      const share = place / length;
-      L.circleMarker([lat0 + share * (lat1 - lat0), lon0 + share * (lon1 - lon0)], style).addTo(places);
-    }
-  }
-}
+// Labels of the plan that are seen, by kind, and areas of gaps.
+export const planShown = () => plan.shown;
 
 // Draw a plan: lines, planned exposure positions, and retakes.
-export function drawPlan(received) {
-  planned = received;
-  const lines = received?.lines || [];
-  planBounds = lines.length ? L.latLngBounds(lines.flatMap((line) => line.at)) : null;
-  drawLines();
-  drawPlaces();
+export function drawPlan(planned) {
+  planBounds = planned?.lines.length ? L.latLngBounds(planned.lines.flatMap((line) => line.at)) : null;
+  plan.set({ plan: planned });
+  frame();
 }
 
-// Redraw the lines when their state changed.
+// Draw the lines again when their state changed.
 function updateLines() {
-  if (planned && drawnState !== lineState()) drawLines();
+  const state = flight.brief?.status?.lines || {};
+  if (drawnState === JSON.stringify(state)) return;
+  drawnState = JSON.stringify(state);
+  plan.set({ state });
 }
 
-// Ground covered by too few images, and the line segments to re-fly for it.
-export function drawGaps(segments) {
-  gaps.clearLayers();
-  for (const one of segments) {
-    if (one.kind !== "hole") continue;
-    const rings = one.holes.flatMap((gap) => gap.rings).map((ring) => [ring]);
-    L.polygon(rings, { color: colour("--warning"), weight: 1, fillOpacity: 0.6, className: "gap-area", interactive: false }).addTo(gaps);
-    L.polyline(one.at, { color: colour("--warning"), weight: 12, opacity: 0.55, dashArray: "2 6", lineCap: "butt" })
-      .bindTooltip(label(`✖ ${one.line}`),
-        { permanent: true, direction: "right", className: "gap-label" }).addTo(gaps);
-  }
-}
+// Draw gaps of the coverage, and the line segments to re-fly for them.
+export const drawGaps = (gaps) => plan.set({ gaps });
 
 function drawMap(choose) {
   track.setLatLngs(flight.track.map((point) => point.at));
   const position = flight.brief?.status?.position;
   if (position?.latitude_deg != null) {
     marker.setLatLng([position.latitude_deg, position.longitude_deg]).addTo(map);
-    marker.setStyle({ color: colour("--accent") });
+    // An old position is no longer where the aircraft is.
+    const isPresent = presentPosition(flight) !== null;
+    marker.setStyle({ color: colour(isPresent ? "--accent" : "--soft"), dashArray: isPresent ? null : "3 4" });
   }
   for (const one of flight.exposures.values()) {
     if (!one.footprint) continue;
@@ -213,11 +152,11 @@ export function start(root, feed) {
   startNoData(map, feed);
   onGuidance((frame) => {
     if (frame.latitude_deg == null) return;
-    marker.setLatLng([frame.latitude_deg, frame.longitude_deg]).addTo(map);
-    marker.setStyle({ color: colour(frame.is_deviating ? "--warning" : "--accent") });
+    marker.setLatLng([frame.latitude_deg, near(frame.longitude_deg)]).addTo(map);
+    marker.setStyle({ color: colour(frame.is_deviating ? "--warning" : "--accent"), dashArray: null });
   });
   feed.subscribe((record, isFirstRecord) => {
-    if (!record && planned) drawPlan(planned);
+    if (!record) plan.draw();
     updateLines();
     if (isFirstRecord || !record || record.exposures || record.track) drawMap(feed.select);
   });

@@ -114,23 +114,29 @@ function drawChoices(map, tools) {
 const placed = new Map();
 let areThumbnailsShown = localStorage.getItem("thumbnails") !== "off";
 
-async function placeThumbnails(map, flight) {
-  const newest = areThumbnailsShown ? [...flight.exposures.values()]
-    .filter((one) => one.step === "processed" && one.footprint).sort((a, b) => b.number - a.number)
-    .slice(0, THUMBNAILS_MAX) : [];
-  const wanted = new Set(newest.map((one) => one.number));
+// A fetch that is pending holds the number of its exposure, and nothing else.
+async function place(map, exposures, number) {
+  const address = await thumbnailOf(number);
+  const { footprint } = exposures.get(number) ?? {};
+  if (!placed.has(number) || placed.get(number)) return;
+  if (address && footprint) placed.set(number, new PlacedPicture(footprint, address).addTo(map));
+  else placed.delete(number);
+}
+
+function placeThumbnails(map, { exposures }) {
+  const newest = areThumbnailsShown ? [...exposures.values()].filter((one) => one.step === "processed" && one.footprint)
+    .map((one) => one.number).sort((a, b) => b - a).slice(0, THUMBNAILS_MAX) : [];
+  const wanted = new Set(newest);
   for (const [number, layer] of placed) {
     if (!wanted.has(number)) {
       layer?.remove();
       placed.delete(number);
     }
   }
-  for (const one of newest) {
-    if (placed.has(one.number)) continue;
-    placed.set(one.number, null);
-    const address = await thumbnailOf(one.number);
-    if (!address || !placed.has(one.number)) placed.delete(one.number);
-    else placed.set(one.number, new PlacedPicture(one.footprint, address).addTo(map));
+  for (const number of newest) {
+    if (placed.has(number)) continue;
+    placed.set(number, null);
+    place(map, exposures, number);
   }
 }
 

@@ -13,23 +13,27 @@ export class OlderExposures {
     this.size = 0;
     // Counts what is no mere addition.
     this.changes = (this.changes ?? 0) + 1;
-    this.index = new Map();
     this.bounds = null;
     this.verdicts = new Uint8Array(FIRST_CAPACITY);
     this.numbers = new Int32Array(FIRST_CAPACITY);
     this.corners = new Float64Array(2 * CORNERS * FIRST_CAPACITY);
   }
 
+  // Place of an exposure in the arrays; -1 if it is not in them.
+  indexOf(number) {
+    return this.size ? this.numbers.lastIndexOf(number, this.size - 1) : -1;
+  }
+
   // Add or replace an exposure. One without a footprint has nothing to draw.
   add(number, verdict, footprint) {
     if (footprint?.length !== CORNERS) return;
-    if (this.index.has(number)) this.changes += 1;
+    const known = this.indexOf(number);
+    const at = known < 0 ? this.size : known;
+    if (known >= 0) this.changes += 1;
     else {
       if (this.size === this.numbers.length) this.grow();
-      this.index.set(number, this.size);
       this.size += 1;
     }
-    const at = this.index.get(number);
     this.numbers[at] = number;
     this.verdicts[at] = Math.max(0, VERDICTS.indexOf(verdict ?? null));
     this.corners.set(footprint.flat(), 2 * CORNERS * at);

@@ -4,6 +4,7 @@ import { by } from "./dom.js";
 import { fill, t } from "./i18n.js";
 import { clock } from "./format.js";
 import { feed } from "./feed.js";
+import { timeOfDay } from "./time_of_day.js";
 import { connect } from "./telemetry.js";
 import { requestToken } from "./commands.js";
 import * as tabs from "./tabs.js";
@@ -52,7 +53,7 @@ for (const [module, id] of MODULES) {
 document.body.dataset.ready = "";
 
 const CLOCK_MS = 1000;
-setInterval(() => { by("clock").textContent = `${clock(new Date())} UTC`; }, CLOCK_MS);
+setInterval(() => { by("clock").textContent = `${clock(timeOfDay())} UTC`; }, CLOCK_MS);
 
 let isLive = false;
 
@@ -76,10 +77,10 @@ function showLink(isLinked) {
   document.body.classList.toggle("flight-ended", !isLinked && Boolean(state.isEnded));
   if (isLinked) feed.clearAlarm("page.link");
   else if (isLive && !state.isEnded) {
-    feed.raiseAlarm({ code: "page.link", severity: "warning", params: { time: clock(new Date()) } });
+    feed.raiseAlarm({ code: "page.link", severity: "warning", params: { time: clock(timeOfDay()) } });
   }
   if (!isLinked && isLive) {
-    by("connection-lost").textContent = t(state.sentence, { time: clock(new Date()) });
+    by("connection-lost").textContent = t(state.sentence, { time: clock(timeOfDay()) });
     by("connection-lost").classList.toggle("ended", state.isEnded);
     document.title = `${t(state.title)} · ${document.title}`;
   }

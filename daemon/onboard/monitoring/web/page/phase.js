@@ -52,8 +52,9 @@ export function start(_root, feed) {
     setButton(second, commands.second);
     if (!commands.next) next.textContent = t(brief.phase === "landed" ? "phase.landed" : "phase.waiting");
     by("simulated").hidden = !brief.simulated;
-    by("aircraft").textContent = brief.mission.rig || "";
-    document.title = `${brief.simulated ? `${t("page.simulated")} · ` : ""}${brief.mission.rig || ""} · Syntopic`;
+    by("aircraft").textContent = by("aircraft").title = brief.mission.rig || "";
+    const mark = /^[✖▲] /.exec(document.title)?.[0] ?? "";
+    document.title = `${mark}${brief.simulated ? `${t("page.simulated")} · ` : ""}${brief.mission.rig || ""} · Syntopic`;
     by("recovery").replaceChildren(...serverTexts(brief.mission, "recovery").map((one) =>
       element("li", { textContent: t("page.recovered", { what: one }) })));
     const shown = brief.phase === "ready" || brief.phase === "armed" ? missing : [];

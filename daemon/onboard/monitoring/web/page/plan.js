@@ -1,15 +1,17 @@
 // The flight plan of the mission, and the segments to re-fly.
 
+import { fetchAdvice } from "./advice.js";
 import { fetchJson } from "./http.js";
+import { nearPlaces } from "./longitudes.js";
 import { flight } from "./telemetry.js";
 import { drawGaps, drawPlan } from "./map.js";
 import { serverTexts, t } from "./i18n.js";
 import { distance, number, percent } from "./format.js";
-import { button } from "./dom.js";
+import { button, element } from "./dom.js";
+import { VisibleRows } from "./visible_rows.js";
 
 const REFRESH_MS = 3000;
 const coverageText = document.getElementById("coverage");
-const rows = document.getElementById("segments");
 let mission = null;
 let hasPlan = false;
 let requestedMs = 0;
@@ -17,6 +19,8 @@ let timer = null;
 let retakes = 0;
 let sendCommand = null;
 let gapsFound = null;
+let shownAdvice = null;
+let plan = null;
 
 // Gaps of the coverage as it was last computed; null before that.
 export const gaps = () => gapsFound;
@@ -30,39 +34,64 @@ function shortfallsOf(one) {
   return [...new Set(texts)];
 }
 
-function row(one) {
-  const tableRow = document.createElement("tr");
-  for (const text of [one.line, one.from_m.toFixed(0), one.to_m.toFixed(0),
-    (areaOf(one) / 1e4).toFixed(2), `✖ ${[...shortfallsOf(one), ...serverTexts(one, "reasons")].join("; ")}`]) {
-    const cell = document.createElement("td");
-    cell.textContent = text;
-    tableRow.append(cell);
-  }
-  const action = document.createElement("td");
-  action.append(button(t("lines.retake"), () => sendCommand("retake", { line: one.line, from_m: one.from_m, to_m: one.to_m }),
-    { ariaLabel: `${t("lines.retake")} ${one.line} ${one.from_m.toFixed(0)}` }));
-  tableRow.append(action);
-  return tableRow;
+// Ids of the planned retakes of a line that repeat the middle of a segment: it needs no other one.
+export function retakesOf(segment, planned) {
+  const line = planned?.lines?.find((one) => one.id === segment.line);
+  if (!line) return [];
+  const [[lat0, lon0], [lat1, lon1]] = line.at;
+  const [north, east] = [lat1 - lat0, lon1 - lon0];
+  // The place along the line: 0 at its start, 1 at its end.
+  const shareOf = ([latitude, longitude]) => ((latitude - lat0) * north + (longitude - lon0) * east) / (north ** 2 + east ** 2);
+  const middle = (shareOf(segment.at[0]) + shareOf(segment.at[1])) / 2;
+  return (planned.retakes || []).filter(({ of, at }) => of === segment.line && (shareOf(at[0]) - middle) * (shareOf(at[1]) - middle) <= 0)
+    .map((one) => one.line);
 }
 
-async function updateAdvice() {
-  requestedMs = Date.now();
-  const advice = await fetchJson("/api/v1/advice");
-  if (!advice?.segments) return;
-  const found = advice.segments.filter((one) => one.kind === "hole");
+const cellsOf = (one) => [one.line, one.from_m.toFixed(0), one.to_m.toFixed(0), number(areaOf(one) / 1e4, 2),
+  [`✖ ${[...shortfallsOf(one), ...serverTexts(one, "reasons")].join("; ")}`, ...retakesOf(one, plan).map((id) => `↻ ${id}`)].join(" ")];
+
+function row(one) {
+  const retake = button(t("lines.retake"), () => sendCommand("retake", { line: one.line, from_m: one.from_m, to_m: one.to_m }),
+    { ariaLabel: `${t("lines.retake")} ${one.line} ${one.from_m.toFixed(0)}` });
+  const cells = cellsOf(one).map((textContent) => element("td", { textContent }));
+  cells.at(-1).append(retake);
+  return element("tr", {}, ...cells);
+}
+
+const rows = new VisibleRows(document.getElementById("segments"), (one) => cellsOf(one).join(), row);
+
+function drawRows(found) {
+  rows.table.closest(".scroll").hidden = !found.length;
+  rows.set(found.map((one) => ({ ...one, number: `${one.line} ${one.from_m}` })));
+}
+
+// Gaps with their places next to those of the flight.
+const gapsOf = (advice) => advice.segments.filter((one) => one.kind === "hole").map((one) => ({ ...one, at: nearPlaces(one.at),
+  holes: one.holes.map((gap) => ({ ...gap, rings: gap.rings.map(nearPlaces) })) }));
+
+function drawCoverage() {
+  const advice = shownAdvice;
+  if (!advice) return;
   const share = advice.planned_m ? advice.covered_m / advice.planned_m : 0;
   coverageText.textContent = [
     t("lines.covered", { share: percent(share), length: distance(advice.planned_m) }),
-    found.length ? t("lines.gaps", { n: found.length, ha: number(advice.hole_m2 / 1e4, 2) }) : t("lines.no_gap"),
+    gapsFound.length ? t("lines.gaps", { n: gapsFound.length, ha: number(advice.hole_m2 / 1e4, 2) }) : t("lines.no_gap"),
     ...serverTexts(advice, "notes"),
   ].join(". ");
-  // Unchanged gaps are not drawn again.
-  if (gapsFound && JSON.stringify(gapsFound) === JSON.stringify(found)) return;
-  rows.replaceChildren(...found.map(row));
-  rows.closest(".scroll").hidden = !found.length;
-  gapsFound = found;
-  drawGaps(found);
 }
+
+async function updateAdvice() {
+  requestedMs = performance.now();
+  const advice = await fetchAdvice();
+  if (!advice || advice === shownAdvice) return;
+  shownAdvice = advice;
+  gapsFound = gapsOf(advice);
+  drawCoverage();
+  drawRows(gapsFound);
+  drawGaps(gapsFound);
+}
+
+const placed = (lines = []) => lines.map((one) => ({ ...one, at: nearPlaces(one.at) }));
 
 // Fetch the plan once per mission. Fetch the coverage after new exposures, at most every REFRESH_MS.
 async function followPlan(hasNewExposures) {
@@ -71,18 +100,33 @@ async function followPlan(hasNewExposures) {
   if (current !== mission || wantedRetakes !== retakes) {
     mission = current;
     retakes = wantedRetakes;
-    const plan = current && await fetchJson("/api/v1/plan");
-    hasPlan = Boolean(plan?.lines);
-    gapsFound = null;
+    const received = current && await fetchJson("/api/v1/plan");
+    if (mission !== current) return;
+    // The link was lost, or the service refused: tried again.
+    if (current && !received) {
+      setTimeout(() => { if (mission === current) mission = null; }, REFRESH_MS);
+      return;
+    }
+    plan = received && { lines: placed(received.lines), retakes: placed(received.retakes) };
+    hasPlan = Boolean(received?.lines);
+    gapsFound = shownAdvice = null;
     drawPlan(plan);
+    if (!hasPlan) {
+      coverageText.textContent = t("lines.no_plan");
+      drawRows([]);
+      drawGaps([]);
+    }
     if (hasPlan) updateAdvice();
     return;
   }
   if (!hasPlan || !hasNewExposures || timer) return;
-  timer = setTimeout(() => { timer = null; updateAdvice(); }, Math.max(0, requestedMs + REFRESH_MS - Date.now()));
+  timer = setTimeout(() => { timer = null; updateAdvice(); }, Math.max(0, requestedMs + REFRESH_MS - performance.now()));
 }
 
 export function start(_root, feed) {
   sendCommand = feed.command;
-  feed.subscribe((record) => followPlan(Boolean(record?.exposures)));
+  feed.subscribe((record) => {
+    if (!record) drawCoverage();
+    followPlan(Boolean(record?.exposures));
+  });
 }

@@ -1,6 +1,7 @@
 // State of the flight, merged from telemetry records. Notifies listeners of each record.
 
 import { fetchJson, isRefused } from "./http.js";
+import { near, nearPlaces } from "./longitudes.js";
 import { OlderExposures } from "./older_exposures.js";
 import { clearThumbnails } from "./thumbnails.js";
 
@@ -73,7 +74,7 @@ async function loadOlder() {
     return;
   }
   for (const { number, verdict, footprint } of listed) {
-    if (!flight.exposures.has(number) && !flight.older.index.has(number)) flight.older.add(number, verdict, footprint);
+    if (!flight.exposures.has(number) && flight.older.indexOf(number) < 0) flight.older.add(number, verdict, nearPlaces(footprint));
   }
   for (const listener of listeners) listener(null, false);
 }
@@ -84,19 +85,26 @@ export async function restore(number) {
   const one = await fetchJson(`/api/v1/exposures/${number}`);
   if (!one) return false;
   flight.restoredNumber = number;
-  flight.exposures.set(number, one);
+  addExposure(one);
   return true;
+}
+
+function addExposure(one) {
+  if (one.footprint) one.footprint = nearPlaces(one.footprint);
+  flight.exposures.set(one.number, one);
 }
 
 const bySequence = (a, b) => a.sequence - b.sequence;
 
 function merge(record, isFirstRecord) {
   const { exposures = [], devices = [], track = [], history = [], settings = [], ...brief } = record;
+  const { position } = brief.status ?? {};
+  if (position) position.longitude_deg = near(position.longitude_deg);
   flight.brief = brief;
-  for (const one of exposures) flight.exposures.set(one.number, one);
+  for (const one of exposures) addExposure(one);
   for (const one of devices) flight.devices.set(one.name, one);
   flight.settings = settings.at(-1) || flight.settings;
-  for (const one of track) flight.track.push(one);
+  for (const one of track) flight.track.push({ ...one, at: [one.at[0], near(one.at[1])] });
   for (const one of history) flight.history.push(one);
   // The past comes newest first, in several records.
   flight.track.sort(bySequence);
@@ -147,6 +155,15 @@ export function connect(onLinkChange, requestToken) {
     socket.onopen = restartTimeout;
     socket.onmessage = (message) => {
       if (hasEnded) return;
+      let record = null;
+      try {
+        record = JSON.parse(message.data);
+      } catch {
+        // Unreadable: the values shown would be frozen on a link that looks live.
+        socket.close();
+        end();
+        return;
+      }
       waitMs = 500;
       restartTimeout();
       // What the first record leaves out follows. The previous state may belong to another flight.
@@ -154,7 +171,7 @@ export function connect(onLinkChange, requestToken) {
         clear();
         onLinkChange(true);
       }
-      merge(JSON.parse(message.data), isFirstRecord);
+      merge(record, isFirstRecord);
       isFirstRecord = false;
     };
     socket.onclose = end;

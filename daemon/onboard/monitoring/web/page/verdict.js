@@ -1,12 +1,12 @@
 // The verdict of the last exposure, with its findings; and the table of exposures.
 
-import { by, element, updateRows } from "./dom.js";
+import { by, element } from "./dom.js";
 import { knows, serverText, t } from "./i18n.js";
 import { lastWhere } from "./feed.js";
+import { VisibleRows } from "./visible_rows.js";
 
 export const MARKS = { good: "●", usable: "▲", refly: "■", lost: "✖" };
 const SEVERITY_ORDER = { refly: 0, usable: 1, good: 2 };
-const ROWS_SHOWN = 300;
 
 export const verdictText = (word) => knows(`verdict.${word}`) ? t(`verdict.${word}`) : knows(`step.${word}`) ? t(`step.${word}`) : word;
 
@@ -49,19 +49,17 @@ function row(one, feed) {
   return created;
 }
 
-function drawRows(feed) {
-  const newest = [...feed.flight.exposures.values()].sort((a, b) => b.number - a.number).slice(0, ROWS_SHOWN);
-  const focused = document.activeElement?.closest?.("#rows") ? document.activeElement.textContent : null;
-  const keyOf = (one) => JSON.stringify([one.verdict, one.step, one.line, one.frames, one.number === feed.selected]);
-  updateRows(by("rows"), newest, keyOf, (one) => row(one, feed));
-  if (focused && !document.activeElement?.closest("#rows")) [...by("rows").querySelectorAll("button")].find((one) => one.textContent === focused)?.focus();
+function drawRows(rows, feed) {
+  rows.set([...feed.flight.exposures.values()].sort((a, b) => b.number - a.number));
 }
 
 export function start(_root, feed) {
+  const keyOf = (one) => JSON.stringify([one.verdict, one.step, one.line, one.frames, one.number === feed.selected]);
+  const rows = new VisibleRows(by("rows"), keyOf, (one) => row(one, feed));
   by("verdict").querySelector(".word").textContent = t("verdict.waiting");
   feed.subscribe((record, isFirstRecord) => {
     drawVerdict();
-    if (isFirstRecord || !record || record.exposures) drawRows(feed);
+    if (isFirstRecord || !record || record.exposures) drawRows(rows, feed);
   });
-  feed.onSelect(() => drawRows(feed));
+  feed.onSelect(() => drawRows(rows, feed));
 }
