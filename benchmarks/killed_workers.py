@@ -365,7 +365,7 @@ def with_kills(
                 counts: BatchCounts, finished: int = finished, killer: Killer = killer
             ) -> None:
                 killer.exposures_done = finished + counts.done
-                if not killer.is_alive() and not killer.is_ended.is_set():
+                if killer.ident is None and not killer.is_ended.is_set():
                     killer.start()
                 if hold.is_over and not killer.is_ended.is_set():
                     killer.is_ended.set()

@@ -43,10 +43,12 @@ def worker(
 ) -> None:
     require("cluster")
     from daemon.postflight.batch import capacity
-    from daemon.postflight.batch.cluster_address import cluster_address
+    from daemon.postflight.batch.cluster_address import certificate_problem, cluster_address
     from daemon.postflight.batch.dask_worker import run_workers
 
     address = cluster_address(scheduler, tls_ca, tls_certificate, tls_key)
+    if problem := certificate_problem(address):
+        raise DaemonError(problem)
     count = processes or max(1, capacity.usable_cores() // threads)
     share = int(capacity.available_memory_nbytes() * capacity.MEMORY_SHARE / count)
     if share < capacity.PROCESS_NBYTES:
@@ -72,6 +74,7 @@ def worker(
         )
     except TimeoutError as error:
         raise DaemonError(
-            f"no scheduler answered at {scheduler} for {wait:.0f} s. "
+            certificate_problem(address)
+            or f"no scheduler answered at {scheduler} for {wait:.0f} s. "
             "Start one: dask scheduler --host 127.0.0.1 --dashboard-address 127.0.0.1:8787"
         ) from error

@@ -94,7 +94,7 @@ def read_manifest(mission: Mission, number: int, key: str) -> ProductManifest | 
 
 
 def parse_manifest(data: bytes, key: str) -> ProductManifest | None:
-    """The manifest in the content of a file; None where it is damaged or of another key.
+    """The manifest in the content of a file; None where it is damaged or of another key or format.
 
     Args:
         data: content of the file.
@@ -102,6 +102,8 @@ def parse_manifest(data: bytes, key: str) -> ProductManifest | None:
     """
     try:
         content = parse_record(data, f"{key}.json")
+        if content["format"] != _FORMAT:
+            return None
         files = {
             str(name): ProductFile(int(file["nbytes"]), str(file["sha256"]))
             for name, file in content["files"].items()

@@ -36,6 +36,18 @@ _ALLOW_HTTP: Final = {
     "gs": "GOOGLE_ALLOW_HTTP",
     "az": "AZURE_ALLOW_HTTP",
 }
+_ACCESS_CURES: Final = {
+    "ExpiredToken": "The credentials have expired. Set new ones",
+    "TokenRefreshRequired": "The credentials have expired. Set new ones",
+    "RequestTimeTooSkewed": "The clock of this machine is wrong by more than the store permits. "
+    "Set it",
+}
+"""Errors of S3 by their code, of which the first comes with status 400.
+
+Source: Amazon S3 API Reference, Error responses.
+"""
+_DENIED = re.compile(r"status code: (40[13]\b|400 Bad Request:?$)")
+"""Answers that name no code, as those to HEAD; obstore reports some of them as general errors."""
 _URL = re.compile(r"([a-z0-9]+)://([^/?#@]+)(/[^?#]*)?")
 
 T = TypeVar("T")
@@ -44,6 +56,10 @@ ByteProgress = Callable[[int], None]
 
 class ObjectStoreError(DaemonError):
     """A store refused or cannot be reached; the message has the cause and what to do."""
+
+
+class ObjectStoreAccessError(ObjectStoreError):
+    """A store that refuses these credentials: other objects would be refused as well."""
 
 
 class ObjectStoreUnavailableError(ObjectStoreError, ConnectionError):
@@ -307,6 +323,11 @@ class ObjectStore:
         raise AssertionError  # the last attempt returns or raises
 
     def _refused(self, name: str, error: Exception) -> ObjectStoreError:
+        if cure := _access_cure(error):
+            return ObjectStoreAccessError(
+                f"{self.url}/{name}: {_first_line(error)}. {cure}, and run the command again: it "
+                "continues"
+            )
         kind = ObjectStoreError if _is_final(error) else ObjectStoreUnavailableError
         return kind(
             f"{self.url}/{name}: {_first_line(error)}. Check the network, the credentials and the "
@@ -318,14 +339,28 @@ def _is_final(error: Exception) -> bool:
     """Errors that no repetition cures: no such object or bucket, no right, no credentials."""
     import obstore
 
-    return isinstance(
-        error,
-        FileNotFoundError
-        | PermissionError
-        | obstore.exceptions.NotFoundError
+    absent = FileNotFoundError | obstore.exceptions.NotFoundError
+    return isinstance(error, absent) or bool(_access_cure(error))
+
+
+def _access_cure(error: Exception) -> str:
+    """What to do where a store refuses the credentials; empty for all other errors."""
+    import obstore
+
+    for code, cure in _ACCESS_CURES.items():
+        if code in str(error):
+            return cure
+    denied = (
+        PermissionError
         | obstore.exceptions.PermissionDeniedError
-        | obstore.exceptions.UnauthenticatedError,
+        | obstore.exceptions.UnauthenticatedError
     )
+    if isinstance(error, denied) or _DENIED.search(_first_line(error)):
+        return (
+            "Check that the credentials have not expired, their rights to the bucket, and the "
+            "clock of this machine"
+        )
+    return ""
 
 
 def _first_line(error: Exception) -> str:

@@ -16,6 +16,7 @@ from typing import Any, Final, TypeAlias
 
 from daemon.mission.exposure_batch import ExposureFailure, cause_of
 from daemon.mission.store.product_manifests import ClaimedElsewhereError
+from daemon.mission.transfer.object_store import ObjectStoreAccessError
 from daemon.postflight.batch.executor import (
     BatchExecutor,
     BatchTask,
@@ -43,7 +44,11 @@ _POLL_S: Final = 0.5
 _PASSING_ERRNOS: Final = frozenset(
     {errno.ETIMEDOUT, errno.EAGAIN, errno.ESTALE, errno.EINTR, errno.EBUSY, errno.EREMOTEIO}
 )
-_UNWRITABLE_ERRNOS: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS})
+_UNWRITABLE_CURES: Final = {
+    errno.ENOSPC: "Free space on the disk",
+    errno.EDQUOT: "Free space below the quota",
+    errno.EROFS: "Mount the disk for writing",
+}
 
 
 @dataclass
@@ -231,9 +236,13 @@ class _Run:
             self.outcome.counts.store_retries += 1
             self._defer(task, delay_s)
             return
-        elif isinstance(error, OSError) and error.errno in _UNWRITABLE_ERRNOS:
+        cause = cause_of(error)
+        if isinstance(error, ObjectStoreAccessError):
+            self._ended_by = f"not attempted, because the store refused exposure {number}"
+        elif isinstance(error, OSError) and error.errno in _UNWRITABLE_CURES:
             self._ended_by = f"not attempted, because of exposure {number}: {error.strerror}"
-        self._fail(task, cause_of(error))
+            cause += f". {_UNWRITABLE_CURES[error.errno]}, and run the same command again"
+        self._fail(task, cause)
 
     def _defer(self, task: BatchTask, delay_s: float) -> None:
         heapq.heappush(self._deferred, (time.monotonic() + delay_s, task.number, task))

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ipaddress
+import socket
+import ssl
 from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -10,6 +12,7 @@ from urllib.parse import urlsplit
 from daemon.configuration.model import ConfigurationError
 
 SCHEMES = ("tcp", "tls")
+HANDSHAKE_TIMEOUT_S = 3.0
 
 
 @dataclass(frozen=True)
@@ -32,6 +35,17 @@ class ClusterAddress:
     def is_loopback(self) -> bool:
         return is_loopback(urlsplit(self.url).hostname or "")
 
+    def context(self) -> ssl.SSLContext:
+        """How this side proves itself and checks the other one; host names are not compared.
+
+        Raises:
+            OSError: a file is no certificate, or the key is of another one.
+        """
+        context = ssl.create_default_context(cafile=self.ca)
+        context.check_hostname = False
+        context.load_cert_chain(str(self.certificate), self.key)
+        return context
+
 
 def cluster_address(
     url: str, ca: Path | None, certificate: Path | None, key: Path | None
@@ -46,7 +60,7 @@ def cluster_address(
 
     Raises:
         ConfigurationError: no such address, an unencrypted one off this machine, or TLS files
-            that are missing.
+            that are missing or do not belong together.
     """
     parts = urlsplit(url)
     try:
@@ -81,7 +95,46 @@ def cluster_address(
     ]
     if problems:
         raise ConfigurationError(problems)
+    try:
+        address.context()
+    except OSError as error:
+        raise ConfigurationError(
+            [
+                f"--tls-ca, --tls-certificate and --tls-key cannot be used together: {error}. "
+                "Give PEM files, and the key of this certificate"
+            ]
+        ) from error
     return address
+
+
+def certificate_problem(address: ClusterAddress) -> str:
+    """Whether a scheduler that listens and this side refuse each other's certificate.
+
+    Args:
+        address: of the scheduler.
+
+    Returns:
+        A sentence; empty where they do not, or nothing listens.
+    """
+    if not address.is_encrypted:
+        return ""
+    parts = urlsplit(address.url)
+    try:
+        with (
+            socket.create_connection(
+                (parts.hostname or "", parts.port or 0), HANDSHAKE_TIMEOUT_S
+            ) as connection,
+            address.context().wrap_socket(connection) as encrypted,
+        ):
+            encrypted.recv(1)  # in TLS 1.3 a refused certificate is reported here
+    except ssl.SSLError:
+        return (
+            f"{address.url} and this command do not accept each other's certificate. Both are "
+            "signed by the authority of --tls-ca, and valid by the clocks of both machines"
+        )
+    except OSError:
+        return ""
+    return ""
 
 
 def is_loopback(host: str) -> bool:

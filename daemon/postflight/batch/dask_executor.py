@@ -14,6 +14,7 @@ import queue
 import threading
 import time
 import uuid
+import warnings
 from collections import OrderedDict
 from collections.abc import Callable
 from contextlib import suppress
@@ -22,9 +23,14 @@ from typing import Any, Final
 
 import dask
 import distributed
+from distributed.versions import VersionMismatchWarning
 
 from daemon import DaemonError
-from daemon.postflight.batch.cluster_address import ClusterAddress, is_loopback
+from daemon.postflight.batch.cluster_address import (
+    ClusterAddress,
+    certificate_problem,
+    is_loopback,
+)
 from daemon.postflight.batch.dask_losses import TASK_PREFIX, ReturnLostTasks
 from daemon.postflight.batch.executor import (
     BatchAction,
@@ -304,7 +310,12 @@ class DaskExecutor:
     def _connect(self, timeout_s: float) -> distributed.Client:
         # The client reports a lost scheduler by many messages; this executor reports it once.
         logging.getLogger("distributed").setLevel(logging.CRITICAL)
-        with dask.config.set({"distributed.comm.timeouts.connect": timeout_s}):
+        with (
+            dask.config.set({"distributed.comm.timeouts.connect": timeout_s}),
+            warnings.catch_warnings(),
+        ):
+            # Versions are compared by `_check_versions`, in one sentence.
+            warnings.simplefilter("ignore", VersionMismatchWarning)
             try:
                 self._client = distributed.Client(
                     self._address.url,
@@ -314,11 +325,8 @@ class DaskExecutor:
                     heartbeat_interval="2s",
                 )
             except (OSError, TimeoutError) as error:
-                if self._address.is_encrypted and "certificate" in _chain(error).lower():
-                    raise ClusterError(
-                        f"{self._address.url} and this command do not accept each other's "
-                        "certificate. Both are signed by the authority of --tls-ca"
-                    ) from error
+                if problem := certificate_problem(self._address):
+                    raise ClusterError(problem) from error
                 raise ClusterError(
                     f"no scheduler answers at {self._address.url}. "
                     f"Start one: dask scheduler --host 127.0.0.1 --dashboard-address 127.0.0.1:8787"
@@ -362,15 +370,6 @@ class DaskExecutor:
             f"syntopic worker {self._address.url}, and run the same command again; complete "
             "exposures are not computed again"
         )
-
-
-def _chain(error: BaseException | None) -> str:
-    """An error and its causes as text."""
-    found = []
-    while error is not None:
-        found.append(f"{type(error).__name__} {error}")
-        error = error.__cause__ or error.__context__
-    return "; ".join(found)
 
 
 def _dashboard_of(client: distributed.Client, address: ClusterAddress) -> str:

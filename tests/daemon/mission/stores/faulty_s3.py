@@ -1,8 +1,9 @@
 """moto's S3 server on a loopback port, behind a layer that injects faults into requests.
 
 The server is a peer; the layer is WSGI and knows nothing of the client. A seeded generator draws
-the faults: refused before the request (500, 503), an answer lost after the request was done, no
-answer within the client's time, and a body that ends early.
+the faults: refused before the request (500, 503, or by a code of S3's such as ExpiredToken), an
+answer lost after the request was done, no answer within the client's time, a late answer, and a
+body that ends early.
 """
 
 from __future__ import annotations
@@ -17,6 +18,14 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
+REFUSALS = {
+    "500": ("500 Internal Server Error", "InternalError"),
+    "503": ("503 Slow Down", "SlowDown"),
+    "ExpiredToken": ("400 Bad Request", "ExpiredToken"),
+    "RequestTimeTooSkewed": ("403 Forbidden", "RequestTimeTooSkewed"),
+    "AccessDenied": ("403 Forbidden", "AccessDenied"),
+}
+"""Status and code of faults that refuse a request."""
 REGION = "eu-central-1"
 BUCKET = "survey"
 
@@ -88,11 +97,13 @@ class FaultyApplication:
             self._faults.sent[path] += len(body)
             self._faults.largest = max(self._faults.largest, len(body))
         fault = self._faults.draw(method, path)
-        if fault in ("500", "503"):
+        if fault in REFUSALS:
             return _refuse(start_response, fault)
         if fault == "hang":
             time.sleep(self._faults.hang_s)
             return _refuse(start_response, "500")
+        if fault == "slow":
+            time.sleep(self._faults.hang_s)
         if fault == "lost answer":
             list(self._application(environ, lambda *_arguments: None))
             return _refuse(start_response, "500")
@@ -109,12 +120,11 @@ def _body(environ: dict[str, Any]) -> bytes:
     return bytes(environ["wsgi.input"].read()) if environ.get("wsgi.input_terminated") else b""
 
 
-def _refuse(start_response: Any, status: str) -> list[bytes]:
-    code = "SlowDown" if status == "503" else "InternalError"
+def _refuse(start_response: Any, fault: str) -> list[bytes]:
+    status, code = REFUSALS[fault]
     content = f"<Error><Code>{code}</Code><Message>injected</Message></Error>".encode()
-    reason = "Slow Down" if status == "503" else "Internal Server Error"
     start_response(
-        f"{status} {reason}",
+        status,
         [("Content-Type", "application/xml"), ("Content-Length", str(len(content)))],
     )
     return [content]

@@ -57,7 +57,8 @@ def test_a_full_disk_ends_the_run(kind: str, tmp_path: Path) -> None:
     slow = dict.fromkeys(range(2, 41), "slow")
     outcome = ran(EXECUTORS[kind](), tmp_path, slow | {1: "full 9"}, count=40)
     found = causes(outcome)
-    assert found[1] == "No space left on device"
+    cure = "Free space on the disk, and run the same command again"
+    assert found[1] == f"No space left on device. {cure}"
     assert found[40] == "not attempted, because of exposure 1: No space left on device"
     assert len(found) + len(outcome.results) == 40
 

@@ -18,7 +18,11 @@ from typer.testing import CliRunner
 from daemon.cli import app
 from daemon.postflight.batch import dask_executor
 from daemon.postflight.batch.batch_run import LOSSES_MAX, run_batch
-from daemon.postflight.batch.cluster_address import ClusterAddress, cluster_address
+from daemon.postflight.batch.cluster_address import (
+    ClusterAddress,
+    certificate_problem,
+    cluster_address,
+)
 from daemon.postflight.batch.dask_executor import ClusterError, DaskExecutor, run_on_worker
 from daemon.postflight.batch.executor import BatchTask, TaskDone
 from tests.daemon.diverging_camera import ROOT
@@ -101,6 +105,12 @@ def test_a_certificate_of_another_authority_is_refused(
     address = cluster_address(encrypted.url, *authority(tmp_path / "other", "unknown"))
     with pytest.raises(ClusterError, match=r"certificate.*signed by the authority of --tls-ca"):
         DaskExecutor(address).start(ToyWork(tmp_path))
+    tls = ["--tls-ca", address.ca, "--tls-certificate", address.certificate, "--tls-key"]
+    done = CliRunner().invoke(app, ["worker", address.url, *map(str, [*tls, address.key])])
+    assert "do not accept each other's certificate" in str(done.exception)
+    assert certificate_problem(encrypted) == ""
+    done = CliRunner().invoke(app, ["worker", address.url, *map(str, [*tls, encrypted.key])])
+    assert "cannot be used together" in str(done.exception)
 
 
 @pytest.mark.trust

@@ -86,6 +86,7 @@ def test_the_bytes_do_not_depend_on_processes_and_threads(
         ("L2/000002/quicklook.jpg", None),
         ("L2/000002/foreign.txt", b"x"),
         ("manifests/L2/000002", None),
+        ("L2/000002/RIGHT.tif", b""),
         ("L0/000002/capture.json", b"{}"),
     ],
 )
@@ -102,6 +103,17 @@ def test_what_is_not_complete_or_has_other_inputs_is_computed_again(
         path.write_bytes(data)
     output = process(mission)
     assert (output["complete_before"], output["done"], output["failures"]) == (3, 1, [])
+    assert compared(mission) == compared(processed)
+
+
+def test_a_manifest_of_another_format_is_computed_again(processed: Mission, tmp_path: Path) -> None:
+    mission = copied(processed, tmp_path)
+    (key,) = committed_keys(mission, 2)
+    path = mission.path / MANIFESTS / "L2/000002" / f"{key}.json"
+    content = json.loads(path.read_bytes())
+    path.write_text(json.dumps({**content, "format": 2}))
+    assert read_manifest(mission, 2, key) is None
+    assert process(mission)["done"] == 1
     assert compared(mission) == compared(processed)
 
 
