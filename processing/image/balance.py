@@ -64,6 +64,15 @@ class PairBalance:
 
 
 @dataclass(frozen=True)
+class GainOutlier:
+    """A sensor that shows `signal` times that of the rest; others explain the overlaps as well."""
+
+    sensor: str
+    signal: float
+    alternatives: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
 class Balance:
     """Gains by sensor (the mean of their logarithms is zero) and the measurement of every overlap.
 
@@ -75,30 +84,22 @@ class Balance:
     pairs: tuple[PairBalance, ...]
     offsets: Mapping[str, float] = field(default_factory=dict)
 
-    @property
-    def outlier(self) -> tuple[str, float] | None:
-        """The sensor whose gain is farthest from the median, and its signal over that of the rest.
+    def outlier_without(self, changed: Collection[str]) -> GainOutlier | None:
+        """The sensor whose gain is farthest from the median.
 
-        None where no gain is more than `OUTLIER` off.
-        """
-        return self.outlier_without(())
-
-    def outlier_without(self, changed: Collection[str]) -> tuple[str, float] | None:
-        """The same where the signal of some sensors changes within their frames.
-
-        Such a frame has no one gain, and passes its error on to its neighbours: gains follow from
-        the overlaps of the others alone.
+        Sensors whose signal changes within their frames have no one gain, and pass their error on
+        to their neighbours: gains follow from the overlaps of the others alone.
 
         Args:
             changed: these sensors, by name.
 
         Returns:
-            Name and signal, or None where no gain is more than `OUTLIER` off.
+            The sensor; None where no gain is more than `OUTLIER_LIMIT` off.
         """
-        gains = self.gains
+        gains, pairs = self.gains, self.pairs
         if not gains.keys().isdisjoint(changed):
             names = [name for name in gains if name not in changed]
-            pairs = [p for p in self.pairs if {p.sensor_a, p.sensor_b}.isdisjoint(changed)]
+            pairs = tuple(p for p in pairs if {p.sensor_a, p.sensor_b}.isdisjoint(changed))
             tied = {name for pair in pairs for name in (pair.sensor_a, pair.sensor_b)}
             names = [name for name in names if name in tied]
             gains = dict(zip(names, np.exp(_log_gains(names, pairs)).tolist(), strict=True))
@@ -106,9 +107,13 @@ class Balance:
             return None
         logs = {name: float(np.log(gain)) for name, gain in gains.items()}
         middle = float(np.median(list(logs.values())))
-        name = max(logs, key=lambda n: abs(logs[n] - middle))
-        off = logs[name] - middle
-        return (name, float(np.exp(-off))) if abs(off) > np.log1p(OUTLIER_LIMIT) else None
+        farthest = max(logs, key=lambda n: abs(logs[n] - middle))
+        if abs(logs[farthest] - middle) <= np.log1p(OUTLIER_LIMIT):
+            return None
+        causes = _explanations(pairs) or [farthest]
+        name = farthest if farthest in causes else causes[0]
+        others = tuple(sorted(cause for cause in causes if cause != name))
+        return GainOutlier(name, float(np.exp(middle - logs[name])), others)
 
     @property
     def spread(self) -> float:
@@ -305,6 +310,25 @@ def _log_gains(names: Sequence[str], pairs: Sequence[PairBalance]) -> Array:
         values.append(-pair.log_ratio * weight)
     solution, *_ = np.linalg.lstsq(np.array(rows), np.array(values), rcond=None)
     return np.asarray(solution)
+
+
+def _explanations(pairs: Sequence[PairBalance]) -> list[str]:
+    """Sensors of one of which another gain explains what overlaps differ by, the best first.
+
+    Whose gain is wrong is off in all of its overlaps alike. Where the rest is explained as well by
+    another gain of its neighbour, or by neither, both may be wrong.
+    """
+    worst = max((abs(pair.log_ratio) for pair in pairs), default=0.0)
+    causes: dict[str, float] = {}
+    for pair in pairs:
+        if abs(pair.log_ratio) > 0.5 * worst:
+            for name in (pair.sensor_a, pair.sensor_b):
+                of_a = [p.log_ratio for p in pairs if p.sensor_a == name]
+                own = np.array(of_a + [-p.log_ratio for p in pairs if p.sensor_b == name])
+                causes[name] = float(np.sum(np.abs(own) - np.abs(own - np.median(own))))
+    most = max(causes.values(), default=0.0)
+    likely = [name for name in causes if causes[name] >= most - 0.5 * worst]
+    return sorted(likely, key=lambda name: -causes[name])
 
 
 @compiled_kernel(parallel=True)

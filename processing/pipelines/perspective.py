@@ -38,6 +38,7 @@ from processing.pipelines.exposure_pipeline import (
     StageSettings,
 )
 from processing.pipelines.synthetic_frames import synthetic_head_frames
+from processing.quality.defect_lines import defect_line_figures, defect_lines
 from processing.quality.figures import FigureGroup
 from processing.quality.frame_signal import signal_figures
 from processing.quality.readout import blank_unread, unread_figures
@@ -269,7 +270,7 @@ class HeadPipeline(
         figures = (
             *corrected.figures,
             *signal_figures(present, corrected.level1, corrected.statistics),
-            self._step_figures(corrected.planes),
+            *self._line_figures(corrected.planes),
         )
         return Judgement("heads", figures, self._valid_area(stages.image))
 
@@ -289,14 +290,18 @@ class HeadPipeline(
         rasters = heads[cone.name].bands if cone.name in heads else {}
         return area_of_rasters(rasters, _bands(cone), cells, saturated_bit=1)
 
-    def _step_figures(self, planes: Mapping[str, Mapping[str, Array]]) -> FigureGroup:
-        """Steps of the signal in green, or in the one band of a head."""
+    def _line_figures(
+        self, planes: Mapping[str, Mapping[str, Array]]
+    ) -> tuple[FigureGroup | None, ...]:
+        """Steps of the signal, and defect lines, in green or in the one band of a head."""
         means = {}
         for name, bands in planes.items():
             sensor = self.rig.cone(name).sensors[0]
             leading = bands.get("green", next(iter(bands.values())))
             means[sensor.name] = line_means(leading, (0, sensor.height_px - 1))
-        return step_figures(signal_steps(self.rig.sensors, means))
+        steps = signal_steps(self.rig.sensors, means)
+        defects = defect_lines(self.rig.sensors, means)
+        return step_figures(steps), defect_line_figures(defects)
 
     def _lattice(self, cone: Cone, known: Mapping[str, float]) -> Array:
         """Raw (column, row) at every `_CELL_PX`-th pixel; kept while temperatures stay."""

@@ -33,7 +33,9 @@ from processing.mosaic.stitching import Stitching
 from processing.pipelines.exposure_pipeline import Stages
 from processing.pipelines.product import PipelineSettings
 from processing.quality.band_levels import level_figures
+from processing.quality.block_sides import sides_of_blocks
 from processing.quality.common_windows import measure_common_windows
+from processing.quality.defect_lines import defect_line_figures, defect_lines
 from processing.quality.figures import FigureGroup
 from processing.quality.figures.circumstances import ParallaxFigures
 from processing.quality.figures.image import ValidFigures
@@ -161,6 +163,7 @@ def figures_of(
     )
     yield relative_sharpness_figures(rig, start, level1)
     yield step_figures(steps)
+    yield defect_line_figures(defect_lines(rig.sensors, means))
     yield block_figures(rig, limits, blocks)
     shared = measure_common_windows(rig, mosaic.placements, level1)
     yield local_blur_figures(rig, shared)
@@ -168,6 +171,7 @@ def figures_of(
     yield identity_figures(rig, corrected.by_pattern, start, tie_points, image.registrations)
     yield from layer_figures(adjusted.layers)
     every = [line for step in steps for line in step.every]
+    every += sides_of_blocks(rig, means, blocks)
     yield slip_figures(
         rig,
         [

@@ -15,6 +15,7 @@ from processing.quality.figures.image import (
     BlockFigures,
     ClippingFigures,
     ContentFigures,
+    DefectLineFigures,
     IdentityFigures,
     LocalBlurFigures,
     OtherGroundFigures,
@@ -186,26 +187,47 @@ def signal_findings(figures: QualityFigures, thresholds: Thresholds) -> list[Fin
                 float(repeated.repeated_lines),
             )
         )
+    findings += _defect_line(figures.of(DefectLineFigures))
     balance = figures.of(BalanceFigures)
     outlier, signal = balance.gain_outlier, balance.gain_outlier_signal
     if outlier and signal is not None:
-        findings.append(
-            Finding(
-                Flag.UNDEREXPOSED if signal < 1.0 else Flag.OVEREXPOSED,
-                Verdict.USABLE,
-                f"Head {outlier} shows {signal:.2f} times the signal of the others in the "
-                "overlaps: its exposure time, aperture or gain is not that of the record. The "
-                "image is balanced to the other heads; its noise differs there. Check the head's "
-                "settings.",
-                signal,
-                1.0,
-            )
+        sentence = (
+            f"Head {outlier} shows {signal:.2f} times the signal of the others in the "
+            "overlaps: its exposure time, aperture or gain is not that of the record. The "
+            "image is balanced to the other heads; its noise differs there. Check the head's "
+            "settings."
         )
+        if others := ", ".join(balance.gain_outlier_alternatives):
+            sentence = (
+                f"Head {outlier} shows {signal:.2f} times the signal of {others} in the overlaps, "
+                "which cannot show which of them is wrong: exposure time, aperture or gain is not "
+                "that of the record, and the level of the image may be wrong. Check the settings "
+                "of these heads."
+            )
+        flag = Flag.UNDEREXPOSED if signal < 1.0 else Flag.OVEREXPOSED
+        findings.append(Finding(flag, Verdict.USABLE, sentence, signal, 1.0))
     findings += _block(figures.of(BlockFigures), thresholds)
     findings += _clipping(figures.of(ClippingFigures), thresholds)
     return findings + _blur(
         figures.of(RelativeSharpnessFigures), figures.of(LocalBlurFigures), thresholds
     )
+
+
+def _defect_line(line: DefectLineFigures) -> list[Finding]:
+    """A line of a frame that shows no ground."""
+    if line.defect_line is None:
+        return []
+    return [
+        Finding(
+            Flag.FRAME_CORRUPT,
+            Verdict.USABLE,
+            f"Line {line.defect_line_at} of the {line.defect_line_axis} of "
+            f"{line.defect_line_sensor} differs from both neighbours by {line.defect_line:.0%}, "
+            "while these are alike: calibration does not know this defect, or the read-out failed. "
+            "The image shows no ground there. Calibrate the defects of the head.",
+            line.defect_line,
+        )
+    ]
 
 
 def _block(block: BlockFigures, thresholds: Thresholds) -> list[Finding]:

@@ -54,8 +54,12 @@ def stitching_figures(
         Groups of figures.
     """
     yield _adjustment(mosaic)
-    outlier = balance.outlier_without(changed) or (None, None)
-    yield BalanceFigures(balance.spread, *outlier)
+    outlier = balance.outlier_without(changed)
+    yield (
+        BalanceFigures(balance.spread)
+        if outlier is None
+        else BalanceFigures(balance.spread, outlier.sensor, outlier.signal, outlier.alternatives)
+    )
     yield from _tie_points(rig, tie_points, mosaic)
     poorest = poorest_overlap(rig, mosaic, present)
     if poorest is not None:

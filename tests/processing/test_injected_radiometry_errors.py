@@ -194,9 +194,19 @@ def test_a_pan_head_with_another_exposure_is_named_and_draws_no_other(
     outcome = error_free.with_frame("SU11", gain(factor)).outcome()
     assert outcome.verdict == "usable" and outcome.figure("gain_outlier") == "SU11"
     assert outcome.figure("gain_outlier_signal") == pytest.approx(factor, rel=0.02)
+    assert not outcome.figure("gain_outlier_alternatives")
     both = (outcome.product.pan > 0) & (clean.product.pan > 0)
     ratio = np.median(outcome.product.pan[both] / clean.product.pan[both])
     assert ratio == pytest.approx(1.0, abs=0.005)
+
+
+@pytest.mark.parametrize("sensor", ["SU00", "SU10"])
+def test_of_two_pan_heads_both_are_named_where_one_has_another_exposure(sensor: str) -> None:
+    outcome = rendered("ultracam-l-mini").with_frame(sensor, gain(0.5)).outcome()
+    assert outcome.verdict == "usable"
+    alternatives = outcome.figure("gain_outlier_alternatives")
+    assert {outcome.figure("gain_outlier"), alternatives} == {"SU00", "SU10"}
+    assert f"times the signal of {alternatives} in the overlaps, which" in outcome.sentences
 
 
 @pytest.mark.parametrize("sensor", ["R", "SU11", "SU30"])
@@ -422,6 +432,25 @@ def test_a_colour_head_or_a_region_without_fine_detail_is_named(
         assert region == (
             f"columns {columns.start} to {columns.stop - 1}, rows {rows.start} to {rows.stop - 1}"
         )
+
+
+@pytest.mark.parametrize(
+    ("rig", "sensor", "axis"),
+    [("ultracam-x-mini", "SU21", 1), ("ultracam-x-mini", "B", 0), ("ultracam-l-mini", "RGB", 1)],
+)
+def test_a_line_stuck_at_a_value_is_named(rig: str, sensor: str, axis: int) -> None:
+    exposure = rendered(rig)
+
+    def stuck(frame: Any) -> Any:
+        lines = frame if axis == 0 else frame.T
+        lines[201] = int(np.median(frame))
+        return frame
+
+    outcome = exposure.with_frame(sensor, stuck).outcome()
+    assert outcome.verdict == "usable" and "FRAME_CORRUPT" in outcome.flags
+    assert outcome.figure("defect_line_sensor") == sensor
+    assert outcome.figure("defect_line_axis") == ("rows", "columns")[axis]
+    assert outcome.figure("defect_line_at") == 201
 
 
 @pytest.mark.parametrize(("sensor", "line"), [("SU01", 678), ("N", 613)])

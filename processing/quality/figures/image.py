@@ -70,6 +70,19 @@ class RepeatedLineFigures(FigureGroup):
 
 
 @dataclass(frozen=True)
+class DefectLineFigures(FigureGroup):
+    """A line of a frame that shows no ground."""
+
+    defect_line: Annotated[
+        float | None,
+        "how much a line of a frame differs from both neighbours over its whole length, relative",
+    ] = None
+    defect_line_sensor: Annotated[str | None, "the frame it is in"] = None
+    defect_line_axis: Annotated[str | None, "rows or columns"] = None
+    defect_line_at: Annotated[int | None, "the line, raw pixels"] = None
+
+
+@dataclass(frozen=True)
 class SaturationFigures(FigureGroup):
     """Saturated pixels."""
 
@@ -116,6 +129,9 @@ class BalanceFigures(FigureGroup):
         "PAN sensor whose signal in the overlaps is far off that of the others",
     ] = None
     gain_outlier_signal: Annotated[float | None, "its signal over theirs"] = None
+    gain_outlier_alternatives: Annotated[
+        Names, "sensors whose signal may be wrong instead: the overlaps differ by it as well"
+    ] = ()
 
 
 @dataclass(frozen=True)
