@@ -108,9 +108,9 @@ def adjust(
     from daemon.postflight.adjustment.protocol import write_protocol
     from daemon.postflight.adjustment.summary import print_report, report_of
     from processing.bundle.adjust import adjust as adjusted
-    from processing.bundle.initial_values import completed
     from processing.bundle.network import NetworkError
     from processing.bundle.rank_diagnosis import RankDefectError
+    from processing.bundle.starting_values import starting_values
 
     _refuse_unknown_choices(weight_function, test, free_datum)
     if free_datum is not None and free_network is False:
@@ -152,7 +152,7 @@ def adjust(
             def show(what: str, number: int, squares: float) -> None:
                 progress.update(task, description=f"{what} {number}: {squares:.6g}")
 
-            result = adjusted(completed(given.network), settings, progress=show)
+            result = adjusted(starting_values(given.network), settings, progress=show)
     except NetworkError as error:
         problems = error.problems
     except RankDefectError as error:

@@ -209,6 +209,7 @@ def _undetermined_problems(network: Network, station: Array, attitude: Array) ->
         return []
     return [
         f"{len(lost)} images have no orientation and see too few known points for one "
-        f"({', '.join(lost[:5])}{', ...' if len(lost) > 5 else ''}): give theirs, or four points "
-        "with coordinates in each"
+        f"({', '.join(lost[:5])}{', ...' if len(lost) > 5 else ''}): give theirs, four points "
+        "with coordinates in each, or three in a block without any orientation whose images see "
+        "20 points"
     ]
