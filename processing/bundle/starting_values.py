@@ -59,8 +59,9 @@ def starting_values(network: Network) -> Network:
 def _oriented(network: Network) -> Network | None:
     """The network with orientations of the images that hang together; None without any."""
     table, images = network.image_points, network.images
-    given = np.isfinite(network.stations.position_m[images.station]).all(axis=1)
-    given &= np.isfinite(network.attitudes.rotation[images.attitude]).all(axis=(1, 2))
+    placed = np.isfinite(network.stations.position_m[images.station]).all(axis=1)
+    turned = np.isfinite(network.attitudes.rotation[images.attitude]).all(axis=(1, 2))
+    given = np.asarray(placed & turned)
     rows = np.flatnonzero(~network.points.at_infinity[table.point])
     if given[np.unique(table.image)].any() or (images.head >= 0).any() or not rows.size:
         return None
