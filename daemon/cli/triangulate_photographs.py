@@ -135,7 +135,5 @@ def triangulate_photographs(
 
 
 def _principal_distance(camera: Mapping[str, Any]) -> str:
-    return (
-        f"f {camera['f_px']:.1f} +- {camera['f_sigma_px']:.1f} px of {camera['camera']} (EXIF "
-        f"{camera['f_exif_px']:.1f})"
-    )
+    sigma = f"+- {camera['f_sigma_px']:.1f} px" if camera["f_sigma_px"] > 0.0 else "px (held)"
+    return f"f {camera['f_px']:.1f} {sigma} of {camera['camera']} (EXIF {camera['f_exif_px']:.1f})"

@@ -18,6 +18,7 @@ from processing.bundle.image_rows import BehindCameraError
 from processing.bundle.network import Network
 from processing.bundle.reduced_solution import GaussNewtonStep
 from processing.bundle.unknowns import ParameterLayout, ParameterValues, apply_corrections
+from processing.geometry.rotation import rotations_from_vectors, skew
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -35,6 +36,7 @@ _GOOD: Final = 0.6
 _POOR: Final = 0.2
 _MAX_DEPTH_RATIO: Final = 10.0
 _MAX_TRIALS: Final = 4
+_ROTATION_MIN: Final = 3
 _MAX_OWN_SHARE: Final = 0.1
 _SUFFICIENT: Final = 1e-4
 _NEGLIGIBLE: Final = 1e-7
@@ -218,6 +220,8 @@ def corrected_state(
     rays: Rays,
     reciprocal: Flags,
     share: Array,
+    *,
+    rotates: bool = True,
 ) -> ParameterValues:
     """The state after a step.
 
@@ -228,6 +232,7 @@ def corrected_state(
         rays: projection centres by point.
         reciprocal: (p,) points whose depth changes by its reciprocal.
         share: of the correction of each eliminated point, shape (p,).
+        rotates: stations and points rotate together as the step states to first order.
 
     Returns:
         The state; a depth changes by a factor of ten at most and never its sign.
@@ -236,9 +241,56 @@ def corrected_state(
     """
     dpoints = share[:, None] * step.dpoints
     result = apply_corrections(state, layout, step.dx, dpoints)
-    own = reciprocal
+    _change_depths(state, result, layout, dpoints, rays, reciprocal)
+    if rotates:
+        _rotate_as_whole(state, result, layout, rays, rays.free & ~reciprocal)
+    return result
+
+
+def _rotate_as_whole(
+    state: ParameterValues, result: ParameterValues, layout: ParameterLayout, rays: Rays, own: Flags
+) -> None:
+    """Rotate where the linear step moves along tangents: what stations and points share.
+
+    A block that its images hold together and that hardly anything fixes in space turns as a whole.
+    Moved along tangents it loses its shape, and only short steps would lower the sum of squares.
+
+    Args:
+        state: before the step.
+        result: after it, each coordinate moved by its correction; changed.
+        layout: which coordinates are unknown.
+        rays: points at finite distance, which are rotated.
+        own: (p,) points that show the rotation.
+    """
+    if not (layout.station >= 0).all() or own.sum() < _ROTATION_MIN:
+        return
+    points, shown = layout.eliminated_points[rays.free], layout.eliminated_points[own]
+    before = np.concatenate([state.station, state.points[shown]])
+    after = np.concatenate([result.station, result.points[shown]])
+    centre, centre_after = before.mean(axis=0), after.mean(axis=0)
+    away, moved = before - centre, after - before - (centre_after - centre)
+    inertia = (away * away).sum() * np.eye(3) - away.T @ away
+    vector = (np.linalg.pinv(inertia) @ np.cross(away, moved).sum(axis=0))[None]
+    rotation, tangent = rotations_from_vectors(vector)[0], skew(vector)[0]
+    for values, old, rows in (
+        (result.station, state.station, np.arange(len(state.station))),
+        (result.points, state.points, points),
+    ):
+        unturned = values[rows] - centre_after - (old[rows] - centre) @ tangent.T
+        values[rows] = centre_after + unturned @ rotation.T
+
+
+def _change_depths(
+    state: ParameterValues,
+    result: ParameterValues,
+    layout: ParameterLayout,
+    dpoints: Array,
+    rays: Rays,
+    own: Flags,
+) -> None:
+    """Change the depths of points of nearly parallel rays, `own`, by their reciprocals."""
     if not own.any():
-        return result
+        return
     points = layout.eliminated_points[own]
     before, after, base = rays.centres(state)[0][own], *rays.centres(result)
     after, base = after[own], base[own]
@@ -251,7 +303,6 @@ def corrected_state(
     ratio = 1.0 / np.clip(1.0 - along / depth, 1.0 / _MAX_DEPTH_RATIO, _MAX_DEPTH_RATIO)
     ratio = np.minimum(ratio, np.maximum(_FARTHEST * base / depth, 1.0 / _MAX_DEPTH_RATIO))
     result.points[points] = after + ratio[:, None] * (ray + across)
-    return result
 
 
 def lowering_step(
@@ -283,7 +334,9 @@ def lowering_step(
     objective = float(before.misclosure @ before.misclosure)
     of_point = squares_by_point(before, len(share))
     for _ in range(_MAX_TRIALS):
-        after = corrected_state(state, layout, step, rays, reciprocal, share)
+        after = corrected_state(
+            state, layout, step, rays, reciprocal, share, rotates=not network.constraints
+        )
         try:
             rows = rows_of(after)
         except BehindCameraError as error:
