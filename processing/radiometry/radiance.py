@@ -23,6 +23,9 @@ from processing.rig import Sensor
 Array = NDArray[Any]
 
 RADIANCE_FILE_MAX_BYTES: Final = 100_000
+POWER_MAX: Final = 8
+"""Highest power of a two-dimensional vignetting polynomial."""
+_TERMS_MAX: Final = 64
 _VALUE_RANGE: Final = 65536.0
 
 
@@ -32,7 +35,9 @@ class RadianceCalibration:
 
     L = V R (word - black) a1 / (gain t 65536) with words of 16 bits, t the exposure time in s,
     V = 1 / (1 + sum k_i r^i), i from 1, r the distance in px from the vignetting centre (column,
-    row), and R = 1 / (1 + a2 row / t - a3 row), the rows being read one after another.
+    row), and R = 1 / (1 + a2 row / t - a3 row), the rows being read one after another. Where
+    `vignetting_powers` has a pair (p, q) for each k, V = 1 / sum k_i x^p_i y^q_i, x and y being
+    column and row in widths and heights of the frame.
     """
 
     a1: float
@@ -42,6 +47,7 @@ class RadianceCalibration:
     vignetting: tuple[float, ...]
     wavelength_nm: float
     bandwidth_nm: float
+    vignetting_powers: tuple[tuple[int, int], ...] = ()
 
 
 def radiance_from_raw(
@@ -96,15 +102,25 @@ def radiance_from_raw(
         black = sensor.black_dn * sensor.raw_units_per_dn
     # A right-justified word is carried to the 16 bits the calibration is made for.
     unit = (1 << (16 - sensor.bits)) / sensor.raw_units_per_dn
-    column = np.arange(sensor.width_px, dtype=np.float64)[None, :]
     row = np.arange(sensor.height_px, dtype=np.float64)[:, None]
-    centre = calibration.vignetting_centre_px
-    r = np.hypot(column - centre[0], row - centre[1])
-    fall_off = np.polynomial.polynomial.polyval(r, (1.0, *calibration.vignetting))
+    fall_off = _fall_off(calibration, shape)
     rows = 1.0 + calibration.a2 * row / exposure_time_s - calibration.a3 * row
     scale = unit * calibration.a1 / (gain * exposure_time_s * _VALUE_RANGE)
     radiance: Array = ((raw - black) * scale / (fall_off * rows)).astype(np.float32)
     return radiance
+
+
+def _fall_off(calibration: RadianceCalibration, shape: tuple[int, int]) -> Array:
+    """1 / V of each pixel, shape (h, w)."""
+    column = np.arange(shape[1], dtype=np.float64)[None, :]
+    row = np.arange(shape[0], dtype=np.float64)[:, None]
+    if not calibration.vignetting_powers:
+        centre = calibration.vignetting_centre_px
+        r = np.hypot(column - centre[0], row - centre[1])
+        return np.polynomial.polynomial.polyval(r, (1.0, *calibration.vignetting))
+    x, y = column / shape[1], row / shape[0]
+    terms = zip(calibration.vignetting, calibration.vignetting_powers, strict=True)
+    return np.asarray(sum(k * x**p * y**q for k, (p, q) in terms))
 
 
 def saturated_pixels(sensor: Sensor, raw: Array) -> Array:
@@ -138,6 +154,8 @@ def radiance_as_json(calibration: RadianceCalibration) -> dict[str, Any]:
         The fields by name, tuples as lists.
     """
     content = asdict(calibration)
+    if not calibration.vignetting_powers:
+        del content["vignetting_powers"]
     return {
         key: list(value) if isinstance(value, tuple) else value for key, value in content.items()
     }
@@ -176,14 +194,18 @@ def _radiance_from_mapping(content: Any, name: str) -> RadianceCalibration:
         CalibrationError: a key is missing, unknown, or no finite number.
     """
     keys = [field.name for field in fields(RadianceCalibration)]
+    if isinstance(content, Mapping):
+        content = {"vignetting_powers": [], **content}
     if not isinstance(content, Mapping) or sorted(content) != sorted(keys):
         raise CalibrationError(f"{name}: holds other keys than it should: {', '.join(keys)}")
     centre = _numbers(content, "vignetting_centre_px", name)
     if len(centre) != 2:
         raise CalibrationError(f"{name}: vignetting_centre_px has two numbers, column and row")
+    vignetting = _numbers(content, "vignetting", name)
     calibration = RadianceCalibration(
         vignetting_centre_px=(centre[0], centre[1]),
-        vignetting=_numbers(content, "vignetting", name),
+        vignetting=vignetting,
+        vignetting_powers=_powers(content["vignetting_powers"], len(vignetting), name),
         **{key: _number(content[key], key, name) for key in keys if "vignetting" not in key},
     )
     if calibration.a1 <= 0.0:
@@ -191,10 +213,29 @@ def _radiance_from_mapping(content: Any, name: str) -> RadianceCalibration:
     return calibration
 
 
+def _powers(values: Any, count: int, name: str) -> tuple[tuple[int, int], ...]:
+    """Pairs of powers, as many as there are coefficients, or none."""
+    if not isinstance(values, list) or len(values) not in (0, count):
+        raise CalibrationError(f"{name}: vignetting_powers is a list with a pair for each k")
+    pairs = []
+    for pair in values:
+        if not (
+            isinstance(pair, list)
+            and len(pair) == 2
+            and all(type(power) is int and 0 <= power <= POWER_MAX for power in pair)
+        ):
+            raise CalibrationError(
+                f"{name}: vignetting_powers has {pair!r}; two whole numbers from 0 to {POWER_MAX} "
+                "are needed"
+            )
+        pairs.append((pair[0], pair[1]))
+    return tuple(pairs)
+
+
 def _numbers(content: Mapping[str, Any], key: str, name: str) -> tuple[float, ...]:
     values = content[key]
-    if not isinstance(values, list) or len(values) > 16:
-        raise CalibrationError(f"{name}: {key} is a list of at most 16 numbers")
+    if not isinstance(values, list) or len(values) > _TERMS_MAX:
+        raise CalibrationError(f"{name}: {key} is a list of at most {_TERMS_MAX} numbers")
     return tuple(_number(value, key, name) for value in values)
 
 

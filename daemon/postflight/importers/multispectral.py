@@ -233,13 +233,28 @@ def _cameras(folder: Path) -> list[_Camera]:
     notes = [f"{sentence}: {count} images are left out" for sentence, count in left_out.items()]
     cameras = [
         _camera_of(name, serial, images, notes, problems)
-        for (name, serial), images in by_camera.items()
+        for (name, serial), images in _joined(by_camera).items()
     ]
     if not problems and not cameras:
         problems = [f"{folder}: holds no image of a band that is processed; {'; '.join(notes)}"]
     if problems:
         raise ImagesError(problems)
     return cameras
+
+
+def _joined(
+    by_camera: Mapping[tuple[str, str], list[BandImage]],
+) -> dict[tuple[str, str], list[BandImage]]:
+    """Cameras with all their heads: heads of one band that each have a serial number are one."""
+    found = dict(by_camera)
+    for name in {name for name, _ in by_camera}:
+        own = sorted(key for key in by_camera if key[0] == name)
+        bands = [{image.sensor for image in by_camera[key]} for key in own]
+        if len(own) < 2 or any(len(band) > 1 for band in bands):
+            continue
+        if len(set.union(*bands)) == len(own):
+            found[own[0]] = [image for key in own for image in found.pop(key)]
+    return found
 
 
 def _camera_of(
@@ -301,8 +316,8 @@ def _captures(images: Sequence[BandImage], problems: list[str]) -> list[list[Ban
     without = [image.path.name for image in timed if image.taken is None]
     if without:
         problems.append(
-            f"{', '.join(without[:5])}: neither CaptureId, CaptureUUID nor DateTimeOriginal; which "
-            "bands belong together is not known"
+            f"{', '.join(without[:5])}: neither CaptureId, CaptureUUID, ImageUniqueID nor "
+            "DateTimeOriginal; which bands belong together is not known"
         )
         timed = []
     groups: list[list[BandImage]] = []

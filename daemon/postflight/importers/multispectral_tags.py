@@ -28,7 +28,7 @@ from daemon.postflight.importers.xmp import Xmp, XmpError, read_xmp
 from drivers.cameras.tiff_layout import layout_problem
 from processing.geometry.brown import Brown
 from processing.geometry.fisheye import Fisheye
-from processing.radiometry.radiance import RadianceCalibration
+from processing.radiometry.radiance import POWER_MAX, RadianceCalibration
 
 BANDS: Final[Mapping[str, tuple[str, str]]] = {
     "blue": ("B", "blue"),
@@ -45,8 +45,10 @@ BANDS: Final[Mapping[str, tuple[str, str]]] = {
     "red edge-740": ("E2", "red_edge_2"),
 }
 """Sensor and band by BandName, in lower case."""
-LEFT_OUT: Final = frozenset({"panchro", "lwir"})
-"""Bands of another size that are not processed: the panchromatic and the thermal head."""
+LEFT_OUT: Final = frozenset({"panchro", "pan", "lwir", "thermal", "rgb"})
+"""Bands of another size that are not processed: panchromatic, thermal and colour heads."""
+_DEWARPED: Final = "1"
+"""DewarpFlag of an image from which DJI removed the distortion."""
 MICASENSE: Final = "MicaSense"
 _MAX_FILE_BYTES: Final = 100_000_000
 _XMP, _EXIF, _GPS, _BLACK_LEVEL, _MAKE, _MODEL = 700, 34665, 34853, 50714, 271, 272
@@ -55,6 +57,9 @@ _PER_MM: Final = {2: 1.0 / 25.4, 3: 0.1, 4: 1.0, 5: 1000.0}
 _F_IN_MM_BELOW: Final = 100.0
 """A focal length without a unit is in mm, as Pix4D specifies; older RedEdge wrote pixels."""
 _SAME_SCALE: Final = 0.01
+_CAPTURE: Final = ("CaptureId", "CaptureUUID", "ImageUniqueID")
+"""Names of a capture: of MicaSense, of DJI and Parrot, of Sentera."""
+_COLONS_IN_DATE: Final = re.compile(r"^(\d{4}):(\d\d):(\d\d)")
 _F_SHARE: Final = (0.2, 50.0)
 """Focal lengths that are possible, in longer sides of the image."""
 
@@ -122,7 +127,7 @@ def read_image(path: Path) -> tuple[BandImage, NDArray[np.uint16]]:
             wanted = (_XMP, _EXIF, _GPS, _BLACK_LEVEL, _MAKE, _MODEL)
             tags = {code: page.tags[code].value for code in wanted if code in page.tags}
             xmp = _packet(path, tags)
-            _refuse_left_out(path, xmp)
+            _refuse_left_out(xmp)
             if page.dtype != np.uint16 or len(page.shape) != 2:
                 raise ImagesError([f"{path.name}: is no plane of 16-bit words"])
             shape = (int(page.shape[0]), int(page.shape[1]))
@@ -161,9 +166,10 @@ def _camera(tags: Mapping[int, Any]) -> str:
     return " ".join(made).strip()[:80] or "unknown camera"
 
 
-def _refuse_left_out(path: Path, xmp: Xmp) -> None:
-    if "BandName" in xmp and xmp.text("BandName").strip().lower() in LEFT_OUT:
-        raise BandLeftOutError([f"band {xmp.text('BandName').strip()} is not processed"])
+def _refuse_left_out(xmp: Xmp) -> None:
+    names = [name.strip() for name in xmp.texts("BandName")]
+    if len(names) > 1 or (names and names[0].lower() in LEFT_OUT):
+        raise BandLeftOutError([f"band {' '.join(names)[:40]} is not processed"])
 
 
 def _image(path: Path, tags: Mapping[int, Any], xmp: Xmp, pixels: NDArray[np.uint16]) -> BandImage:
@@ -187,7 +193,7 @@ def _image(path: Path, tags: Mapping[int, Any], xmp: Xmp, pixels: NDArray[np.uin
     return BandImage(
         path=path,
         camera=camera,
-        capture_id=next((xmp.text(k) for k in ("CaptureId", "CaptureUUID") if k in xmp), ""),
+        capture_id=next((xmp.text(k) for k in _CAPTURE if k in xmp), ""),
         sensor=sensor,
         band=band,
         serial=_serial(xmp, exif),
@@ -228,7 +234,11 @@ def _missing(
         needed = ()
         missing.append("lens: ModelType with its parameters, or DewarpData in XMP")
     if is_micasense:
-        needed += ("RadiometricCalibration", "VignettingCenter", "VignettingPolynomial")
+        needed += ("RadiometricCalibration",)
+        if "VignettingPolynomial" in xmp or "VignettingPolynomial2D" not in xmp:
+            needed += ("VignettingCenter", "VignettingPolynomial")
+        else:
+            needed += ("VignettingPolynomial2DName",)
         needed += ("CentralWavelength", "WavelengthFWHM")
     missing += [f"{key} in XMP" for key in needed if key not in xmp]
     if "ExposureTime" not in exif:
@@ -263,6 +273,8 @@ def _lens(xmp: Xmp, per_mm: float) -> Brown | Fisheye:
         fx, fy, cx, cy, k1, k2, p1, p2, k3 = _dewarp(xmp)
         if abs(fx / fy - 1.0) > _SAME_SCALE:
             raise ValueError(f"focal lengths of {fx:g} and {fy:g} px")
+        if "DewarpFlag" in xmp and xmp.text("DewarpFlag").strip() == _DEWARPED:
+            k1 = k2 = k3 = p1 = p2 = 0.0
         middle = (xmp.number("CalibratedOpticalCenterX"), xmp.number("CalibratedOpticalCenterY"))
         return Brown(math.sqrt(fx * fy), (middle[0] + cx, middle[1] + cy), k1, k2, k3, p1, p2)
     x_mm, y_mm = xmp.numbers("PrincipalPoint", 2)
@@ -306,13 +318,28 @@ def _dewarp(xmp: Xmp) -> tuple[float, ...]:
 
 def _calibration(xmp: Xmp, wavelength_nm: float) -> RadianceCalibration:
     a1, a2, a3 = xmp.numbers("RadiometricCalibration", 3)
-    centre = xmp.numbers("VignettingCenter", 2)
+    centre: tuple[float, ...] = (0.0, 0.0)
+    powers: tuple[tuple[int, int], ...] = ()
+    if "VignettingPolynomial" in xmp:
+        centre, vignetting = (
+            xmp.numbers("VignettingCenter", 2),
+            xmp.numbers("VignettingPolynomial", 6),
+        )
+    else:
+        # RedEdge-P and Altum-PT: pairs of powers of column and row, then their coefficients.
+        name = "VignettingPolynomial2DName"
+        values = xmp.numbers(name, len(xmp.texts(name, split=True)))
+        if len(values) % 2 or any(v % 1.0 or not 0.0 <= v <= POWER_MAX for v in values):
+            raise ValueError(f"{name}: pairs of powers from 0 to {POWER_MAX} are right")
+        powers = tuple((int(p), int(q)) for p, q in zip(values[::2], values[1::2], strict=True))
+        vignetting = xmp.numbers("VignettingPolynomial2D", len(powers))
     return RadianceCalibration(
         a1=a1,
         a2=a2,
         a3=a3,
         vignetting_centre_px=(centre[0], centre[1]),
-        vignetting=xmp.numbers("VignettingPolynomial", 6),
+        vignetting=vignetting,
+        vignetting_powers=powers,
         wavelength_nm=wavelength_nm,
         bandwidth_nm=_leading_number(xmp, "WavelengthFWHM"),
     )
@@ -359,7 +386,8 @@ def _utc(
     """
     try:
         if "UTCAtExposure" in xmp:
-            stated = datetime.fromisoformat(xmp.text("UTCAtExposure").strip())
+            text = xmp.text("UTCAtExposure").strip()
+            stated = datetime.fromisoformat(_COLONS_IN_DATE.sub(r"\1-\2-\3", text))
             return stated.replace(tzinfo=UTC) if stated.tzinfo is None else stated.astimezone(UTC)
         offset = str(exif.get("OffsetTimeOriginal", exif.get("OffsetTime", ""))).strip("\0 ")
         if taken is not None and offset:

@@ -42,6 +42,11 @@ class Xmp:
             raise XmpError(f"{self._file}: XMP {key} has {len(values)} values; one is needed")
         return values[0]
 
+    def texts(self, key: str, *, split: bool = False) -> tuple[str, ...]:
+        """All texts of a property, none where it is not there; of one text the parts at commas."""
+        values = self._values.get(key, ())
+        return tuple(values[0].split(",") if split and len(values) == 1 else values)
+
     def number(self, key: str) -> float:
         return self._number(key, self.text(key))
 

@@ -80,6 +80,7 @@ def micasense(folder: Path, scene, band: str, name: str, model: str, serial: str
         "RadiometricCalibration": "1e-4,1e-7,1e-6", "VignettingCenter": "160,120",
         "VignettingPolynomial": "0,0,0,0,0,0", **changes.pop("tags", {}),
     }  # fmt: skip
+    values = {key: value for key, value in values.items() if value is not None}
     more = {"black": 4800, "per_mm": 1 / 0.00345, **changes}
     write_image(
         folder / name, scene & 0xFFF0, xmp(values), make="MicaSense", model=model,
@@ -179,6 +180,7 @@ def test_images_of_dji_are_placed_as_opencv_does(scene, tmp_path, model, bands) 
     ("tags", "offset", "hour"),
     [
         ({"UTCAtExposure": "2024-05-06T05:08:09.250000"}, None, 5),
+        ({"UTCAtExposure": "2024:05:06 05:08:09.250000"}, None, 5),
         ({}, "+02:00", 5),
         ({}, None, None),
         ({"UTCAtExposure": "yesterday"}, None, None),
@@ -271,6 +273,69 @@ def test_bands_of_another_size_are_left_out_by_name(scene, tmp_path) -> None:
     ]
 
 
+def test_vignetting_of_a_rededge_p_is_a_polynomial_of_column_and_row(scene, tmp_path) -> None:
+    tags = {
+        "VignettingPolynomial2DName": "0,0,1,0,0,2",
+        "VignettingPolynomial2D": "0.8,0.2,-0.1",
+        "VignettingPolynomial": None,
+        "VignettingCenter": None,
+    }
+    micasense(tmp_path / "in", scene, "Green", "a.tif", "RedEdge-P", "PR02-1", tags=tags)
+    imported(tmp_path / "in", tmp_path / "out")
+    found = json.loads((tmp_path / "out/radiometry/G.json").read_text())
+    assert found["vignetting"] == [0.8, 0.2, -0.1]
+    assert found["vignetting_powers"] == [[0, 0], [1, 0], [0, 2]]
+    rig = load_rig(tmp_path / "out/rig.toml")
+    assert radiance_of(rig, tmp_path / "out/radiometry")["G"].vignetting_powers[2] == (0, 2)
+    for name, sentence in (
+        ("0,0,1,0,0", "pairs of powers from 0 to 8"),
+        ("0,0,1,0,0,-2", "pairs of powers from 0 to 8"),
+        ("0,0,1,0", "XMP VignettingPolynomial2D has 3 values; 2 are needed"),
+        (None, "has no VignettingPolynomial2DName"),
+    ):
+        own = tags | {"VignettingPolynomial2DName": name}
+        micasense(tmp_path / "other", scene, "Green", "a.tif", "RedEdge-P", "PR02-1", tags=own)
+        assert sentence in refused(tmp_path / "other", tmp_path / "two")
+
+
+def test_an_image_that_dji_dewarped_has_no_distortion_left(scene, tmp_path) -> None:
+    dji(tmp_path / "in", scene, "Green", "a.tif", tags={"DewarpFlag": "1"})
+    dji(tmp_path / "raw", scene, "Green", "a.tif", tags={"DewarpFlag": "0"})
+    imported(tmp_path / "in", tmp_path / "out")
+    imported(tmp_path / "raw", tmp_path / "two")
+    corner = np.array([[0.0, 0.0]])
+    for folder, is_straight in (("out", True), ("two", False)):
+        rig = load_rig(tmp_path / folder / "rig.toml")
+        straight_px = corner - [170.5, 112.75]
+        away_px = np.abs(ideal(rig, "G", corner) * 1913.333 - straight_px).max()
+        assert away_px < 0.001 if is_straight else away_px > 0.3
+
+
+def test_captures_of_a_sentera_6x_are_named_by_their_unique_id(scene, tmp_path) -> None:
+    """Two captures within a second, in a folder a band; the heads have serial numbers."""
+    bands = ("Blue", "Green", "Red", "Red Edge", "Near Infrared")
+    for number, band in enumerate(bands):
+        for capture in range(2):
+            values = {
+                "BandName": band, "CentralWavelength": "560", "ModelType": "perspective",
+                "PrincipalPoint": "0.55,0.41", "PerspectiveFocalLength": "8.0",
+                "PerspectiveFocalLengthUnits": "mm", "ImageUniqueID": f"6x-{capture}",
+                "PerspectiveDistortion": "-0.1,0.1,0,0.0002,0.0003",
+            }  # fmt: skip
+            write_image(
+                tmp_path / f"in/{band}/IMG_{capture:04d}.tif", scene, xmp(values), make="Sentera",
+                model="21244-00_3.2MP-GS", serial=f"S{number}", subsec=None, per_mm=1 / 0.00345,
+            )  # fmt: skip
+    colour = xmp({"BandName": "<r:Seq><r:li>Blue</r:li><r:li>Green</r:li><r:li>Red</r:li></r:Seq>"})
+    write_image(tmp_path / "in/RGB/a.tif", scene, colour, make="Sentera", model="20MP")
+    (camera,) = imported(tmp_path / "in", tmp_path / "out")
+    assert (camera["serial"], camera["exposures"], camera["frames"]) == ("S0", 2, 10)
+    assert camera["missing"] == []
+    assert "band Blue Green Red is not processed: 1 images are left out" in camera["notes"]
+    rig = load_rig(tmp_path / "out/rig.toml")
+    assert [sensor.serial for sensor in rig.sensors] == ["S0", "S1", "S2", "S4", "S3"]
+
+
 def test_a_group_with_one_of_five_bands_is_degraded_and_not_usable(scene, tmp_path) -> None:
     for number, band in enumerate(("Blue", "Green", "Red", "NIR", "Red edge"), 1):
         micasense(tmp_path / "in", scene, band, f"IMG_0000_{number}.tif", "RedEdge-M", "R1")
@@ -308,7 +373,10 @@ def test_captures_without_a_name_are_grouped_by_time(scene, tmp_path) -> None:
     assert (camera["exposures"], camera["frames"], camera["missing"]) == (2, 8, [])
     dji(tmp_path / "in", scene, "NIR", "DJI_0099.TIF", tags=nameless, taken="")
     sentence = refused(tmp_path / "in", tmp_path / "other")
-    assert "DJI_0099.TIF: neither CaptureId, CaptureUUID nor DateTimeOriginal" in sentence
+    assert (
+        "DJI_0099.TIF: neither CaptureId, CaptureUUID, ImageUniqueID nor DateTimeOriginal"
+        in sentence
+    )
 
 
 def test_an_unknown_camera_is_refused_with_what_is_missing(scene, tmp_path) -> None:

@@ -45,6 +45,33 @@ def test_radiance_follows_the_maker_s_formula_pixel_by_pixel():
     assert found.dtype == np.float32
 
 
+def test_vignetting_in_two_dimensions_follows_the_formula_pixel_by_pixel(tmp_path):
+    """RedEdge-P and Altum-PT: coefficients of powers of column and row."""
+    powers = ((0, 0), (1, 0), (0, 2), (2, 1))
+    flat = replace(
+        CALIBRATION, vignetting=(0.9, 0.2, -0.3, 0.15), vignetting_powers=powers,
+        vignetting_centre_px=(0.0, 0.0),
+    )  # fmt: skip
+    raw = np.full((6, 8), 20000, np.uint16)
+    found = radiance_from_raw(SENSOR, flat, raw, exposure_time_s=0.002, gain=1.0, black=4700.0)
+    x, y, row = 5 / 8, 4 / 6, 4
+    v = 1.0 / (0.9 + 0.2 * x - 0.3 * y**2 + 0.15 * x**2 * y)
+    rows = 1.0 / (1.0 + 1e-7 * row / 0.002 - 3e-6 * row)
+    expected = v * rows * (20000.0 - 4700.0) * 2e-4 / (0.002 * 65536.0)
+    assert found[4, 5] == pytest.approx(expected, rel=1e-6)
+    path = tmp_path / "B.json"
+    path.write_text(json.dumps(radiance_as_json(flat)))
+    assert load_radiance(path) == flat
+    for powers, sentence in (
+        ([[0, 0]], "with a pair for each k"),
+        ([[0, 0], [1, 0], [0, 2], [2, 99]], "from 0 to 8"),
+        ([[0, 0], [1, 0], [0, 2], [2, True]], "two whole numbers"),
+    ):
+        path.write_text(json.dumps({**radiance_as_json(flat), "vignetting_powers": powers}))
+        with pytest.raises(CalibrationError, match=sentence):
+            load_radiance(path)
+
+
 def test_right_justified_values_of_the_same_light_have_the_same_radiance():
     left = np.full((6, 8), 16 * 1234, np.uint16)
     right = np.full((6, 8), 1234, np.uint16)
