@@ -412,9 +412,13 @@ def test_after_landing_the_summary_stays_without_an_alarm(cockpit: Cockpit) -> N
     cockpit.status("landed", triggers=9)
     cockpit.until("document.querySelector('#landing').checkVisibility()")
     cockpit.until("document.querySelectorAll('[data-file]').length === 4")
+    cockpit.emit({"event": "landing", "folders": ["/media/a"], "poweroff": ""})
+    cockpit.until("document.querySelector('[data-action=verify]') !== null")
     cockpit.service.end()
     cockpit.until("document.body.classList.contains('flight-ended')")
     assert not browser.evaluate("document.body.classList.contains('connection-lost')")
+    # What only the service can do is no longer offered.
+    assert browser.evaluate("document.querySelector('[data-action]')") is None
     lamp = browser.evaluate("document.querySelector('#lamp-link').className")
     assert "off" in lamp
     assert browser.evaluate("document.querySelector('#alarm-bar').hidden")

@@ -88,6 +88,8 @@ function showLink(isLinked) {
   isLive = isLinked;
   feed.drawLamps();
   feed.drawAlarms();
+  // Commands that only the service can do are no longer offered.
+  if (!isLinked) feed.refresh();
 }
 
 connect(showLink, async () => {
