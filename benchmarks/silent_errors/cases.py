@@ -13,15 +13,24 @@ import numpy as np
 
 from benchmarks.silent_errors.exposures import healthy, remeasured
 from benchmarks.silent_errors.faults import FAULTS
+from benchmarks.silent_errors.frame_faults import FRAME_FAULTS
 from benchmarks.silent_errors.limits import LIMITS
 from benchmarks.silent_errors.truth import CleanImage, Found, compare, image_of
+from processing.quality.figures import QualityFigures
 from processing.quality.figures.circumstances import EstimatedDcFigures
 from processing.quality.figures.image import (
     BalanceFigures,
+    BlockFigures,
+    ClippingFigures,
     ContentFigures,
+    DefectLineFigures,
+    IdentityFigures,
+    LocalBlurFigures,
     OtherGroundFigures,
     RelativeSharpnessFigures,
+    RepeatedLineFigures,
     SignalStepFigures,
+    UnreadFigures,
     WordFormatFigures,
 )
 from processing.quality.figures.stitching import (
@@ -33,10 +42,12 @@ from processing.quality.figures.stitching import (
     PlatformFigures,
     SlipFigures,
 )
-from processing.quality.report import Flag, QualityReport, Verdict
+from processing.quality.report import Flag, QualityReport, Thresholds, Verdict
 
-LATER: Final = ("frame-part",)
+LATER: Final = ("frame-part", *FRAME_FAULTS)
 """Kinds that were added last: the first cases of a seed stay what they were."""
+NARROW: Final = ("stuck-column",)
+"""Kinds that change less than a region that is compared: without a finding they are silent."""
 EXPOSURES: Final = 2
 """Healthy exposures of a rig, over other ground and at other temperatures."""
 SMALLEST, LARGEST = 0.5, 4.0
@@ -188,6 +199,7 @@ def _result(
         placed = placed and found.worst <= found.worst_limit
     shown = found.radiance <= RADIANCE and found.band_px <= BAND_PX
     shown = shown and found.detail >= DETAIL and found.blank <= BLANK
+    shown = shown and case.kind not in NARROW
     if not placed or (case.above and not shown):
         return "silent"
     return "right" if case.above else "covered"
@@ -210,12 +222,11 @@ def named_causes(report: QualityReport) -> dict[str, frozenset[str]]:
         "temperature": _names(figures.of(EstimatedDcFigures).dc_disagreement),
         "misread": _names(_one(misread.misread_probe)),
     }
+    identity = figures.of(IdentityFigures)
+    found["exchanged"] = _names(identity.exchanged_frames, identity.exchanged_from)
     # Of frames of other ground, signal and sharpness are not evaluated.
     if not other_ground:
-        found["gain"] = _names(_one(figures.of(BalanceFigures).gain_outlier))
-        found["blur"] = _names(_one(figures.of(RelativeSharpnessFigures).blurred_sensor))
-        found["noise"] = _names(_one(figures.of(RelativeSharpnessFigures).noisy_sensor))
-        found["step"] = _names(_one(figures.of(SignalStepFigures).signal_step_sensor))
+        found |= _signal_causes(figures)
     if Flag.CALIBRATION_EXPIRED in report.flags:
         causes, other = figures.of(LayerFigures).platform_causes, platform.platform_alternatives
         scaled = _one(figures.of(HeadScaleFigures).platform_scale_head)
@@ -223,6 +234,33 @@ def named_causes(report: QualityReport) -> dict[str, frozenset[str]]:
             _one(platform.platform_shift_head), other, scaled
         )
     return {what: names for what, names in found.items() if names}
+
+
+def _signal_causes(figures: QualityFigures) -> dict[str, frozenset[str]]:
+    """Who is named for signal or sharpness."""
+    limits = Thresholds()
+    block, local = figures.of(BlockFigures), figures.of(LocalBlurFigures)
+    clipping, unread = figures.of(ClippingFigures), figures.of(UnreadFigures)
+    relative, balance = figures.of(RelativeSharpnessFigures), figures.of(BalanceFigures)
+    found = {
+        "gain": _names(_one(balance.gain_outlier), balance.gain_outlier_alternatives),
+        "blur": _names(_one(relative.blurred_sensor)),
+        "noise": _names(_one(relative.noisy_sensor)),
+        "line": _names(_one(figures.of(DefectLineFigures).defect_line_sensor)),
+        "step": _names(_one(figures.of(SignalStepFigures).signal_step_sensor)),
+        "repeated": _names(_one(figures.of(RepeatedLineFigures).repeated_lines_sensor)),
+    }
+    if abs(block.block_step or 0.0) > limits.block_step:
+        found["block"] = _names(_one(block.block_sensor))
+    if (clipping.clipped_fraction or 0.0) > limits.clipped_fraction:
+        found["clipped"] = _names(clipping.clipped_sensors)
+    if (unread.unread_worst_fraction or 0.0) > limits.unread_fraction:
+        found["unread"] = _names(_one(unread.unread_worst_sensor))
+    if (local.pan_blur_deficit or 0.0) > limits.pan_blur_deficit:
+        found["pan blur"] = _names(_one(local.pan_blur_sensor))
+    if (local.colour_blur_deficit or 0.0) > limits.colour_blur_deficit:
+        found["colour blur"] = _names(_one(local.colour_blur_sensor))
+    return found
 
 
 def _one(name: str | None) -> tuple[str, ...]:

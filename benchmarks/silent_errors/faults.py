@@ -3,80 +3,36 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, Final, TypeVar
+from dataclasses import replace
+from typing import Any, Final
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.silent_errors.exposures import EmulatedExposure
+from benchmarks.silent_errors.frame_faults import FRAME_FAULTS
+from benchmarks.silent_errors.planting import (
+    Array,
+    Fault,
+    FaultInjector,
+    Random,
+    any_of,
+    any_part,
+    any_sign,
+    colour_sensors,
+    of_cone,
+    of_frame,
+    of_sensor,
+    pan_sensors,
+    scaled,
+    sensors_of_several,
+)
 from processing.rig import Cone, Rig, Sensor
-
-Array = NDArray[Any]
-Random = np.random.Generator
-T = TypeVar("T")
-
-
-@dataclass(frozen=True)
-class Fault:
-    """What was planted: the exposure, what may rightly be named as the cause, and a description."""
-
-    emulated: EmulatedExposure
-    true_causes: frozenset[str]
-    description: str
-
-
-FaultInjector = Callable[[EmulatedExposure, float, Random], Fault]
-
-
-def _of_cone(
-    emulated: EmulatedExposure, cone: Cone, change: Callable[[Cone], Cone], description: str
-) -> Fault:
-    names = frozenset({cone.name, *(s.name for s in cone.sensors)})
-    return Fault(emulated.with_cone(cone.name, change), names, f"cone {cone.name}: {description}")
-
-
-def _of_sensor(
-    emulated: EmulatedExposure, name: str, change: Callable[[Sensor], Sensor], description: str
-) -> Fault:
-    names = frozenset({name, emulated.rig.cone_of(name).name})
-    return Fault(emulated.with_sensor(name, change), names, f"{name}: {description}")
-
-
-def _of_frame(
-    emulated: EmulatedExposure, name: str, change: Callable[[Array], Array], description: str
-) -> Fault:
-    names = frozenset({name, emulated.rig.cone_of(name).name})
-    return Fault(emulated.with_frame(name, change), names, f"{name}: {description}")
-
-
-def _any(random: Random, some: Sequence[T]) -> T:
-    return some[int(random.integers(0, len(some)))]
-
-
-def _sign(random: Random) -> float:
-    return float(_any(random, (-1.0, 1.0)))
-
-
-def _pan(rig: Rig) -> list[str]:
-    """PAN sensors; all where there is no PAN."""
-    pan = [s.name for cone in rig.pan_cones for s in cone.sensors]
-    return pan or [s.name for s in rig.sensors]
-
-
-def _colour(rig: Rig) -> list[str]:
-    return [s.name for cone in rig.cones if cone.role == "colour" for s in cone.sensors]
-
-
-def _several(rig: Rig) -> list[str]:
-    """Sensors of cones of several."""
-    return [s.name for cone in rig.pan_cones if len(cone.sensors) > 1 for s in cone.sensors]
 
 
 def _principal_distance(emulated: EmulatedExposure, ppm: float, random: Random) -> Fault:
-    cone, off = _any(random, emulated.rig.pan_cones), _sign(random) * ppm
-    return _of_cone(emulated, cone, _with_f(off), f"principal distance {off:+.0f} ppm")
+    cone, off = any_of(random, emulated.rig.pan_cones), any_sign(random) * ppm
+    return of_cone(emulated, cone, _with_f(off), f"principal distance {off:+.0f} ppm")
 
 
 def _with_f(ppm: float) -> Callable[[Cone], Cone]:
@@ -93,10 +49,10 @@ def _rotated(rotation_rad: Sequence[float]) -> Callable[[Cone], Cone]:
 
 def _cone_rotated(emulated: EmulatedExposure, urad: float, random: Random) -> Fault:
     rig = emulated.rig
-    cone = _any(random, [c for c in rig.cones if c.name != rig.master_cone])
-    axis, off = int(random.integers(0, 3)), _sign(random) * urad
+    cone = any_of(random, [c for c in rig.cones if c.name != rig.master_cone])
+    axis, off = int(random.integers(0, 3)), any_sign(random) * urad
     rotation = np.eye(3)[axis] * off * 1e-6
-    return _of_cone(
+    return of_cone(
         emulated, cone, _rotated(rotation), f"turned {off:+.0f} urad about {'xyz'[axis]}"
     )
 
@@ -106,14 +62,17 @@ def _moved(x_px: float, y_px: float) -> Callable[[Sensor], Sensor]:
 
 
 def _sensor_displaced(emulated: EmulatedExposure, px: float, random: Random) -> Fault:
-    name, angle = _any(random, _several(emulated.rig)), float(random.uniform(0.0, 2.0 * np.pi))
+    name, angle = (
+        any_of(random, sensors_of_several(emulated.rig)),
+        float(random.uniform(0.0, 2.0 * np.pi)),
+    )
     x, y = px * np.cos(angle), px * np.sin(angle)
-    return _of_sensor(emulated, name, _moved(x, y), f"displaced {x:+.2f}, {y:+.2f} px")
+    return of_sensor(emulated, name, _moved(x, y), f"displaced {x:+.2f}, {y:+.2f} px")
 
 
 def _sensor_rotated(emulated: EmulatedExposure, urad: float, random: Random) -> Fault:
-    name, off = _any(random, _several(emulated.rig)), _sign(random) * urad
-    return _of_sensor(
+    name, off = any_of(random, sensors_of_several(emulated.rig)), any_sign(random) * urad
+    return of_sensor(
         emulated,
         name,
         lambda s: replace(s, rotation_rad=s.rotation_rad + off * 1e-6),
@@ -122,7 +81,7 @@ def _sensor_rotated(emulated: EmulatedExposure, urad: float, random: Random) -> 
 
 
 def _slip(emulated: EmulatedExposure, lines: float, random: Random) -> Fault:
-    name = _any(random, [*_pan(emulated.rig), *_leading(emulated.rig)])
+    name = any_of(random, [*pan_sensors(emulated.rig), *_leading(emulated.rig)])
     axis = int(random.integers(0, 2))
     sensor = emulated.rig.sensor(name)
     size = (sensor.height_px, sensor.width_px)[axis]
@@ -143,7 +102,7 @@ def _slip(emulated: EmulatedExposure, lines: float, random: Random) -> Fault:
         return moved
 
     description = f"{count} {('rows', 'columns')[axis]} from {first} on are those {by} further on"
-    fault = _of_frame(emulated, name, change, description)
+    fault = of_frame(emulated, name, change, description)
     return replace(fault, emulated=replace(fault.emulated, content={name: content}))
 
 
@@ -158,32 +117,23 @@ def _blurred(sigma: float) -> Callable[[Array], Array]:
 
 
 def _blur(emulated: EmulatedExposure, sigma: float, random: Random) -> Fault:
-    name = _any(random, _pan(emulated.rig))
-    return _of_frame(emulated, name, _blurred(sigma), f"blurred by {sigma:.2f} px")
+    name = any_of(random, pan_sensors(emulated.rig))
+    return of_frame(emulated, name, _blurred(sigma), f"blurred by {sigma:.2f} px")
 
 
 def _blur_region(emulated: EmulatedExposure, sigma: float, random: Random) -> Fault:
-    name = _any(random, _pan(emulated.rig))
-    part, where = _part(emulated.rig.sensor(name), 2, random)
+    name = any_of(random, pan_sensors(emulated.rig))
+    part, where = any_part(emulated.rig.sensor(name), 2, random)
 
     def change(frame: Array) -> Array:
         frame[part] = cv2.GaussianBlur(frame, (0, 0), sigma)[part]
         return frame
 
-    return _of_frame(emulated, name, change, f"blurred by {sigma:.2f} px in {where}")
-
-
-def _part(sensor: Sensor, parts: int, random: Random) -> tuple[tuple[slice, slice], str]:
-    """One of `parts` x `parts` regions of a frame."""
-    height, width = sensor.height_px // parts, sensor.width_px // parts
-    top = int(random.integers(0, sensor.height_px - height + 1))
-    left = int(random.integers(0, sensor.width_px - width + 1))
-    where = f"rows {top} to {top + height - 1}, columns {left} to {left + width - 1}"
-    return (slice(top, top + height), slice(left, left + width)), where
+    return of_frame(emulated, name, change, f"blurred by {sigma:.2f} px in {where}")
 
 
 def _blur_band(emulated: EmulatedExposure, sigma: float, random: Random) -> Fault:
-    name = _any(random, _colour(emulated.rig))
+    name = any_of(random, colour_sensors(emulated.rig))
     bayer = emulated.rig.sensor(name).colour_filter_array != "none"
 
     def change(frame: Array) -> Array:
@@ -195,50 +145,45 @@ def _blur_band(emulated: EmulatedExposure, sigma: float, random: Random) -> Faul
                 frame[row::2, column::2] = cv2.GaussianBlur(plane, (0, 0), sigma / 2.0)
         return frame
 
-    return _of_frame(emulated, name, change, f"blurred by {sigma:.2f} px")
+    return of_frame(emulated, name, change, f"blurred by {sigma:.2f} px")
 
 
 def _smear(emulated: EmulatedExposure, px: float, random: Random) -> Fault:
-    name, along = _any(random, _pan(emulated.rig)), bool(random.integers(0, 2))
+    name, along = any_of(random, pan_sensors(emulated.rig)), bool(random.integers(0, 2))
     # Of an even length the content would shift by half a pixel, too.
     length = 1 + 2 * max(1, round((px - 1.0) / 2.0))
     size = (1, length) if along else (length, 1)
     way = "along" if along else "across"
-    return _of_frame(
+    return of_frame(
         emulated, name, lambda f: np.asarray(cv2.blur(f, size)), f"smeared by {length} px {way}"
     )
 
 
-def _scaled(sensor: Sensor, frame: Array, factor: Any) -> Array:
-    signal = (frame.astype(np.float64) - sensor.black_dn) * factor + sensor.black_dn
-    return np.asarray(np.clip(np.rint(signal), 0, sensor.full_scale_dn), np.uint16)
-
-
 def _gain_step(emulated: EmulatedExposure, percent: float, random: Random) -> Fault:
-    return _stepped(emulated, _any(random, _pan(emulated.rig)), percent, random)
+    return _stepped(emulated, any_of(random, pan_sensors(emulated.rig)), percent, random)
 
 
 def _gain_step_colour(emulated: EmulatedExposure, percent: float, random: Random) -> Fault:
-    return _stepped(emulated, _any(random, _colour(emulated.rig)), percent, random)
+    return _stepped(emulated, any_of(random, colour_sensors(emulated.rig)), percent, random)
 
 
 def _stepped(emulated: EmulatedExposure, name: str, percent: float, random: Random) -> Fault:
     axis = int(random.integers(0, 2))
     sensor = emulated.rig.sensor(name)
     size = (sensor.height_px, sensor.width_px)[axis]
-    line, off = int(random.integers(size // 8, size - size // 8)), _sign(random) * percent
+    line, off = int(random.integers(size // 8, size - size // 8)), any_sign(random) * percent
     factors = np.where(np.arange(size) < line, 1.0, 1.0 + off / 100.0)
     factor = factors[:, None] if axis == 0 else factors[None, :]
     description = f"signal {off:+.1f} % from {('row', 'column')[axis]} {line} on"
-    return _of_frame(emulated, name, lambda f: _scaled(sensor, f, factor), description)
+    return of_frame(emulated, name, lambda f: scaled(sensor, f, factor), description)
 
 
 def _banding(emulated: EmulatedExposure, percent: float, random: Random) -> Fault:
-    return _banded(emulated, _any(random, _pan(emulated.rig)), percent, random)
+    return _banded(emulated, any_of(random, pan_sensors(emulated.rig)), percent, random)
 
 
 def _banding_colour(emulated: EmulatedExposure, percent: float, random: Random) -> Fault:
-    return _banded(emulated, _any(random, _colour(emulated.rig)), percent, random)
+    return _banded(emulated, any_of(random, colour_sensors(emulated.rig)), percent, random)
 
 
 def _banded(emulated: EmulatedExposure, name: str, percent: float, random: Random) -> Fault:
@@ -249,7 +194,7 @@ def _banded(emulated: EmulatedExposure, name: str, percent: float, random: Rando
     dn = np.rint(percent / 100.0 * signal) * ((np.arange(size) // period) % 2)
     lines = dn[:, None] if axis == 0 else dn[None, :]
     description = f"{('rows', 'columns')[axis]} in turn of {period} {dn.max():.0f} DN brighter"
-    return _of_frame(emulated, name, lambda f: _added(sensor, f, lines), description)
+    return of_frame(emulated, name, lambda f: _added(sensor, f, lines), description)
 
 
 def _added(sensor: Sensor, frame: Array, dn: Any) -> Array:
@@ -257,59 +202,59 @@ def _added(sensor: Sensor, frame: Array, dn: Any) -> Array:
 
 
 def _block_offset(emulated: EmulatedExposure, dn: float, random: Random) -> Fault:
-    return _block(emulated, _any(random, _pan(emulated.rig)), dn, random)
+    return _block(emulated, any_of(random, pan_sensors(emulated.rig)), dn, random)
 
 
 def _block_offset_colour(emulated: EmulatedExposure, dn: float, random: Random) -> Fault:
-    return _block(emulated, _any(random, _colour(emulated.rig)), dn, random)
+    return _block(emulated, any_of(random, colour_sensors(emulated.rig)), dn, random)
 
 
 def _block(emulated: EmulatedExposure, name: str, dn: float, random: Random) -> Fault:
     sensor = emulated.rig.sensor(name)
-    part, where = _part(sensor, 4, random)
+    part, where = any_part(sensor, 4, random)
     added = np.zeros((sensor.height_px, sensor.width_px))
     added[part] = round(dn)
     description = f"{dn:.0f} DN brighter in {where}"
-    return _of_frame(emulated, name, lambda f: _added(sensor, f, added), description)
+    return of_frame(emulated, name, lambda f: _added(sensor, f, added), description)
 
 
 def _clipping(emulated: EmulatedExposure, percent: float, random: Random) -> Fault:
-    name = _any(random, _pan(emulated.rig))
+    name = any_of(random, pan_sensors(emulated.rig))
     level = float(np.percentile(emulated.frames[name], 100.0 - percent))
     description = f"clipped at {level:.0f} DN, {percent:.1f} % of its pixels"
-    return _of_frame(emulated, name, lambda f: np.minimum(f, np.uint16(level)), description)
+    return of_frame(emulated, name, lambda f: np.minimum(f, np.uint16(level)), description)
 
 
 def _exposure_of(emulated: EmulatedExposure, name: str, percent: float, random: Random) -> Fault:
     factor = 1.0 + percent / 100.0
     factor = factor if random.integers(0, 2) else 1.0 / factor
     sensor = emulated.rig.sensor(name)
-    return _of_frame(
-        emulated, name, lambda f: _scaled(sensor, f, factor), f"exposed {factor:.2f} times as long"
+    return of_frame(
+        emulated, name, lambda f: scaled(sensor, f, factor), f"exposed {factor:.2f} times as long"
     )
 
 
 def _exposure_pan(emulated: EmulatedExposure, percent: float, random: Random) -> Fault:
-    return _exposure_of(emulated, _any(random, _pan(emulated.rig)), percent, random)
+    return _exposure_of(emulated, any_of(random, pan_sensors(emulated.rig)), percent, random)
 
 
 def _exposure_colour(emulated: EmulatedExposure, percent: float, random: Random) -> Fault:
-    return _exposure_of(emulated, _any(random, _colour(emulated.rig)), percent, random)
+    return _exposure_of(emulated, any_of(random, colour_sensors(emulated.rig)), percent, random)
 
 
 def _exposure_unknown(emulated: EmulatedExposure, _: float, random: Random) -> Fault:
-    name = _any(random, _colour(emulated.rig))
+    name = any_of(random, colour_sensors(emulated.rig))
     times = {n: t for n, t in emulated.conditions.exposure_time_s.items() if n != name}
     conditions = replace(emulated.conditions, exposure_time_s=times)
     sensor = emulated.rig.sensor(name)
-    changed = emulated.with_frame(name, lambda f: _scaled(sensor, f, 0.5))
+    changed = emulated.with_frame(name, lambda f: scaled(sensor, f, 0.5))
     true_causes = frozenset({name, emulated.rig.cone_of(name).name})
     description = f"{name}: exposed half as long, not stated"
     return Fault(replace(changed, conditions=conditions), true_causes, description)
 
 
 def _exposure_stated(emulated: EmulatedExposure, percent: float, random: Random) -> Fault:
-    name = _any(random, _several(emulated.rig))
+    name = any_of(random, sensors_of_several(emulated.rig))
     factor = 1.0 + percent / 100.0
     factor = factor if random.integers(0, 2) else 1.0 / factor
     times = dict(emulated.conditions.exposure_time_s)
@@ -329,14 +274,14 @@ def _with_probes(emulated: EmulatedExposure, off_k: Mapping[str, float]) -> Emul
 
 
 def _probes_all(emulated: EmulatedExposure, kelvin: float, random: Random) -> Fault:
-    off = _sign(random) * kelvin
+    off = any_sign(random) * kelvin
     changed = _with_probes(emulated, dict.fromkeys(emulated.rig.probes, off))
     names = frozenset(emulated.rig.probes) | {c.name for c in emulated.rig.cones}
     return Fault(changed, names, f"all probes {off:+.1f} K")
 
 
 def _probe_one(emulated: EmulatedExposure, kelvin: float, random: Random) -> Fault:
-    cone, off = _any(random, emulated.rig.pan_cones), _sign(random) * kelvin
+    cone, off = any_of(random, emulated.rig.pan_cones), any_sign(random) * kelvin
     read = {cone.probe, *(s.probe for s in cone.sensors)}
     names = frozenset(read | {cone.name})
     return Fault(
@@ -352,8 +297,8 @@ def _stale(emulated: EmulatedExposure, seconds: float, random: Random) -> Fault:
 
 
 def _tdi(emulated: EmulatedExposure, shifts: float, random: Random) -> Fault:
-    cone = _any(random, emulated.rig.pan_cones)
-    off = int(_sign(random)) * max(1, round(shifts))
+    cone = any_of(random, emulated.rig.pan_cones)
+    off = int(any_sign(random)) * max(1, round(shifts))
     counts = dict(emulated.conditions.tdi_shifts)
     for sensor in cone.sensors:
         counts[sensor.name] = max(0, counts[sensor.name] + off)
@@ -365,14 +310,14 @@ def _tdi(emulated: EmulatedExposure, shifts: float, random: Random) -> Fault:
 
 
 def _half_frame(emulated: EmulatedExposure, percent: float, random: Random) -> Fault:
-    name = _any(random, [s.name for s in emulated.rig.sensors])
+    name = any_of(random, [s.name for s in emulated.rig.sensors])
     lines = round(emulated.rig.sensor(name).height_px * min(percent, 90.0) / 100.0)
 
     def change(frame: Array) -> Array:
         frame[-lines:] = 0
         return frame
 
-    fault = _of_frame(emulated, name, change, f"last {lines} rows not read out")
+    fault = of_frame(emulated, name, change, f"last {lines} rows not read out")
     return replace(fault, emulated=replace(fault.emulated, elsewhere=frozenset({name})))
 
 
@@ -397,14 +342,14 @@ def _exchanged(emulated: EmulatedExposure, a: str, b: str) -> Fault:
 
 
 def _bands_swapped(emulated: EmulatedExposure, _: float, random: Random) -> Fault:
-    a, b = random.choice(_colour(emulated.rig), 2, replace=False)
+    a, b = random.choice(colour_sensors(emulated.rig), 2, replace=False)
     fault = _exchanged(emulated, str(a), str(b))
     # The same ground, in another colour.
     return replace(fault, emulated=replace(fault.emulated, elsewhere=frozenset()))
 
 
 def _frames_swapped(emulated: EmulatedExposure, _: float, random: Random) -> Fault:
-    a, b = random.choice(_pan(emulated.rig), 2, replace=False)
+    a, b = random.choice(pan_sensors(emulated.rig), 2, replace=False)
     return _exchanged(emulated, str(a), str(b))
 
 
@@ -412,8 +357,8 @@ def _other_ground(
     change: Callable[[EmulatedExposure, str], Array], description: str
 ) -> FaultInjector:
     def inject(emulated: EmulatedExposure, _: float, random: Random) -> Fault:
-        name = _any(random, [s.name for s in emulated.rig.sensors])
-        fault = _of_frame(emulated, name, lambda _: change(emulated, name), description)
+        name = any_of(random, [s.name for s in emulated.rig.sensors])
+        fault = of_frame(emulated, name, lambda _: change(emulated, name), description)
         return replace(fault, emulated=replace(fault.emulated, elsewhere=frozenset({name})))
 
     return inject
@@ -422,28 +367,28 @@ def _other_ground(
 def _frame_part(emulated: EmulatedExposure, _: float, random: Random) -> Fault:
     rig = emulated.rig
     compared = [c for c in rig.cones if c.role == "pan" or "nir" not in c.bands]
-    name = _any(random, [s.name for c in compared for s in c.sensors])
-    part, where = _part(rig.sensor(name), 4, random)
+    name = any_of(random, [s.name for c in compared for s in c.sensors])
+    part, where = any_part(rig.sensor(name), 4, random)
     other = emulated.other()[name]
 
     def change(frame: Array) -> Array:
         frame[part] = other[part]
         return frame
 
-    fault = _of_frame(emulated, name, change, f"of the next exposure in {where}")
+    fault = of_frame(emulated, name, change, f"of the next exposure in {where}")
     return replace(fault, emulated=replace(fault.emulated, elsewhere=frozenset({name})))
 
 
 def _words(emulated: EmulatedExposure, _: float, random: Random) -> Fault:
-    name = _any(random, [s.name for s in emulated.rig.sensors])
+    name = any_of(random, [s.name for s in emulated.rig.sensors])
     shift = 16 - emulated.rig.sensor(name).bits
     if random.integers(0, 2):
-        return _of_frame(emulated, name, lambda f: f.byteswap(), "words byte-swapped")
-    return _of_frame(emulated, name, lambda f: f << shift, "words left-justified")
+        return of_frame(emulated, name, lambda f: f.byteswap(), "words byte-swapped")
+    return of_frame(emulated, name, lambda f: f << shift, "words left-justified")
 
 
 def _frame_lost(emulated: EmulatedExposure, _: float, random: Random) -> Fault:
-    name = _any(random, [s.name for s in emulated.rig.sensors])
+    name = any_of(random, [s.name for s in emulated.rig.sensors])
     frames = {n: f for n, f in emulated.frames.items() if n != name}
     changed = replace(emulated, frames=frames, elsewhere=frozenset({name}))
     return Fault(changed, frozenset({name, emulated.rig.cone_of(name).name}), f"{name} lost")
@@ -484,5 +429,6 @@ FAULTS: Final[Mapping[str, FaultInjector]] = {
     "frame-part": _frame_part,
     "words": _words,
     "frame-lost": _frame_lost,
+    **FRAME_FAULTS,
 }
 """How each kind of `benchmarks.silent_errors.limits` is planted."""

@@ -81,6 +81,9 @@ LIMITS: Final[Mapping[str, Limit]] = {
     ),
     "bands-swapped": Limit("frames of two colour heads swapped", "", _same_limit((X, DMC), 1.0)),
     "frames-swapped": Limit("frames of two PAN heads swapped", "", _same_limit(STITCHED, 1.0)),
+    "heads-swapped": Limit(
+        "frames of two heads of one size swapped, or serials", "", _same_limit((X, DMC, MIDAS), 1.0)
+    ),
     "frame-other": Limit("a frame of another exposure", "", _same_limit(STITCHED, 1.0)),
     "frame-turned": Limit("a frame turned by 180 degrees", "", _same_limit(STITCHED, 1.0)),
     "frame-mirrored": Limit("a frame mirrored", "", _same_limit(STITCHED, 1.0)),
@@ -90,6 +93,34 @@ LIMITS: Final[Mapping[str, Limit]] = {
     ),
     "words": Limit("words left-justified or byte-swapped", "", _same_limit(EVERY, 1.0)),
     "frame-lost": Limit("a frame lost", "", _same_limit(EVERY, 1.0)),
+    "exposure-half": Limit(
+        "a PAN head exposed half as long, not stated", "", _same_limit(STITCHED, 1.0)
+    ),
+    "row-inserted": Limit(
+        "one row twice, the rest of the frame one row further on", "", _same_limit(STITCHED, 1.0)
+    ),
+    "stuck-column": Limit("a column stuck at one value", "", _same_limit(EVERY, 1.0)),
+    "gain-step-oblique": Limit(
+        "signal of a PAN frame beyond a line at an angle", "%", {}
+    ),
+    "gain-step-oblique-colour": Limit(
+        "signal of a colour frame beyond a line at an angle", "%", {}
+    ),
+    "vignetting": Limit(
+        "corners of a PAN frame darker: another lens", "%", _same_limit(STITCHED, 20.0)
+    ),
+    "smear-varying": Limit(
+        "a PAN head smeared, growing from row to row up to", "px", _same_limit(STITCHED, 6.0)
+    ),
+    "rows-stale": Limit(
+        "last rows of a PAN frame of another exposure", "%", _same_limit(STITCHED, 20.0)
+    ),
+    "frame-copied": Limit(
+        "the frame of another head of the same size", "", _same_limit(EVERY, 1.0)
+    ),
+    "frame-flipped": Limit(
+        "a frame flipped, last row first", "", _same_limit(STITCHED, 1.0)
+    ),
 }  # fmt: skip
 
 

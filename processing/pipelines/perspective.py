@@ -40,6 +40,7 @@ from processing.pipelines.exposure_pipeline import (
 from processing.pipelines.synthetic_frames import synthetic_head_frames
 from processing.quality.defect_lines import defect_line_figures, defect_lines
 from processing.quality.figures import FigureGroup
+from processing.quality.frame_identity import FixedPatterns, heads_by_pattern, pattern_figures
 from processing.quality.frame_signal import signal_figures
 from processing.quality.readout import blank_unread, unread_figures
 from processing.quality.repeated_lines import repeated_line_figures
@@ -203,6 +204,7 @@ class HeadPipeline(
             )
         super().__init__(rig, settings or HeadSettings())
         self._correctors = correctors_for(rig.sensors, radiometry or {})
+        self._patterns = FixedPatterns(self._correctors)
         self._lattices: dict[str, tuple[tuple[float | None, float | None], Array]] = {}
 
     def clone(self) -> HeadPipeline:
@@ -239,6 +241,7 @@ class HeadPipeline(
             unread_figures(unread_fraction),
             word_format_figures(self.rig, frames),
             repeated_line_figures(self.rig, frames),
+            pattern_figures(heads_by_pattern(self.rig, frames, self._patterns, {})),
         )
         return _CorrectedHeads(level1, statistics, planes, figures)
 

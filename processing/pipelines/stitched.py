@@ -181,7 +181,8 @@ class Pipeline(
                 repeated_line_figures(rig, frames),
                 clipping_figures(rig, frames),
             )
-            by_pattern = heads_by_pattern(rig, frames, self._patterns, start)
+            tdi_shifts = {name: placement.tdi_shifts for name, placement in start.items()}
+            by_pattern = heads_by_pattern(rig, frames, self._patterns, tdi_shifts)
         return CorrectedFrames(level1, statistics, start, ground, by_pattern, figures)
 
     def _level1(

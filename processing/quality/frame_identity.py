@@ -17,6 +17,7 @@ from processing.geometry.placement import SensorPlacement, vip_mm_from_raw
 from processing.image.colour import BandRegistration
 from processing.matching.tie_points import PAN_TO_COLOUR, TiePoints
 from processing.quality.figures.image import IdentityFigures
+from processing.radiometry.demosaic import is_bayer
 from processing.radiometry.level1 import Corrector, exposed_rows
 from processing.rig import Rig, Sensor
 
@@ -61,8 +62,9 @@ class FixedPatterns:
             shifts: TDI shifts, over which the response is averaged.
 
         Returns:
-            Second differences along the rows as a share of the response, (rows, width - 2); None
-            for a sensor without a calibrated response.
+            Second differences along the rows as a share of the response, (rows, width - 2), or
+            width - 4 where pixels of one colour are two apart; None for a sensor without a
+            calibrated response.
         """
         corrector = self._correctors.get(name)
         if corrector is None or corrector.response is None:
@@ -71,7 +73,7 @@ class FixedPatterns:
             rows = _rows(corrector.sensor, shifts)
             visited = rows[:, None] - corrector.sensor.tdi_row_sign * np.arange(shifts + 1)
             response = corrector.response[visited].mean(axis=1, dtype=np.float32)
-            self._known[name, shifts] = _relative_change(response)
+            self._known[name, shifts] = _relative_change(response, _pace(corrector.sensor))
         return self._known[name, shifts]
 
 
@@ -79,7 +81,7 @@ def heads_by_pattern(
     rig: Rig,
     frames: Mapping[str, Array],
     patterns: FixedPatterns,
-    placements: Mapping[str, SensorPlacement],
+    tdi_shifts: Mapping[str, int],
 ) -> dict[str, str]:
     """Find frames that show another head's fixed pattern and not their own.
 
@@ -87,7 +89,7 @@ def heads_by_pattern(
         rig: the camera.
         frames: Level-0 frames by sensor name, (h, w) uint16, DN.
         patterns: of the pixels' response.
-        placements: their TDI shifts count, by sensor name.
+        tdi_shifts: of each frame, by sensor name; none where it is absent.
 
     Returns:
         The sensor a frame came from, by the sensor it is stored for.
@@ -97,7 +99,7 @@ def heads_by_pattern(
         name = sensor.name
         if name not in frames:
             continue
-        shifts = placements[name].tdi_shifts
+        shifts = tdi_shifts.get(name, 0)
         own = patterns.of(name, shifts)
         if own is None:
             continue
@@ -112,7 +114,7 @@ def heads_by_pattern(
             other.name: _correlation_significance(change, pattern)
             for other in rig.sensors
             if other.name != name
-            and (sensor.width_px, sensor.height_px) == (other.width_px, other.height_px)
+            and _format(sensor) == _format(other)
             and (pattern := patterns.of(other.name, shifts)) is not None
         }
         best = max(others, key=lambda n: others[n], default=None)
@@ -140,9 +142,32 @@ def identity_figures(
     Returns:
         Such frames, the heads they came from, and by what; empty without one.
     """
-    found = by_pattern or _by_place(rig, placements, tie_points, bands)
-    shown_by = "fixed pattern" if by_pattern else "geometry"
-    return IdentityFigures(tuple(found), tuple(found.values()), shown_by if found else None)
+    if by_pattern:
+        return pattern_figures(by_pattern)
+    found = _by_place(rig, placements, tie_points, bands)
+    return IdentityFigures(tuple(found), tuple(found.values()), "geometry" if found else None)
+
+
+def pattern_figures(by_pattern: Mapping[str, str]) -> IdentityFigures:
+    """Name frames that show another head's fixed pattern.
+
+    Args:
+        by_pattern: of `heads_by_pattern`.
+
+    Returns:
+        Such frames and the heads they came from; empty without one.
+    """
+    shown_by = "fixed pattern" if by_pattern else None
+    return IdentityFigures(tuple(by_pattern), tuple(by_pattern.values()), shown_by)
+
+
+def _format(sensor: Sensor) -> tuple[int, int, str]:
+    return sensor.width_px, sensor.height_px, sensor.colour_filter_array
+
+
+def _pace(sensor: Sensor) -> int:
+    """Pixels from one to the next of its colour along a row."""
+    return 2 if is_bayer(sensor) else 1
 
 
 def _rows(sensor: Sensor, shifts: int) -> Array:
@@ -155,13 +180,14 @@ def _rows(sensor: Sensor, shifts: int) -> Array:
 def _change_of(sensor: Sensor, lines: Array) -> Array:
     """Relative change along lines of a Level-0 frame."""
     signal = lines.astype(np.float32) / sensor.raw_units_per_dn - sensor.black_dn
-    return _relative_change(signal)
+    return _relative_change(signal, _pace(sensor))
 
 
-def _relative_change(lines: Array) -> Array:
+def _relative_change(lines: Array, pace: int) -> Array:
     """Second differences along lines over what they are of, edges cut off."""
-    middle = lines[:, 1:-1]
-    change = (lines[:, 2:] - 2.0 * middle + lines[:, :-2]) / np.maximum(middle, np.float32(20.0))
+    middle = lines[:, pace:-pace]
+    change = lines[:, 2 * pace :] - 2.0 * middle + lines[:, : -2 * pace]
+    change /= np.maximum(middle, np.float32(20.0))
     most = MAX_TEXTURE * np.float32(np.median(np.abs(change)))
     limited: Array = np.clip(change, -most, most)
     return limited

@@ -106,6 +106,23 @@ def test_tie_points_that_a_step_of_signal_draws_are_no_slip_of_the_neighbour() -
     assert outcome.result == "found" and outcome.named == {"step": "RGB"}
 
 
+@pytest.mark.trust
+def test_tie_points_that_an_edge_of_a_block_draws_are_no_slip_of_the_neighbour() -> None:
+    """They lie at the end of the block, not at the edge that is named."""
+    case = Case(52, "block-offset-colour", X, exposure=0, share=3.505049949549646, seed=10100052)
+    outcome = run(case)
+    assert outcome.description.startswith("G: 561 DN brighter in rows 211 to 418")
+    assert outcome.result == "found" and outcome.named == {"block": "G"}
+
+
+@pytest.mark.trust
+@pytest.mark.parametrize("kind", ["heads-swapped", "frame-copied"])
+def test_frames_of_heads_that_share_no_ground_are_known_by_their_fixed_pattern(kind: str) -> None:
+    outcome = run(Case(0, kind, MIDAS, exposure=0, share=1.0, seed=7))
+    assert outcome.result == "found" and outcome.verdict == "refly"
+    assert set(outcome.named["exchanged"].split(", ")) <= {"nadir", "5", "7", "8", "19"}
+
+
 def test_the_published_detection_limits_are_those_of_the_search() -> None:
     assert table() in DOCUMENT.read_text(encoding="utf-8")
     assert FAULTS.keys() == LIMITS.keys()

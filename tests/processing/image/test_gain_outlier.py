@@ -43,7 +43,7 @@ def test_where_one_overlap_differs_and_the_others_do_not_both_of_its_heads_are_n
     assert {found.sensor, *found.alternatives} == {"A", "C"}
 
 
-def test_a_head_whose_signal_changes_within_its_frame_says_nothing_about_gains() -> None:
+def test_a_head_whose_signal_changes_within_its_frame_does_not_count() -> None:
     logs = {**dict.fromkeys("ABCD", 0.0), "D": math.log(1.4)}
     assert balance(logs).outlier_without({"D"}) is None
     assert balance(dict.fromkeys("ABCD", 0.07)).outlier_without(()) is None
