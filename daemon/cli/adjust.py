@@ -80,6 +80,14 @@ def adjust(
             "(default: unknowns)."
         ),
     ] = None,
+    join: Annotated[
+        bool,
+        typer.Option(
+            "--join",
+            help="Join object points of no common image whose adjusted coordinates agree, and "
+            "adjust again.",
+        ),
+    ] = False,
     covariance: Annotated[
         Path | None,
         typer.Option(help="File for covariances (.npz): of all orientations, and of each point."),
@@ -109,6 +117,7 @@ def adjust(
     from daemon.postflight.adjustment.summary import print_report, report_of
     from processing.bundle.adjust import adjust as adjusted
     from processing.bundle.network import NetworkError
+    from processing.bundle.point_joining import joined_points, named_points
     from processing.bundle.rank_diagnosis import RankDefectError
     from processing.bundle.starting_values import starting_values
 
@@ -153,6 +162,16 @@ def adjust(
                 progress.update(task, description=f"{what} {number}: {squares:.6g}")
 
             result = adjusted(starting_values(given.network), settings, progress=show)
+            joined = 0
+            if join:
+                network, joined = joined_points(
+                    result.network,
+                    result.state.points,
+                    result.point_cofactor * result.sigma0**2,
+                    named_points(result.network, given.checks.names),
+                )
+            if joined:
+                result = adjusted(network, settings, progress=show)
     except NetworkError as error:
         problems = error.problems
     except RankDefectError as error:
@@ -166,6 +185,8 @@ def adjust(
             for problem in problems:
                 console.print(problem, style="red", markup=False, highlight=False)
         raise typer.Exit(ExitStatus.PROBLEM)
+    if join:
+        Console(stderr=True).print(f"{joined} object points were joined with others")
     report = report_of(
         result,
         given.checks,

@@ -234,7 +234,8 @@ def print_triangulation(console: Console, found: Mapping[str, Any]) -> None:
     if found["patterns"]["images"]:
         console.print(
             f"{found['patterns']['images']} images with patterns of stitching, at most "
-            f"{found['patterns']['most']} each",
+            f"{found['patterns']['most']} each, which hold at least "
+            f"{100.0 * found['patterns']['share']:.1f} % of its variance",
             highlight=False,
         )
     if found["mounting"]:
