@@ -21,6 +21,7 @@ FOLDERS: Final[Mapping[str, str]] = {
     "reference/contributing": "Contributing",
     "explanation": "Explanation",
     "explanation/cameras": "Cameras",
+    "explanation/processing": "Processing",
     "explanation/mathematics": "Mathematics",
     "explanation/decisions": "Decisions",
 }

@@ -15,6 +15,7 @@ port=8786
 host=$(hostname --fqdn)
 tls="--tls-ca $certificates/ca.pem --tls-certificate $certificates/own.pem --tls-key $certificates/own.key"
 
+export DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED=False DASK_DISTRIBUTED__ADMIN__TICK__INTERVAL=1s
 dask scheduler --protocol tls --host "$host" --port "$port" --dashboard-address 127.0.0.1:8787 \
     --tls-ca-file "$certificates/ca.pem" --tls-cert "$certificates/own.pem" \
     --tls-key "$certificates/own.key" &
