@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.stats import chi2, poisson
 
 from benchmarks.silent_errors.cases import WIDEST, Case, by_exposure, draw, run
 from benchmarks.silent_errors.clean import clean_rows, clean_summary
@@ -103,6 +103,12 @@ def failures(rows: Sequence[Row]) -> list[str]:
     flagged = [row for row in rows if row["flags"]]
     unflagged = [row for row in rows if not row["flags"]]
     failed = _wrong(rows) + interval_failures(unflagged, "unflagged")
+    wide, expected, most = wide_sigmas(flagged)
+    if wide > most:
+        failed.append(
+            f"{wide} flagged images state more than {WIDEST:g} times their error, {expected:.1f} "
+            f"are expected of what they state, {most} in one of 1,000 runs"
+        )
     failed += interval_failures(flagged, "flagged", lower=False)
     pooled = _pooled(flagged)
     if pooled is not None and not pooled.stated_px <= WIDEST * pooled.true_px:
@@ -155,6 +161,25 @@ def _pooled(rows: Iterable[Row]) -> _Pooled | None:
     )
     mean = sum(row["squares"] for row in some) / rank
     return _Pooled(len(some), rank, mean, low, high, true_px, stated_px)
+
+
+def wide_sigmas(rows: Iterable[Row]) -> tuple[int, float, int]:
+    """How many images state more than `WIDEST` times their error, and how many are expected to.
+
+    An error of a few unknowns is small by chance, however honest its sigma is.
+
+    Args:
+        rows: outcomes; those without a stated covariance do not count.
+
+    Returns:
+        Their number, its expectation where the stated covariances hold, and what it reaches in one
+        of 1,000 runs (Poisson).
+    """
+    some = [row for row in rows if row["rank"] and row.get("freedom")]
+    wide = sum(row["stated_px"] > WIDEST * row["error_px"] for row in some)
+    freedom = np.array([row["freedom"] for row in some])
+    expected = float(np.sum(chi2.cdf(freedom / WIDEST**2, freedom)))
+    return wide, expected, int(poisson.ppf(0.999, expected))
 
 
 def results(cases: Sequence[Case], file: Path | None, jobs: int) -> Iterable[Row]:
@@ -231,12 +256,12 @@ def _sigmas(rows: Sequence[Row]) -> list[str]:
         pooled = _pooled(some)
         if pooled is None:
             continue
-        wide = sum(r["stated_px"] > WIDEST * r["error_px"] for r in some if r["rank"])
+        wide, expected, _ = wide_sigmas(some)
         lines.append(
             f"{label}: {pooled.images} images, mean square of normalised errors {pooled.mean:.3f} "
             f"(rank {pooled.rank}, {pooled.low:.3f} .. {pooled.high:.3f}); {pooled.true_px:.3f} px "
             f"true, {pooled.stated_px:.3f} stated; {wide} state more than {WIDEST:g} times their "
-            "error"
+            f"error, {expected:.1f} are expected of what they state"
         )
     return lines
 

@@ -138,6 +138,7 @@ class Outcome:
     worst_limit: float | None
     squares: float | None
     rank: int
+    freedom: float | None
     band_px: float
     radiance: float
     radiance_of: str

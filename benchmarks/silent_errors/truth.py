@@ -48,8 +48,8 @@ class Found:
     `error_px` is the RMS of a coordinate over the image, `stated_px` the report's sigma, `worst`
     the RMS error of the worst PAN sensor `worst_of` over its own stated sigma, `worst_limit` what
     that ratio reaches in one of 1,000 images where the stated covariance holds. `normalised` are
-    the errors of check points against the stated covariance. `band_px` is the largest RMS error of
-    a colour band, colour pixels. `radiance` is the largest relative error of a region,
+    the errors of check points against the stated covariance, `freedom` the degrees of freedom of
+    their mean square. `band_px` is the largest RMS error of a colour band, colour pixels. `radiance` is the largest relative error of a region,
     `radiance_of` its sensor. Against the image of the same exposure without a fault, `detail` is
     the least share of the fine detail of a sensor, `blank` the largest share of its part of the
     image that has no data, `blank_of` the sensor.
@@ -61,6 +61,7 @@ class Found:
     worst_of: str
     worst_limit: float | None
     normalised: NormalizedErrors | None
+    freedom: float | None
     band_px: float
     radiance: float
     radiance_of: str
@@ -102,6 +103,7 @@ def compare(
         worst_of="",
         worst_limit=None,
         normalised=None,
+        freedom=None,
         band_px=0.0,
         radiance=regions.get(worst, 0.0),
         radiance_of=worst,
@@ -116,6 +118,7 @@ def compare(
     stated = product.report.figures.of(PrecisionFigures).stitched_sigma_px
     points = _check_points(emulated, product)
     ratio, name, limit = _worst_head(emulated, product, errors, points)
+    normalised, freedom = _normalised(emulated, product, points)
     return replace(
         found,
         error_px=float(np.sqrt(np.mean(every**2))),
@@ -123,7 +126,8 @@ def compare(
         worst=ratio,
         worst_of=name,
         worst_limit=limit,
-        normalised=_normalised(emulated, product, points),
+        normalised=normalised,
+        freedom=freedom,
         band_px=max(_bands(emulated, product).values(), default=0.0),
     )
 
@@ -184,15 +188,23 @@ def _of_head(emulated: EmulatedExposure, product: Product, name: str, points: Ar
 def head_limit(covariance: Array, heads: int) -> float:
     """RMS error over stated sigma that one of `heads` heads reaches in one of 1,000 images.
 
-    The mean square of correlated errors is taken as a chi-square of as many degrees of freedom
-    as has its variance (Satterthwaite).
-
     Args:
         covariance: of the errors of one head, (n, n).
         heads: that are compared.
     """
-    freedom = float(np.trace(covariance)) ** 2 / float(np.sum(covariance**2))
+    freedom = freedom_of(covariance)
     return float(np.sqrt(chi2.ppf(1.0 - BY_CHANCE / heads, freedom) / freedom))
+
+
+def freedom_of(covariance: Array) -> float:
+    """Degrees of freedom of the chi-square that has the variance of the errors' mean square.
+
+    Source: Satterthwaite, F. E. (1946). Biometrics Bulletin 2(6), 110-114.
+
+    Args:
+        covariance: of correlated errors, (n, n).
+    """
+    return float(np.trace(covariance)) ** 2 / float(np.sum(covariance**2))
 
 
 def _check_points(emulated: EmulatedExposure, product: Product) -> dict[str, Array]:
@@ -208,10 +220,10 @@ def _check_points(emulated: EmulatedExposure, product: Product) -> dict[str, Arr
 
 def _normalised(
     emulated: EmulatedExposure, product: Product, points: Mapping[str, Array]
-) -> NormalizedErrors | None:
+) -> tuple[NormalizedErrors | None, float | None]:
     """Errors of check points against the covariance stated for them, findings included."""
     if not points or product.mosaic.redundancy <= 0:
-        return None
+        return None, None
     image, mosaic = emulated.world.image, product.mosaic
     error = []
     for name, raw in points.items():
@@ -222,7 +234,8 @@ def _normalised(
     added = disturbance_covariance_px(
         emulated.rig, mosaic, points, product.uncertainty_contribution
     )
-    return normalized_errors(np.concatenate(error), tie + datum + added)
+    covariance = tie + datum + added
+    return normalized_errors(np.concatenate(error), covariance), freedom_of(covariance)
 
 
 def _bands(emulated: EmulatedExposure, product: Product) -> dict[str, float]:

@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.silent_errors.__main__ import failures
+from benchmarks.silent_errors.__main__ import failures, wide_sigmas
 from benchmarks.silent_errors.cases import Case, _result, draw, run
 from benchmarks.silent_errors.clean import clean_row, clean_rows
 from benchmarks.silent_errors.exposures import retoned
 from benchmarks.silent_errors.faults import FAULTS
 from benchmarks.silent_errors.limits import DMC, LIMITS, MIDAS, L, X, table
-from benchmarks.silent_errors.truth import Found, _least_share, head_limit
+from benchmarks.silent_errors.truth import Found, _least_share, freedom_of, head_limit
 from processing.quality.figures import QualityFigures
 from processing.quality.report import NO_FLAGS, QualityReport, Verdict
 
@@ -146,6 +146,7 @@ RIGHT = Found(
     worst_of="SU00",
     worst_limit=3.0,
     normalised=None,
+    freedom=None,
     band_px=0.1,
     radiance=0.01,
     radiance_of="SU00",
@@ -209,6 +210,17 @@ def test_a_run_fails_where_errors_are_not_those_stated(
 ) -> None:
     sentences = failures(rows)
     assert [s[: len(failed)] for s in sentences] == ([failed] if failed else [])
+
+
+def test_errors_that_are_small_by_chance_are_expected_by_their_degrees_of_freedom() -> None:
+    honest = [_row("BLUR", 1000.0, stated_px=0.1, freedom=2.0) for _ in range(90)]
+    wide = [_row("BLUR", 1000.0, stated_px=0.31, freedom=2.0) for _ in range(10)]
+    assert wide_sigmas([*honest, *wide]) == (10, pytest.approx(100 * -np.expm1(-1.0 / 9.0)), 22)
+    assert not failures([*honest, *wide])
+    (sentence,) = failures([*honest, *(3 * wide)])
+    assert sentence.startswith("30 flagged images state more than 3 times their error")
+    moved = np.tile(np.eye(2), (25, 25))
+    assert freedom_of(moved) == pytest.approx(2.0) and freedom_of(np.eye(7)) == pytest.approx(7.0)
 
 
 @pytest.mark.soak
