@@ -58,6 +58,11 @@ PORT = 18_790
 STORE_FAILURE_SHARE = 0.01
 RATIO_MAX = 1.18
 """Seconds of the cluster over those of two plain processes, without kills."""
+SCHEDULER_SETTINGS: Final = {
+    "DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "False",
+    "DASK_DISTRIBUTED__ADMIN__TICK__INTERVAL": "1s",
+}
+"""As the how-to on many exposures states."""
 LAST_KILL_SHARE = 0.95
 """Of the exposures: an exposure that lost two processes is tried alone at the end of a run."""
 CONTINUE_STATUS: Final = 75
@@ -129,7 +134,7 @@ def started_scheduler() -> subprocess.Popen[bytes]:
         [str(dask), "scheduler", *options],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
-        env=os.environ | {"PYTHONPATH": str(Path.cwd())},
+        env=os.environ | SCHEDULER_SETTINGS | {"PYTHONPATH": str(Path.cwd())},
     )
 
 
@@ -358,6 +363,7 @@ def with_kills(
         before = events_of(path)
         done = before[attempt_notes.WORKER_KILLED] + before[attempt_notes.SCHEDULER_KILLED]
         killer = Killer(plan[done:], notes)
+        notes.add(0, attempt_notes.STOPPED)  # an earlier program may have been killed itself
         with cluster(options.folder, options.workers, killer) as executor:
             finished = options.exposures - pending
 
