@@ -298,7 +298,7 @@ def without_kills(
 
 
 def one_pace(pristine: Mission, root: Path, workers: int) -> dict[str, float]:
-    """Pace of one run: of two processes where the folder's name begins with plain, else of a cluster."""
+    """Pace of one run: of two processes in a folder named plain-N, else of a cluster."""
     mission, notes = linked(pristine, root), root.with_suffix(".txt")
     notes.unlink(missing_ok=True)
     if root.name.startswith("plain"):
