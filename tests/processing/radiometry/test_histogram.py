@@ -20,3 +20,10 @@ def test_saturated_pixels_are_in_the_last_bin_and_the_sample_is_a_sixtyfourth() 
     frame = np.full((160, 240), 4095, np.uint16)
     counts = sampled_histogram(frame, 12)
     assert counts[-1] == sum(counts) == 160 * 240 // 64
+
+
+def test_a_converter_of_fewer_values_than_bins_leaves_bins_empty() -> None:
+    values = np.arange(16, dtype=np.uint16)
+    frame = np.repeat(np.tile(values, (EVERY, 1)), EVERY, axis=1)
+    counts = sampled_histogram(frame, 4)
+    assert counts[::4] == (1,) * 16 and sum(counts) == 16
