@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from daemon.postflight.triangulation.ground_control import GroundControl
 from daemon.postflight.triangulation.photograph_block import PhotographBlock
 from processing.bundle.camera_model import ideal_mm, principal_distance_mm
+from processing.geometry.positions_fit import NotPlacedError, fit_positions
 
 Array = NDArray[np.float64]
 
@@ -28,6 +29,9 @@ _LIMIT_HEIGHTS: Final = 0.05
 _DOUBTFUL_M: Final = 0.5
 _DOUBTFUL: Final = 3.0
 """Median deviations beyond which a point is named where the adjustment fails."""
+_OTHERS_MIN: Final = 4
+_OUTLYING: Final = 4.0
+"""A point this many times farther off than any of the others, which four at least must be."""
 _SHARE: Final = 0.3
 """An exchange explains deviations that it reduces to less than this share."""
 
@@ -51,6 +55,9 @@ def control_mistakes(found: PhotographBlock, control: GroundControl) -> list[str
     if far:
         return far
     deviation, limit = _deviations(found, control, control.xyz_m)
+    outlying = _outlying(found, control, limit)
+    if outlying:
+        return outlying
     own = _total(deviation)
     if not own > limit * len(control.names) / 2.0:
         return []
@@ -125,6 +132,31 @@ def _far(found: PhotographBlock, control: GroundControl) -> list[str]:
         f"control is not where the photographs are: {listed}. Check the coordinate system and the "
         "order of east and north"
     ]
+
+
+def _outlying(found: PhotographBlock, control: GroundControl, limit_m: float) -> list[str]:
+    """The one point that all others contradict, which agree with each other."""
+    place = _measured_places(found, control, control.xyz_m)
+    known = np.flatnonzero(np.isfinite(place[:, 0]))
+    if len(known) < _OTHERS_MIN + 1:
+        return []
+    worst, sentences = _OUTLYING, []
+    for k in known.tolist():
+        rest = known[known != k]
+        try:
+            fit = fit_positions(place[rest], control.xyz_m[rest])
+        except NotPlacedError:
+            continue
+        away_m = float(np.linalg.norm(fit.applied(place[k][None])[0] - control.xyz_m[k]))
+        others_m = float(np.linalg.norm(fit.residual_m, axis=1).max())
+        if away_m > limit_m and away_m > worst * others_m:
+            worst = away_m / others_m
+            sentences = [
+                f"control point {control.names[k]} is {away_m:.1f} m from where the photographs "
+                f"and the other {len(rest)} points place it, which agree to {others_m:.1f} m. "
+                "Check its coordinates and its measurements, or leave it out"
+            ]
+    return sentences
 
 
 def _deviations(

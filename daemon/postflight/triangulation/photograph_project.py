@@ -300,6 +300,7 @@ def photographs_section(
             for name, axes in zip(result.network.points.names, result.excluded.control, strict=True)
             if axes.any()
         ],
+        "control_measurements_rejected": _rejected_measurements(result),
         "f_ground_correlation": correlation,
         "ground_sigma_of_f_m": ground_sigma_m,
         "f_and_height_separated": 0.0 < ground_sigma_m <= height_m / cameras[0]["f_px"],
@@ -338,6 +339,15 @@ def photograph_cautions(section: Mapping[str, Any]) -> list[str]:
         found.append(
             f"control rejected by the adjustment: {', '.join(section['control_rejected'])}; check "
             "coordinates and measurements of these points"
+        )
+    if section["control_measurements_rejected"]:
+        listed = ", ".join(
+            f"{one['point']} {one['rejected']} of {one['measured']}"
+            for one in section["control_measurements_rejected"]
+        )
+        found.append(
+            f"measurements of control rejected by the adjustment: {listed}; check the coordinates "
+            "of these points and where the photographs show them"
         )
     if not section["f_and_height_separated"] and section["ground_sigma_of_f_m"] > 0.0:
         used = section["control_points"]
@@ -454,6 +464,18 @@ def _measured_control(result: Adjustment) -> int:
     seen = np.bincount(table.point[result.weight > 0.0], minlength=len(result.network.points.names))
     is_control = np.isfinite(result.network.points.sigma_m).any(axis=1)
     return int((is_control & (seen > 0)).sum())
+
+
+def _rejected_measurements(result: Adjustment) -> list[dict[str, Any]]:
+    """Control points of which half of the image measurements or more are rejected."""
+    table, names = result.network.image_points, result.network.points.names
+    measured = np.bincount(table.point, minlength=len(names))
+    rejected = np.bincount(table.point[result.excluded.image], minlength=len(names))
+    is_control = np.isfinite(result.network.points.sigma_m).any(axis=1)
+    return [
+        {"point": names[k], "rejected": int(rejected[k]), "measured": int(measured[k])}
+        for k in np.flatnonzero(is_control & (rejected > 0) & (2 * rejected >= measured))
+    ]
 
 
 def _interior_sigmas(result: Adjustment, camera: int) -> dict[str, float]:

@@ -467,6 +467,28 @@ def test_a_control_point_that_the_adjustment_rejects_is_named(block) -> None:
     assert any("control rejected by the adjustment: p1;" in s for s in photograph_cautions(section))
 
 
+def test_a_control_point_that_all_others_contradict_is_named(block) -> None:
+    control = control_from(block, 6)
+    assert control_mistakes(block, control) == []
+    for away in ((9.0, 0.0, 0.0), (0.0, 0.0, -9.0)):
+        xyz = control.xyz_m.copy()
+        xyz[2] += away
+        (sentence,) = control_mistakes(block, replace(control, xyz_m=xyz))
+        assert re.match(r"control point p2 is [89]\.\d m from where .* other 5 points", sentence)
+
+
+def test_control_whose_measurements_are_rejected_is_named(block) -> None:
+    control = control_from(block, 6)
+    own = np.flatnonzero(control.point == 1)
+    px = control.px.copy()
+    px[own] += np.random.default_rng(6).choice([-40.0, 40.0], (len(own), 2))
+    section = section_of(block, replace(control, px=px))
+    (one,) = section["control_measurements_rejected"]
+    assert one["point"] == "p1" and one["measured"] == len(own) and 2 * one["rejected"] >= len(own)
+    expected = f"rejected by the adjustment: p1 {one['rejected']} of {len(own)};"
+    assert any(expected in sentence for sentence in photograph_cautions(section))
+
+
 def test_control_in_tables_is_refused_by_the_command(triangulated, block, tmp_path) -> None:
     """A gcp_list.txt in degrees with two names exchanged; the command names them."""
     mission, _ = triangulated
