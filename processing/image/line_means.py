@@ -20,6 +20,8 @@ Array = NDArray[Any]
 BUNDLE_PX: Final = 32
 BUNDLES: Final = 39
 """So many bundles of pixels of a line are averaged, or as many as fit in it."""
+_AT_ONCE: Final = 4
+"""Rows that are added to the sums of the columns at once."""
 _TILE_ROWS: Final = 16
 """Rows that are transposed at once: their words of one bundle fill a line of cache."""
 
@@ -112,42 +114,47 @@ def _sum_lines(frame, by_row, by_column):
         first = block * tall
         last = height if block == blocks - 1 else first + tall
         for r in range(first, last):
-            add_line(frame[r], r - first, by_row[r], by_column[block])
+            add_line(frame, r, r - first, by_row[r], by_column[block])
 
 
 @compiled_kernel()
-def add_line(line, row_of_block, of_row, by_column):
+def add_line(frame, row, row_of_block, of_row, by_column):
     """Sum the bundles of one line, and add it to those of the columns.
 
     Args:
-        line: (w,) uint16.
+        frame: (h, w) uint16; of a block every row, from its first on.
+        row: of the line.
         row_of_block: its place within the block of rows that a bundle of each column is of.
         of_row: (bundles,) uint32, overwritten.
         by_column: (w,) uint32, sums of this block's bundle; without columns nothing is added.
     """
+    line = frame[row]
     bundles = len(of_row)
-    wide = len(line) // max(bundles, 1)
+    wide = np.uint64(len(line) // max(bundles, 1))
     for k in range(bundles):
         # Sums stay 32 bits wide, so that vectors hold eight of them and not four.
         total = np.uint32(0)
-        part = line[k * wide : k * wide + BUNDLE_PX]
+        # Unsigned places are not looked at for negative ones.
+        first = np.uint64(k) * wide
         for c in range(BUNDLE_PX):
-            total = np.uint32(total + part[c])
+            total = np.uint32(total + line[first + np.uint64(c)])
         of_row[k] = total
-    if row_of_block < BUNDLE_PX:
+    if row_of_block < BUNDLE_PX and row_of_block % _AT_ONCE == _AT_ONCE - 1 and len(by_column):
+        one, two, three = frame[row - 3], frame[row - 2], frame[row - 1]
         for c in range(len(by_column)):
-            by_column[c] += line[c]
+            before = np.uint32(np.uint32(one[c]) + np.uint32(two[c]))
+            by_column[c] += np.uint32(before + np.uint32(np.uint32(three[c]) + np.uint32(line[c])))
 
 
 @compiled_kernel()
-def add_pixels(frame, places, first_row, sign, by_row, by_column):
-    """Add some pixels to the sums of bundles, or subtract them.
+def add_changes(changes, places, width, first_row, by_row, by_column):
+    """Add what some pixels of a frame were changed by to the sums of bundles.
 
     Args:
-        frame: (h, w) uint16.
-        places: row and column in the frame, (n, 2).
+        changes: of their words, (n,) int32.
+        places: their row and column in the frame, (n, 2).
+        width: of the frame, px.
         first_row: row of the frame with which `by_row` begins.
-        sign: 1 adds, -1 subtracts.
         by_row: sums along rows, changed in place, (rows, bundles) uint32.
         by_column: sums along columns, changed in place, (bundles, columns) uint32.
     """
@@ -155,16 +162,26 @@ def add_pixels(frame, places, first_row, sign, by_row, by_column):
     blocks = len(by_column)
     if bundles == 0 or blocks == 0:
         return
-    wide, tall = frame.shape[1] // bundles, height // blocks
+    # Tables instead of two divisions for every pixel.
+    of_column = _bundles_of(width, width // bundles, bundles)
+    of_row = _bundles_of(height, height // blocks, blocks)
     for i in range(len(places)):
-        row, column = places[i, 0], places[i, 1]
-        r = row - first_row
+        r, column = places[i, 0] - first_row, places[i, 1]
         if r < 0 or r >= height:
             continue
-        # Sums of unsigned words wrap, so that taking off and adding leaves them exact.
-        value = np.uint32(sign * np.int64(frame[row, column]))
-        k, block = column // wide, r // tall
-        if k < bundles and column - k * wide < BUNDLE_PX:
-            by_row[r, k] += value
-        if block < blocks and r - block * tall < BUNDLE_PX:
-            by_column[block, column] += value
+        # Sums of unsigned words wrap, so that negative changes leave them exact.
+        change = np.uint32(changes[i])
+        k, block = of_column[column], of_row[r]
+        if k >= 0:
+            by_row[r, k] += change
+        if block >= 0:
+            by_column[block, column] += change
+
+
+@compiled_kernel()
+def _bundles_of(length, pace, bundles):
+    """The bundle that each pixel of a line is of, -1 for none."""
+    found = np.full(length, -1, np.int16)
+    for k in range(bundles):
+        found[k * pace : k * pace + BUNDLE_PX] = k
+    return found

@@ -17,7 +17,7 @@ from processing.rig import Sensor
 Array = NDArray[Any]
 
 _EVERY_ROW: Final = 16
-_ROWS: Final = 1024
+_ROWS: Final = 512
 """Of taller frames only every second, third .. row is looked at."""
 _BUNDLE: Final = 32
 _AHEAD: Final = 2

@@ -21,6 +21,7 @@ from processing.matching.tie_points import PAN_TO_COLOUR, PAN_TO_PAN, TiePoints
 from processing.mosaic.slip_bins import (
     MEDIAN_EFFICIENCY_FACTOR,
     bin_residuals,
+    level_of,
     order_along,
     points_of_frame,
     shifted_runs,
@@ -327,7 +328,7 @@ def _bands(
     if len(rows) < 6 * settings.bin_points:
         return []
     sensor = rig.sensor(tie_points.names[number])
-    own_px = _own_px(rig, sensor.name)
+    own_px, own_sigma = _own_px(rig, sensor.name), sigma[rows]
     axes: tuple[tuple[Axis, int, int], ...] = (
         ("rows", 1, sensor.height_px),
         ("columns", 0, sensor.width_px),
@@ -337,7 +338,7 @@ def _bands(
         for axis, index, size in axes
         if (
             band := _best_band(
-                sensor.name, axis, size, raw[:, index], own, sigma[rows], settings, own_px=own_px
+                sensor.name, axis, size, raw[:, index], own, own_sigma, settings, own_px=own_px
             )
         )
     ]
@@ -370,12 +371,12 @@ def _best_band(
     per = settings.bin_points
     bins = len(at) // per
     order = order_along(at, size)[: bins * per]
-    residuals, sigma = residuals[order], sigma[order]
-    medians, sums, weight, level = bin_residuals(residuals, sigma, per)
+    medians, sums, weight = bin_residuals(residuals, sigma, order, per)
+    level = level_of(medians)
     runs = shifted_runs(sums, weight, level, settings.limit)
     if not len(runs):
         return None
-    at = at[order]
+    at, residuals, sigma = at[order], residuals[order], sigma[order]
     best: tuple[Slip, float] | None = None
     for run in runs:
         at_bin, width, score = int(run[0]), int(run[1]), float(run[2])

@@ -45,12 +45,12 @@ def points_of_frame(
         Indices of its m points (m,), their places in the frame (m, 2), and the residuals (m, 2),
         of the other sign where the frame is the second one.
     """
-    rows = np.empty(len(sensor_a), np.int64)
+    rows = np.empty(len(sensor_a) + 1, np.int64)
     count = 0
     for i in range(len(sensor_a)):
-        if usable[i] and (sensor_a[i] == number or sensor_b[i] == number):
-            rows[count] = i
-            count += 1
+        # No branch, which a processor would guess wrong now and then; one more place than points.
+        rows[count] = i
+        count += usable[i] & ((sensor_a[i] == number) | (sensor_b[i] == number))
     raw, own = np.empty((count, 2)), np.empty((count, 2))
     for k in range(count):
         i = rows[k]
@@ -98,40 +98,55 @@ def order_along(at: Array, size: int) -> Array:
     return order
 
 
-@compiled_kernel(error_model="numpy")
-def bin_residuals(residuals: Array, sigma: Array, per: int) -> tuple[Array, Array, Array, Array]:
-    """Medians of residuals in bins, running sums over the bins, and the median of all.
+@compiled_kernel()
+def level_of(medians: Array) -> Array:
+    """The level of a frame: the median of what its bins have, a seventh of the work of all.
 
     Args:
-        residuals: in the order of the axis, (bins * per, 2).
-        sigma: standard deviation of a coordinate of each, (bins * per,).
+        medians: of the bins, (n, 2).
+
+    Returns:
+        By coordinate, (2,).
+    """
+    return np.array([np.median(medians[:, 0].copy()), np.median(medians[:, 1].copy())])
+
+
+@compiled_kernel(error_model="numpy")
+def bin_residuals(
+    residuals: Array, sigma: Array, order: Array, per: int
+) -> tuple[Array, Array, Array]:
+    """Medians of residuals in bins, and running sums over the bins.
+
+    Args:
+        residuals: of the points, (n, 2).
+        sigma: standard deviation of a coordinate of each, (n,).
+        order: numbers of the points along the axis, (bins * per,).
         per: points of a bin.
 
     Returns:
-        Medians (bins, 2), sums of medians times information (bins + 1, 2), sums of information
-        (bins + 1,), the first of which are zero, and the median of all (2,). Information is the
-        sum of 1 / sigma^2.
+        Medians (bins, 2), sums of medians times information (bins + 1, 2), and sums of information
+        (bins + 1,), the first of which are zero. Information is the sum of 1 / sigma^2.
     """
-    bins = len(sigma) // per
+    bins = len(order) // per
     medians = np.empty((bins, 2))
     sums, weight = np.zeros((bins + 1, 2)), np.zeros(bins + 1)
     values = np.empty(per)
     for b in range(bins):
         information = 0.0
         for k in range(b * per, (b + 1) * per):
-            information += 1.0 / sigma[k] ** 2
+            information += 1.0 / sigma[order[k]] ** 2
         weight[b + 1] = weight[b] + information
         for axis in range(2):
             for k in range(per):
-                value, place = residuals[b * per + k, axis], k
-                while place > 0 and values[place - 1] > value:
-                    values[place] = values[place - 1]
-                    place -= 1
-                values[place] = value
+                values[k] = residuals[order[b * per + k], axis]
+            # Sorts without branches, which a processor would guess wrong half of the time.
+            for turn in range(per):
+                for k in range(turn % 2, per - 1, 2):
+                    one, other = values[k], values[k + 1]
+                    values[k], values[k + 1] = min(one, other), max(one, other)
             medians[b, axis] = (values[(per - 1) // 2] + values[per // 2]) / 2.0
             sums[b + 1, axis] = sums[b, axis] + medians[b, axis] * information
-    level = np.array([np.median(residuals[:, 0].copy()), np.median(residuals[:, 1].copy())])
-    return medians, sums, weight, level
+    return medians, sums, weight
 
 
 @compiled_kernel(error_model="numpy")
@@ -153,18 +168,19 @@ def shifted_runs(sums: Array, weight: Array, level: Array, limit: float) -> Arra
     found = np.empty((bins, 3))
     count, width = 0, 2 if bins > 2 else bins + 1
     while width <= max((bins + 1) // 2, 2) and width <= bins:
-        best, at_bin = -1.0, 0
+        largest, at_bin = -1.0, 0
         for first in range(bins + 1 - width):
             held = weight[first + width] - weight[first]
+            of_run, of_rest = 1.0 / held, 1.0 / (weight[bins] - held)
             reach = 0.0
             for axis in range(2):
                 inside = sums[first + width, axis] - sums[first, axis]
-                mean = inside / held
-                rest = (sums[bins, axis] - inside) / (weight[bins] - held)
+                mean = inside * of_run
+                rest = (sums[bins, axis] - inside) * of_rest
                 reach = max(reach, abs(mean - level[axis]), abs(mean - rest))
-            score = reach * math.sqrt(held) / MEDIAN_EFFICIENCY_FACTOR
-            if score > best:
-                best, at_bin = score, first
+            if reach * reach * held > largest:
+                largest, at_bin = reach * reach * held, first
+        best = math.sqrt(max(largest, 0.0)) / MEDIAN_EFFICIENCY_FACTOR
         if best > limit:
             found[count, 0], found[count, 1], found[count, 2] = at_bin, width, best
             count += 1

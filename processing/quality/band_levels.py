@@ -13,7 +13,7 @@ from processing.quality.common_windows import CommonWindows
 from processing.quality.figures.image import BandLevelFigures
 from processing.rig import Rig
 
-MIN_WINDOWS: Final = 200
+MIN_WINDOWS: Final = 100
 
 
 def level_figures(rig: Rig, ground: CommonWindows | None) -> BandLevelFigures | None:

@@ -7,7 +7,7 @@ size of colour pixels. What follows for a head is in `processing.quality.local_s
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -24,7 +24,7 @@ from processing.geometry.topology import exact_colour_ratio
 from processing.image.compiled_kernel import compiled_kernel
 from processing.matching.prefetch import fetch_ahead
 from processing.radiometry.level1 import exposed_rows, level1_counts_per_dn
-from processing.rig import Rig, Sensor
+from processing.rig import Rig, Sensor, VirtualImage
 
 Array = NDArray[Any]
 
@@ -55,7 +55,8 @@ class CommonWindows:
     counts, `noise` (f, n) the variance of a pixel that light and read-out explain. The rest is
     along columns and along rows, (f, n, 2): `near` and `far` the mean squared differences of pixels
     one and two apart, `curved` the mean square of the second difference, all three in pixels of
-    colour and less noise; `fine` that of neighbouring pixels of the frame itself.
+    colour and less noise; `fine` that of neighbouring pixels of the frame itself. One of
+    `every` windows of the grid is measured; `finer` measures all.
     """
 
     names: tuple[str, ...]
@@ -68,12 +69,14 @@ class CommonWindows:
     far: Array
     curved: Array
     fine: Array
+    every: int
+    finer: Callable[[], CommonWindows]
 
 
 def measure_common_windows(
     rig: Rig, placements: Mapping[str, SensorPlacement], frames: Mapping[str, Array]
 ) -> CommonWindows | None:
-    """Measure all frames in windows on an even grid of the virtual image.
+    """Measure all frames in every second window of an even grid of the virtual image.
 
     Args:
         rig: the camera.
@@ -85,12 +88,19 @@ def measure_common_windows(
         None for a rig without a virtual image.
     """
     image = rig.virtual_image
-    if image is None:
-        return None
-    columns, rows = WINDOWS
-    x = (np.arange(columns) + 0.5) * image.width_px / columns
-    y = (np.arange(rows) + 0.5) * image.height_px / rows
-    vip_mm = vip_mm_from_px(image, np.stack([g.ravel() for g in np.meshgrid(x, y)], axis=1))
+    return None if image is None else _measured(rig, image, placements, frames, every=2)
+
+
+def _measured(
+    rig: Rig,
+    image: VirtualImage,
+    placements: Mapping[str, SensorPlacement],
+    frames: Mapping[str, Array],
+    *,
+    every: int,
+) -> CommonWindows:
+    """All frames in every first or second window of the grid, as on a chessboard."""
+    vip_mm = vip_mm_from_px(image, _centres(image, every))
     ratio = max(round(exact_colour_ratio(rig) or 1.0), 1)
     pan = {s.name for cone in rig.pan_cones for s in cone.sensors}
     sensors = [s for s in rig.sensors if s.name in frames and s.colour_filter_array == "none"]
@@ -119,7 +129,17 @@ def measure_common_windows(
         far=measured[..., 2:4] - 2.0 * reduced[..., None],
         curved=measured[..., 4:6] - 6.0 * reduced[..., None],
         fine=measured[..., 6:8] - 2.0 * noise[..., None],
+        every=every,
+        finer=lambda: _measured(rig, image, placements, frames, every=1),
     )
+
+
+def _centres(image: VirtualImage, every: int) -> Array:
+    """Centres (n, 2) of the windows, pixels of the virtual image."""
+    columns, rows = np.meshgrid(*(np.arange(count) for count in WINDOWS))
+    used = (columns + rows) % every == 0
+    share = (np.stack([columns[used], rows[used]], axis=1) + 0.5) / WINDOWS
+    return np.asarray(share * (image.width_px, image.height_px))
 
 
 def _inside(placement: SensorPlacement, vip_mm: Array, half_px: int) -> tuple[Array, Array]:

@@ -204,8 +204,8 @@ def _candidates(sensor: Sensor, lines: LineMeans, limits: tuple[float, float]) -
         if len(by_line) < RUN:
             continue
         pace = length // len(by_line)
-        for sign in (1.0, -1.0):
-            places = np.flatnonzero(_has_run(by_line, sign, limit, RUN))
+        for sign, has_run in zip((1.0, -1.0), _have_runs(by_line, limit, RUN), strict=True):
+            places = np.flatnonzero(has_run)
             starts, stops, steps, blurs = _runs(by_line, places, sign, limit, RUN)
             for k in np.flatnonzero(blurs <= MAX_BLUR * np.abs(steps)):
                 first = int(starts[k]) * pace
@@ -233,17 +233,25 @@ def _texture(means: Array) -> float:
 
 
 @compiled_kernel()
-def _has_run(means: Array, sign: float, limit: float, length: int) -> Array:
-    """Between which lines so many neighbouring bundles change by more than a limit."""
+def _have_runs(means: Array, limit: float, length: int) -> Array:
+    """Between which lines so many neighbouring bundles rise by more than a limit, and fall."""
     bundles, lines = means.shape
-    run = np.zeros(lines - 1, np.int32)
-    longest = np.zeros(lines - 1, np.int32)
+    # Bytes, of which vectors hold many: there are fewer bundles than a byte counts.
+    run = np.zeros((2, lines - 1), np.uint8)
+    found = np.zeros((2, lines - 1), np.uint8)
+    least, enough = np.float32(limit), np.uint8(length)
     for k in range(bundles):
-        row = means[k]
-        for i in range(lines - 1):
-            run[i] = (run[i] + 1) * (sign * (row[i + 1] - row[i]) > limit)
-            longest[i] = max(longest[i], run[i])
-    return np.asarray(longest >= length)
+        here, following = means[k, :-1], means[k, 1:]
+        rises, falls = run[0], run[1]
+        for i in range(len(here)):
+            change = following[i] - here[i]
+            rises[i] = (rises[i] + np.uint8(1)) * np.uint8(change > least)
+            falls[i] = (falls[i] + np.uint8(1)) * np.uint8(change < -least)
+        some_rise, some_fall = found[0], found[1]
+        for i in range(len(here)):
+            some_rise[i] |= rises[i] >= enough
+            some_fall[i] |= falls[i] >= enough
+    return np.asarray(found != 0)
 
 
 @compiled_kernel()

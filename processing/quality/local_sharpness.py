@@ -25,6 +25,10 @@ Array = NDArray[Any]
 CELLS: Final = 4
 """A frame is divided into so many cells each way; a region is two by two of them."""
 MIN_WINDOWS: Final = 24
+"""Of the whole grid in a region."""
+SUSPICIOUS: Final = (0.06, 0.3)
+"""Deficits of colour and of PAN from which on twice as many windows are measured, half of what
+changes the verdict."""
 MIN_FRAMES: Final = 3
 SINGLE_AXIS_DEFICIT: Final = 0.1
 """A band that only PAN can be compared with may hold so much less: near infrared, of vegetation."""
@@ -56,7 +60,7 @@ def _local_blurs(ground: CommonWindows) -> tuple[LocalBlur, ...]:
     found = []
     for k, name in enumerate(ground.names):
         deficits = pan if ground.pan[k] else colour
-        worst = _worst_region(ground.place[k], deficits[k])
+        worst = _worst_region(ground.place[k], deficits[k], MIN_WINDOWS // ground.every)
         if worst is not None:
             found.append(LocalBlur(name, bool(ground.pan[k]), *worst))
     return tuple(found)
@@ -75,7 +79,17 @@ def local_blur_figures(rig: Rig, ground: CommonWindows | None) -> LocalBlurFigur
     Returns:
         Sensor, deficit and region in pixels of both; None for a kind that cannot be compared.
     """
-    blurs = () if ground is None else _local_blurs(ground)
+    figures = _figures(rig, () if ground is None else _local_blurs(ground))
+    deficits = figures.colour_blur_deficit, figures.pan_blur_deficit
+    if ground is not None and any(
+        deficit is not None and deficit > limit
+        for deficit, limit in zip(deficits, SUSPICIOUS, strict=True)
+    ):
+        figures = _figures(rig, _local_blurs(ground.finer()))
+    return figures
+
+
+def _figures(rig: Rig, blurs: Sequence[LocalBlur]) -> LocalBlurFigures:
     colour, _ = _least_sharp([b for b in blurs if not b.pan])
     pan, next_pan = _least_sharp([b for b in blurs if b.pan])
     usual = 0.0 if next_pan is None else max(0.0, next_pan.deficit)
@@ -132,10 +146,10 @@ def _pan_deficits(ground: CommonWindows) -> Array:
 
 
 def _worst_region(
-    place: Array, deficits: Array
+    place: Array, deficits: Array, enough: int
 ) -> tuple[float, tuple[float, float, float, float], Literal["columns", "rows"]] | None:
     """The largest median deficit of any region of a frame, in either direction."""
-    medians = _region_medians(place, deficits)
+    medians = _region_medians(place, deficits, enough)
     if not np.isfinite(medians).any():
         return None
     left, top, axis = (int(k) for k in np.unravel_index(np.nanargmax(medians), medians.shape))
@@ -144,8 +158,8 @@ def _worst_region(
 
 
 @compiled_kernel()
-def _region_medians(place: Array, deficits: Array) -> Array:
-    """Medians (left, top, axis) of finite deficits (n, 2); NaN of fewer than `MIN_WINDOWS`."""
+def _region_medians(place: Array, deficits: Array, enough: int) -> Array:
+    """Medians (left, top, axis) of finite deficits (n, 2); NaN of fewer than enough."""
     medians = np.full((CELLS - 1, CELLS - 1, 2), np.nan)
     values = np.empty(len(place))
     for left in range(CELLS - 1):
@@ -159,7 +173,7 @@ def _region_medians(place: Array, deficits: Array) -> Array:
                     if left <= column <= left + 1 and top <= row <= top + 1:
                         values[count] = deficits[i, axis]
                         count += 1
-                if count >= MIN_WINDOWS:
+                if count >= enough:
                     medians[left, top, axis] = np.median(values[:count])
     return medians
 

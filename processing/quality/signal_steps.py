@@ -197,13 +197,14 @@ def _usual_change(means: Array) -> tuple[float, float]:
 def _signs(means: Array) -> tuple[Array, Array]:
     """How many bundles rise and how many fall between each line and the next."""
     bundles, lines = means.shape
-    rising = np.zeros(lines - 1, np.int32)
-    falling = np.zeros(lines - 1, np.int32)
+    # Bytes, of which vectors hold many: there are fewer bundles than a byte counts.
+    rising = np.zeros(lines - 1, np.uint8)
+    falling = np.zeros(lines - 1, np.uint8)
     for k in range(bundles):
-        row = means[k]
-        for i in range(lines - 1):
-            rising[i] += row[i + 1] > row[i]
-            falling[i] += row[i + 1] < row[i]
+        here, following = means[k, :-1], means[k, 1:]
+        for i in range(len(here)):
+            rising[i] += following[i] > here[i]
+            falling[i] += following[i] < here[i]
     return rising, falling
 
 

@@ -60,7 +60,7 @@ def _is_marked(mask, row, column):
 
 
 @compiled_kernel(parallel=True)
-def interpolate_defects(level1, mask, places, period):
+def interpolate_defects(level1, mask, places, period, changes):
     """Fill each defect from the nearest good pixels on both sides, along the least gradient.
 
     Directions of nearly the least gradient share, for their noise is not the same. Where two good
@@ -75,6 +75,7 @@ def interpolate_defects(level1, mask, places, period):
         mask: defects, bits as of `spread_defects`.
         places: (row, column) of the defects, shape (n, 2), int32.
         period: pixels so far apart in row or column are of one colour; no others are compared.
+        changes: takes by how much each word was changed, (n,) int32.
 
     Source: docs/explanation/mathematics/radiometry.md#defects.
     """
@@ -155,4 +156,5 @@ def interpolate_defects(level1, mask, places, period):
             # Half of the word and its doubling leave the lowest bit to the saturation mark.
             half = int(0.5 * total / weights + 0.5)
             found = 2 * min(max(half, 1), 32767) + marked
+        changes[index] = np.int32(found) - np.int32(level1[row, column])
         level1[row, column] = found

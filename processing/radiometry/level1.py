@@ -26,7 +26,13 @@ from numba import prange
 from numpy.typing import NDArray
 
 from processing.image.compiled_kernel import compiled_kernel
-from processing.image.line_means import LineMeans, add_line, add_pixels, line_sums, means_of_sums
+from processing.image.line_means import (
+    LineMeans,
+    add_changes,
+    add_line,
+    line_sums,
+    means_of_sums,
+)
 from processing.radiometry.calibration import (
     RadiometricCalibration,
     check_radiometry,
@@ -304,9 +310,9 @@ def level1_from_level0(
     if len(corrector.defects):
         mask, places = _spread(corrector, shifts)
         period = 1 if sensor.colour_filter_array == "none" else 2
-        add_pixels(out, places, first, -1, by_row, by_column)
-        interpolate_defects(out, mask, places, period)
-        add_pixels(out, places, first, 1, by_row, by_column)
+        changes = np.empty(len(places), np.int32)
+        interpolate_defects(out, mask, places, period, changes)
+        add_changes(changes, places, sensor.width_px, first, by_row, by_column)
         if unclean is not None:
             mark_pixels(out, places, unclean)
     pixels = max((end - first) * sensor.width_px, 1)
@@ -426,7 +432,7 @@ def _flat_pass(
             total += row_total
             saturated += row_saturated
             unread += _unread(source, least)
-            add_line(target, row - begin, by_row[row - first_row], by_column[band])
+            add_line(out, row, row - begin, by_row[row - first_row], by_column[band])
             if row_saturated > 0:
                 mark_line(target, row, unclean)
         sums[band, 0], sums[band, 1], sums[band, 2] = total, saturated, unread
@@ -512,7 +518,7 @@ def _map_pass(
             total += row_total
             saturated += row_saturated
             unread += _unread(source, least)
-            add_line(target, row - begin, by_row[row - first_row], by_column[band])
+            add_line(out, row, row - begin, by_row[row - first_row], by_column[band])
             if row_saturated > 0:
                 mark_line(target, row, unclean)
         sums[band, 0], sums[band, 1], sums[band, 2] = total, saturated, unread

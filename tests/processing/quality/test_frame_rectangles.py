@@ -18,7 +18,10 @@ from processing.quality.frame_rectangles import (
     SHARP_BUNDLES,
     WINDOW,
     Side,
+    _bundles_between,
     _runs_of_sharp,
+    _sharp_lines,
+    _sizes_at,
     changed_rectangles,
 )
 from processing.quality.ground_steps import GroundView
@@ -124,6 +127,35 @@ def test_a_side_with_a_gap_is_one_edge_and_distant_ones_are_two() -> None:
     runs = _runs_of_sharp(sizes, has_run, SHARP, WINDOW, SHARP_BUNDLES)
     assert [run[:4] for run in runs] == [(0, 1, 10, 32), (0, 1, 50, 56)]
     assert runs[0][4] == pytest.approx(40.0 / np.sqrt(22.0))
+
+
+def test_sharp_lines_are_those_with_enough_sharp_changes_among_neighbouring_bundles() -> None:
+    draw = np.random.default_rng(9)
+    means = draw.normal(3000.0, 10.0, (12, 75)).astype(np.float32)
+    means[3:8, 41:] += 60.0
+    means[6:9, 20:] -= 60.0
+    over, marked = _sharp_lines(means, SHARP, WINDOW, SHARP_BUNDLES)
+    change = np.diff(means.astype(np.float64), axis=1)
+    size = np.zeros(means.shape)
+    size[:, 1:-2] = 1.5 * change[:, 1:-1] - 0.5 * (means[:, 3:] - means[:, :-3])
+    blocks = [np.abs(size[:, at : at + 32]).mean(axis=1) for at in (0, 32, 64)]
+    around = np.stack([blocks[0], *blocks, blocks[-1]], axis=1)
+    sigma = 1.2533 * (around[:, :-2] + around[:, 1:-1] + around[:, 2:]) / 3.0 + 0.25
+    assert over == pytest.approx(1.0 / sigma, rel=1e-4)
+    size /= np.repeat(sigma, 32, axis=1)[:, :75]
+    for sign, found in zip((1.0, -1.0), marked, strict=True):
+        sharp = sign * size > SHARP
+        hits = np.stack([sharp[k : k + WINDOW].sum(axis=0) for k in range(12 - WINDOW + 1)])
+        assert np.array_equal(found, (hits >= SHARP_BUNDLES).any(axis=0))
+    assert marked[0, 40] and not marked[1, 40]
+    places = np.array([0, 20, 40, 73])
+    assert _sizes_at(means, over, places) == pytest.approx(size[:, places], abs=1e-3)
+
+
+@pytest.mark.parametrize("length", [64, 850, 1250, 1286, 3328])
+def test_every_bundle_lies_between_the_ends_of_its_line(length: int) -> None:
+    bundles = min(39, length // 32)
+    assert _bundles_between(0, length - 1, length // bundles, bundles) == (0, bundles)
 
 
 def _seen(

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from processing.image.line_means import line_means
-from processing.quality.frame_blocks import _has_run, _texture
+from processing.quality.frame_blocks import _have_runs, _texture
 from processing.quality.signal_steps import (
     SignalStep,
     _largest,
@@ -238,6 +238,8 @@ def test_runs_of_steps_and_texture_are_those_of_numpy() -> None:
     made[10:14, 121:] += 400.0
     change = np.diff(made, axis=1)
     assert _texture(made) == pytest.approx(float(np.sqrt(np.mean(change * change))), rel=1e-5)
-    assert np.flatnonzero(_has_run(made, 1.0, 150.0, 5)).tolist() == [50]
-    assert np.flatnonzero(_has_run(made, 1.0, 150.0, 4)).tolist() == [50, 120]
-    assert not _has_run(made, -1.0, 150.0, 4).any()
+    for sign in (1.0, -1.0):
+        rises, falls = _have_runs(sign * made, 150.0, 5)[:: int(sign)]
+        assert np.flatnonzero(rises).tolist() == [50] and not falls.any()
+        rises, falls = _have_runs(sign * made, 150.0, 4)[:: int(sign)]
+        assert np.flatnonzero(rises).tolist() == [50, 120] and not falls.any()
