@@ -233,9 +233,11 @@ def _read_out(rig: str, number: int, scene: str, *, seed: int) -> EmulatedExposu
 def recalibrated(world: World, seed: int) -> Rig:
     """The rig as a laboratory would state it whose errors follow from the seed; truth stays.
 
-    Places of the sensors and angles of all cones but the master's are drawn by their sigmas.
+    Places of the sensors and angles of all cones but the master's are drawn by their sigmas, of a
+    master cone's only sensor its scale and rotation, too.
     """
     random = np.random.default_rng([seed, 13])
+    random_of_single = np.random.default_rng([seed, 14])
 
     def rotated_rad(cone: Cone) -> tuple[float, float, float]:
         if cone.name == world.rig.master_cone:
@@ -247,8 +249,18 @@ def recalibrated(world: World, seed: int) -> Rig:
     def stated(sensor: Sensor) -> Sensor:
         right, up = world.camera.place_error_mm[sensor.name]
         x, y = random.normal(0.0, sensor.position_sigma_um * 1e-3, 2)
-        return replace(
+        placed = replace(
             sensor, x_mm=sensor.x_mm + right - float(x), y_mm=sensor.y_mm + up - float(y)
+        )
+        if [s.name for s in world.rig.master_sensors] != [sensor.name]:
+            return placed
+        # The datum of such a rig is the scale and rotation of this sensor, too.
+        at_half_height = 2e-3 * sensor.position_sigma_um / (sensor.height_px * sensor.pitch_mm)
+        scale, rotation = random_of_single.normal(0.0, at_half_height, 2)
+        return replace(
+            placed,
+            scale=sensor.scale * (1.0 + float(scale)),
+            rotation_rad=sensor.rotation_rad + float(rotation),
         )
 
     cones = tuple(

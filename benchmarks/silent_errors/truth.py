@@ -49,10 +49,11 @@ class Found:
     the RMS error of the worst PAN sensor `worst_of` over its own stated sigma, `worst_limit` what
     that ratio reaches in one of 1,000 images where the stated covariance holds. `normalised` are
     the errors of check points against the stated covariance, `freedom` the degrees of freedom of
-    their mean square. `band_px` is the largest RMS error of a colour band, colour pixels. `radiance` is the largest relative error of a region,
-    `radiance_of` its sensor. Against the image of the same exposure without a fault, `detail` is
-    the least share of the fine detail of a sensor, `blank` the largest share of its part of the
-    image that has no data, `blank_of` the sensor.
+    their mean square. `band_px` is the largest RMS error of a colour band, colour pixels.
+    `radiance` is the largest relative error of a region, `radiance_of` its sensor. Against the
+    image of the same exposure without a fault, `detail` is the least share of the fine detail of a
+    sensor, `blank` the largest share of its part of the image that has no data, `blank_of` the
+    sensor.
     """
 
     error_px: float | None

@@ -238,8 +238,11 @@ def datum_covariance(rig: Rig, mosaic: Mosaic, measured_c: Mapping[str, float]) 
             for s in sensors
         ]
     )
-    own_um2 = np.repeat(own_um2, len(place_mm) // len(sensors))
-    covariance = fit @ (np.repeat(own_um2, 2)[:, None] * fit.T)
+    own = np.diag(own_um2)
+    if len(sensors) == 1:
+        # What turns and stretches the sensor moves its second place in addition to the first.
+        own = own_um2[0] * np.array([[1.0, 1.0], [1.0, 2.0]])
+    covariance = fit @ np.kron(own, np.eye(2)) @ fit.T
     for probe, moved in _moved_um_per_kelvin(rig, sensors, place_mm).items():
         unknown_k = UNKNOWN_SIGMA_K if measured_c else BLIND_SIGMA_K
         sigma_k = PROBE_SIGMA_K if probe in measured_c else unknown_k
@@ -273,8 +276,8 @@ def datum_per_kelvin_px(rig: Rig, mosaic: Mosaic) -> Array:
 def _datum_fit(rig: Rig, mosaic: Mosaic) -> tuple[list[Sensor], Array, Array]:
     """Sensors of the datum, places (m, 2) mm, and the fit (4, 2 m) of a similarity to them.
 
-    One sensor alone holds its own scale and rotation, which are known as its place is, at half of
-    its height: it has two places.
+    One sensor alone holds its own scale and rotation. It has two places, half of its height apart:
+    each moves the second against the first by the standard deviation of the first.
     """
     candidates = datum_candidates(rig)
     sensors = [s for s in candidates if s.name in mosaic.datum_sensors] or list(candidates)

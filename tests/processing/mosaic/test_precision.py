@@ -183,17 +183,19 @@ def test_one_sensor_alone_knows_scale_and_rotation_by_its_half_height() -> None:
     )
     found = datum_covariance(dataclasses.replace(rig, cones=cones), mosaic, read)
     half_mm = sensor.height_px / 2.0 * sensor.pitch_mm
-    # Scale and rotation from two places half the height apart.
+    # Scale and rotation move a place half the height away by the sigma of the first.
     warm = (0.1 * sensor.drift.scale_ppm_per_k * 1e-3) ** 2
     rotated = (0.1 * sensor.drift.rotation_urad_per_k * 1e-3) ** 2
-    own = 2.0 * (sensor.position_sigma_um / half_mm) ** 2
+    own = (sensor.position_sigma_um / half_mm) ** 2
     assert found[2, 2] * sensor.pitch_um**2 == pytest.approx(own + warm, rel=1e-6)
     assert found[3, 3] * sensor.pitch_um**2 == pytest.approx(own + rotated, rel=1e-6)
-    # Either place is as sure as the sensor's, the upper one but for 0.1 K over half its height.
-    for up, added in ((0.0, 0.0), (half_mm, (warm + rotated) / 2.0 * half_mm**2)):
-        design = datum_design(np.array([[sensor.x_mm, sensor.y_mm + up]]))
+    # Above and below the middle alike, and the middle as sure as the sensor's place.
+    moved = own + (warm + rotated) / 2.0
+    for up_mm in (0.0, half_mm, -half_mm):
+        design = datum_design(np.array([[sensor.x_mm, sensor.y_mm + up_mm]]))
         variance_um2 = np.trace(design @ found @ design.T) / 2.0 * sensor.pitch_um**2
-        assert variance_um2 == pytest.approx(sensor.position_sigma_um**2 + added, rel=1e-6)
+        expected = sensor.position_sigma_um**2 + moved * up_mm**2
+        assert variance_um2 == pytest.approx(expected, rel=1e-6)
 
 
 def test_of_converging_heads_the_mean_rotation_places_the_image() -> None:
