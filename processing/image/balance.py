@@ -339,8 +339,11 @@ def _node_means(frames, valid, lattices, cell, out):
     for i in prange(rows):
         li = min(i // nodes, lattices.shape[1] - 2)
         f = (i - li * nodes) / nodes
-        covering = np.zeros(columns, np.int64)
-        places = np.empty((count, columns, 2), np.int64)
+        corner = np.empty(2, np.int64)
+        covering = np.zeros(columns, np.int32)
+        # Column and row of a frame at the first node of a cell, and their change per node.
+        lines = np.empty((count, cells, 4))
+        reached = np.zeros((count, cells), np.bool_)
         for s in range(count):
             line = out[s, i]
             line[:] = NOT_COVERED
@@ -360,20 +363,32 @@ def _node_means(frames, valid, lattices, cell, out):
                 r0 = upper_left[1] + f * (lower_left[1] - upper_left[1])
                 dc = (upper_right[0] + f * (lower_right[0] - upper_right[0]) - c0) / nodes
                 dr = (upper_right[1] + f * (lower_right[1] - upper_right[1]) - r0) / nodes
+                reached[s, lj] = True
+                lines[s, lj, 0], lines[s, lj, 1] = c0, r0
+                lines[s, lj, 2], lines[s, lj, 3] = dc, dr
                 # The last cell has the nodes at its right end, too.
                 for k in range(nodes + (1 if lj == cells - 1 else 0)):
                     c = c0 + dc * k
                     r = r0 + dr * k
                     if valid[s, 0] <= c <= valid[s, 1] and valid[s, 2] <= r <= valid[s, 3]:
-                        j = lj * nodes + k
-                        line[j] = SINGLE_COVERAGE
-                        covering[j] += 1
-                        places[s, j, 0] = np.int64(np.floor(c + 0.5)) - _BLOCK_PX // 2
-                        places[s, j, 1] = np.int64(np.floor(r + 0.5)) - _BLOCK_PX // 2
+                        line[lj * nodes + k] = SINGLE_COVERAGE
+                        covering[lj * nodes + k] += 1
         for s in range(count):
-            for j in range(columns):
-                if covering[j] > 1 and out[s, i, j] == SINGLE_COVERAGE:
-                    out[s, i, j] = _block_mean(frames[s], valid[s], places[s, j])
+            for lj in range(cells):
+                if not reached[s, lj]:
+                    continue
+                c0, r0, dc, dr = (
+                    lines[s, lj, 0],
+                    lines[s, lj, 1],
+                    lines[s, lj, 2],
+                    lines[s, lj, 3],
+                )
+                for k in range(nodes + (1 if lj == cells - 1 else 0)):
+                    j = lj * nodes + k
+                    if covering[j] > 1 and out[s, i, j] == SINGLE_COVERAGE:
+                        corner[0] = np.int64(np.floor(c0 + dc * k + 0.5)) - _BLOCK_PX // 2
+                        corner[1] = np.int64(np.floor(r0 + dr * k + 0.5)) - _BLOCK_PX // 2
+                        out[s, i, j] = _block_mean(frames[s], valid[s], corner)
 
 
 @compiled_kernel()

@@ -23,6 +23,7 @@ from processing.image.taps import (
     LINE_LENGTH,
     MISSING,
     along,
+    along_strip,
     down,
     down_strip,
     flags_along,
@@ -277,6 +278,38 @@ def straight_taps(frame, valid, lattice, band, column, cell, reach, unclean):
 
 
 @compiled_kernel(fastmath=True)
+def _straight_lines(frame, corners, cell, table, left, top, first, last, n, lines, phases, steps):
+    """The first pass of rows first .. last - 1 of a cell of straight taps, and all their phases."""
+    width = frame.shape[1]
+    flat = frame.reshape(-1)
+    columns = _columns(n)
+    rows = last - first
+    for y in range(rows):
+        c0, r0, dc, dr = _row_of(corners, (first + y) / cell)
+        # dr / dc, good to the square of the difference of scale from one.
+        slope = dr * (2.0 - dc)
+        phases[0, y] = r0 + slope * (left - 2 - c0) - (top + first + y)
+        steps[0, y] = slope
+        phases[1, y] = c0 - left
+        steps[1, y] = dc - 1.0
+    start = (top + first) * width + left - 2
+    # With a count known to the compiler nothing is left over, and rows go in pairs. Where the frame
+    # has them, some columns more make the widest vectors whole; their values are not used.
+    if columns == 72 and left + 78 <= width:
+        down_strip(flat, start, width, phases[0], steps[0], table, lines, rows, 72, 80)
+    elif columns == 40 and left + 46 <= width:
+        down_strip(flat, start, width, phases[0], steps[0], table, lines, rows, 40, 48)
+    elif columns == 72:
+        down_strip(flat, start, width, phases[0], steps[0], table, lines, rows, 72, 72)
+    elif columns == 40:
+        down_strip(flat, start, width, phases[0], steps[0], table, lines, rows, 40, 40)
+    else:
+        for y in range(rows):
+            line = lines[y * LINE_LENGTH :]
+            down(flat, start + y * width, width, phases[0, y], steps[0, y], table, line, columns)
+
+
+@compiled_kernel(fastmath=True)
 def fetch_straight(
     frame,
     lattice,
@@ -319,34 +352,9 @@ def fetch_straight(
         x0: first column of `out`.
         n: columns of the cell that lie in the target.
     """
-    width = frame.shape[1]
-    flat = frame.reshape(-1)
     corners = _corners(lattice, band, column, cell)
-    columns = _columns(n)
+    _straight_lines(frame, corners, cell, table, left, top, first, last, n, lines, phases, steps)
     rows = last - first
-    for y in range(rows):
-        c0, r0, dc, dr = _row_of(corners, (first + y) / cell)
-        # dr / dc, good to the square of the difference of scale from one.
-        slope = dr * (2.0 - dc)
-        phases[0, y] = r0 + slope * (left - 2 - c0) - (top + first + y)
-        steps[0, y] = slope
-        phases[1, y] = c0 - left
-        steps[1, y] = dc - 1.0
-    start = (top + first) * width + left - 2
-    # With a count known to the compiler nothing is left over, and rows go in pairs. Where the frame
-    # has them, some columns more make the widest vectors whole; their values are not used.
-    if columns == 72 and left + 78 <= width:
-        down_strip(flat, start, width, phases[0], steps[0], table, lines, rows, 72, 80)
-    elif columns == 40 and left + 46 <= width:
-        down_strip(flat, start, width, phases[0], steps[0], table, lines, rows, 40, 48)
-    elif columns == 72:
-        down_strip(flat, start, width, phases[0], steps[0], table, lines, rows, 72, 72)
-    elif columns == 40:
-        down_strip(flat, start, width, phases[0], steps[0], table, lines, rows, 40, 40)
-    else:
-        for y in range(rows):
-            line = lines[y * LINE_LENGTH :]
-            down(flat, start + y * width, width, phases[0, y], steps[0, y], table, line, columns)
     y0 = band * cell + first
     if n == 64:
         values_strip(lines, phases[1], steps[1], table, gain, offset, out, y0, x0, rows, 64)
@@ -354,6 +362,38 @@ def fetch_straight(
         values_strip(lines, phases[1], steps[1], table, gain, offset, out, y0, x0, rows, 32)
     else:
         values_strip(lines, phases[1], steps[1], table, gain, offset, out, y0, x0, rows, n)
+
+
+@compiled_kernel(fastmath=True)
+def fetch_straight_values(
+    frame, lattice, band, column, cell, rows, n, table, left, top, lines, phases, steps, values
+):
+    """All pixels of a cell of straight taps that several frames share: their signal, unrounded.
+
+    Args:
+        frame: as in `fetch_cell`, like all up to `table`.
+        lattice: raw (column, row) at the nodes.
+        band: row of the cell in the lattice.
+        column: column of the cell in the lattice.
+        cell: side of the cell, px.
+        rows: rows of the cell that lie in the target.
+        n: columns of the cell that lie in the target.
+        table: of a `processing.image.kernels.Kernel`.
+        left: raw column from `straight_taps`.
+        top: raw row from `straight_taps`.
+        lines: scratch as in `fetch_straight`, like `phases` and `steps`.
+        phases: scratch, (2, rows of a strip) float32.
+        steps: scratch, (2, rows of a strip) float32.
+        values: (cell, cell) float32, receives the signal.
+    """
+    corners = _corners(lattice, band, column, cell)
+    for at in range(0, rows, phases.shape[1]):
+        end = min(at + phases.shape[1], rows)
+        _straight_lines(frame, corners, cell, table, left, top, at, end, n, lines, phases, steps)
+        if n == 64:
+            along_strip(lines, phases[1], steps[1], table, values, at, end - at, 64)
+        else:
+            along_strip(lines, phases[1], steps[1], table, values, at, end - at, n)
 
 
 @compiled_kernel()

@@ -6,6 +6,7 @@ give the positions of sensors.
 
 from __future__ import annotations
 
+import math
 import mmap
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -122,9 +123,10 @@ class PanComposer:
         self._lattices = np.full((count, rows, columns, 2), OUTSIDE)
         self._spare = np.full((rows, columns, 2), OUTSIDE)
         self._valid = np.tile(np.array(_OUTSIDE_LATTICE), (count, 1))
-        self._means = np.zeros((count, *nodes), np.float32)
         self._weights = np.zeros((count, *nodes), np.uint8)
         self._pan = _paged((image.height_px, image.width_px))
+        # Not needed any more once the image is written.
+        self._means = _in_memory_of(self._pan, (count, *nodes))
         self._source = np.zeros((image.height_px, image.width_px), np.uint8)
 
     def frame(self, name: str) -> Array:
@@ -414,6 +416,15 @@ def _paged(shape: tuple[int, int]) -> Array:
     memory = np.zeros(value_count + mmap.PAGESIZE // 2, np.uint16)
     first = -memory.ctypes.data % mmap.PAGESIZE // 2
     return memory[first : first + value_count].reshape(shape)
+
+
+def _in_memory_of(raster: Array, shape: tuple[int, ...]) -> Array:
+    """Values of float32 in a raster's memory, or in their own where that is too small."""
+    word_count = 2 * math.prod(shape)
+    if word_count > raster.size:
+        return np.zeros(shape, np.float32)
+    view: Array = raster.reshape(-1)[:word_count].view(np.float32).reshape(shape)
+    return view
 
 
 def _usable(placement: SensorPlacement) -> tuple[float, ...]:

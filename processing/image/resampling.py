@@ -18,7 +18,13 @@ from numba import prange
 from numpy.typing import NDArray
 
 from processing.geometry.placement import SensorPlacement
-from processing.image.cells import MAX_CELL_PX, fetch_cell, fetch_straight, straight_taps
+from processing.image.cells import (
+    MAX_CELL_PX,
+    fetch_cell,
+    fetch_straight,
+    fetch_straight_values,
+    straight_taps,
+)
 from processing.image.compiled_kernel import compiled_kernel
 from processing.image.kernels import KERNELS, Interpolation
 from processing.image.lattice import OUTSIDE
@@ -238,8 +244,11 @@ def _mixed_cell(
     cell,
     table,
     reach,
+    unclean,
     chosen,
-    line,
+    lines,
+    phases,
+    steps,
     spare,
     values,
     flags,
@@ -256,28 +265,54 @@ def _mixed_cell(
     rows = min(cell, out.shape[0] - y0)
     n = min(cell, out.shape[1] - x0)
     found = len(chosen)
+    line = lines[:LINE_LENGTH]
     if found != 1:
         total[:] = 0.0
         weight[:] = 0.0
         best[:] = 0.0
         mark[:] = 0
     for s in chosen:
-        fetch_cell(
-            frames[s],
-            valid[s],
-            lattices[s],
-            band,
-            column,
-            cell,
-            rows,
-            n,
-            table,
-            reach,
-            line,
-            spare,
-            values,
-            flags,
-        )
+        left = np.int64(-1)
+        top = left
+        if found != 1:
+            left, top = straight_taps(
+                frames[s], valid[s], lattices[s], band, column, cell, reach, unclean[s]
+            )
+        if left >= 0:
+            flags[:rows] = 0
+            fetch_straight_values(
+                frames[s],
+                lattices[s],
+                band,
+                column,
+                cell,
+                rows,
+                n,
+                table,
+                left,
+                top,
+                lines,
+                phases,
+                steps,
+                values,
+            )
+        else:
+            fetch_cell(
+                frames[s],
+                valid[s],
+                lattices[s],
+                band,
+                column,
+                cell,
+                rows,
+                n,
+                table,
+                reach,
+                line,
+                spare,
+                values,
+                flags,
+            )
         if found == 1:
             _finish_single(
                 values, flags, gains[s], offsets[s], np.uint8(s + 1), out, source, y0, x0, rows, n
@@ -351,8 +386,11 @@ def _resample(
                 cell,
                 table,
                 reach,
+                unclean,
                 chosen[:found],
-                lines[:LINE_LENGTH],
+                lines,
+                phases,
+                steps,
                 spare,
                 values,
                 flags,

@@ -223,6 +223,40 @@ def along(line, first, step, table, out, n):
 
 
 @compiled_kernel(fastmath=True)
+def along_strip(lines, phases, steps, table, values, y0, rows, n):
+    """As `along` row by row, with one row of the table.
+
+    Args:
+        lines: scratch rows of `LINE_LENGTH` float32.
+        phases: at the first value of each row, (rows,) float32, px.
+        steps: change of phase per value, (rows,) float32, px.
+        table: of a `processing.image.kernels.Kernel`.
+        values: rows from `y0` on receive n values each, float32.
+        y0: first row of `values`.
+        rows: target rows.
+        n: values of each row.
+    """
+    middle, span = middle_and_span(phases, steps, rows, n)
+    if span > _SPAN:
+        for y in range(rows):
+            along(lines[y * LINE_LENGTH :], phases[y], steps[y], table, values[y0 + y], n)
+        return
+    row, beyond = weights_at(table, middle)
+    at = middle - beyond
+    w, s = _spread(table[row])
+    for y in range(rows):
+        a = lines[y * LINE_LENGTH : (y + 1) * LINE_LENGTH]
+        target = values[y0 + y, :n]
+        phase = phases[y] - at
+        step = steps[y]
+        for k in range(n):
+            x = phase + step * np.float32(np.int32(k))
+            v = _sum6(w, a[k], a[k + 1], a[k + 2], a[k + 3], a[k + 4], a[k + 5])
+            v += x * _sum6(s, a[k], a[k + 1], a[k + 2], a[k + 3], a[k + 4], a[k + 5])
+            target[k] = v
+
+
+@compiled_kernel(fastmath=True)
 def values_strip(lines, phases, steps, table, gain, offset, out, y0, x0, rows, n):
     """As `along` row by row, times gain plus offset, rounded to words that are signal, 1 to 65535.
 

@@ -204,15 +204,17 @@ def shift_plane(at: Array, shift: Array) -> Array | None:
         return None
     design = np.column_stack([np.ones(len(at)), at])
     off = shift - np.median(shift, axis=0)
-    keep = np.ones(len(at), np.bool_)
+    keep = np.zeros(len(at), np.bool_)
     plane = np.zeros((3, 2))
     scatter = np.inf
     for _ in range(_ROUNDS):
         length = np.abs(off).max(axis=1)
         scatter = 1.4826 * float(np.median(np.abs(off)))
-        keep = length <= max(_BOUND_SIGMAS * scatter, _LEAST_BOUND_PX)
+        earlier, keep = keep, length <= max(_BOUND_SIGMAS * scatter, _LEAST_BOUND_PX)
         if np.count_nonzero(keep) < MIN_AGREEING:
             return None
+        if np.array_equal(keep, earlier):
+            break  # and so would be all that follows
         plane, *_ = np.linalg.lstsq(design[keep], shift[keep], rcond=None)
         off = shift - design @ plane
     return plane if scatter <= MAX_SCATTER_PX else None

@@ -240,6 +240,21 @@ def test_frames_blend_by_their_weights_and_a_missing_one_leaves_all_to_the_other
     assert np.all(source[:, 64:] == 0)
 
 
+@pytest.mark.parametrize(("cell", "shape"), [(64, (128, 192)), (32, (96, 128)), (CELL, (96, 112))])
+def test_what_frames_share_is_the_weighted_mean_of_what_each_gives_alone(
+    cell: int, shape: tuple[int, int]
+) -> None:
+    frames = (np.random.default_rng(4).integers(2500, 4500, (2, 260, 300)) * 2).astype(np.uint16)
+    matrices = [(6.4, 1.0002, 0.0003, 7.6, -0.0004, 0.9999), (9.3, 0.9998, 0.0001, 12.2, 0.0, 1.0)]
+    alone = [fetch(frames[[k]], [matrices[k]], shape=shape, cell=cell)[0] for k in (0, 1)]
+    nodes = tuple(-(-pixels // cell) * cell // WEIGHT_STEP_PX + 1 for pixels in shape)
+    weights = np.stack([np.full(nodes, 200, np.uint8), np.full(nodes, 50, np.uint8)])
+    shared, source = fetch(frames, matrices, shape=shape, weights=weights, cell=cell)
+    expected = (200.0 * alone[0] + 50.0 * alone[1]) / 250.0
+    assert np.abs(shared - expected).max() <= 1.0
+    assert np.all(source == 1)
+
+
 def test_the_result_does_not_depend_on_the_number_of_threads() -> None:
     import numba
 
