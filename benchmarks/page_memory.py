@@ -1,14 +1,16 @@
 """Memory of the operator's page over a replay of thousands of exposures, in headless Chromium.
 
-The events of the service go to the real process of the page, without a pipeline. Memory is that of
-the renderer: heap of JavaScript after a collection of garbage, PSS, and PSS after the browser has
-emptied its caches, as it does when memory is short. Run: `python -m
-benchmarks.page_memory --exposures 5000`.
+The events of the service go to the real process of the page, without a pipeline. With `--in-page`
+the page gets its files from that process and its records from itself, ten exposures in each: what
+it holds is the same, and 5,000 exposures take two minutes. Memory is that of the renderer: heap of
+JavaScript after a collection of garbage, PSS, and PSS after the browser has emptied its caches, as
+it does when memory is short. Run: `python -m benchmarks.page_memory --exposures 5000`.
 """
 
 from __future__ import annotations
 
 import argparse
+import base64
 import importlib
 import json
 import os
@@ -25,6 +27,8 @@ LINE_EXPOSURES: Final = 50
 SPACING_DEG: Final = 6e-4
 RATE_MAX_HZ: Final = 40.0
 SEEN_TIMEOUT_S: Final = 120.0
+PER_RECORD: Final = 10
+REPLAYED_AT_ONCE: Final = 100
 VERDICTS: Final = ("good",) * 90 + ("usable",) * 9 + ("refly",)
 
 
@@ -117,6 +121,70 @@ def sample(browser: Any, number: int) -> dict[str, Any]:
     }
 
 
+def replay_script(exposures: int) -> str:
+    """Script of a page that replays a flight to itself; `replayTo` leads it."""
+    import cv2
+
+    cockpit = importlib.import_module("tests.daemon.onboard.monitoring.cockpit")
+    pictures = {"thumbnail": cv2.resize(cockpit.picture_of(1), (200, 133))}
+    pictures["quicklook"] = cockpit.picture_of(2)
+    replay: dict[str, Any] = {
+        name: base64.b64encode(cv2.imencode(".jpg", one)[1].tobytes()).decode()
+        for name, one in pictures.items()
+    }
+    planned = [
+        {
+            "id": one["properties"]["id"],
+            "at": [[y, x] for x, y in one["geometry"]["coordinates"]],
+            "places_m": [66.7 * k for k in range(LINE_EXPOSURES)],
+        }
+        for one in lines(exposures)["features"]
+    ]
+    replay["plan"] = {"name": "", "lines": planned, "specification": {}}
+    script = Path(str(cockpit.__file__)).with_name("replayed_flight.js").read_text()
+    return f"window.replay = {json.dumps(replay)};\n{script}"
+
+
+def measure_in_page(exposures: int, samples: int) -> dict[str, Any]:
+    """Let the page replay a flight to itself, and sample."""
+    browser_of = importlib.import_module("tests.support.browser").Browser
+    service_of = importlib.import_module("tests.daemon.onboard.monitoring.page_service").Service
+    folder = Path(tempfile.mkdtemp(prefix="page-memory"))
+    found: list[dict[str, Any]] = []
+    service = service_of(folder)
+    try:
+        with browser_of(folder / "profile", width=1280, height=800) as browser:
+            for domain in ("Performance", "HeapProfiler"):
+                browser.call(f"{domain}.enable")
+            browser.call("Network.disable")
+            script = replay_script(exposures)
+            browser.call("Page.addScriptToEvaluateOnNewDocument", source=script)
+            browser.open(service.address)
+            browser.wait_for("document.body?.dataset.ready !== undefined", SEEN_TIMEOUT_S)
+            reached = 0
+            step = max(1, exposures // samples)
+            while reached < exposures:
+                wanted = min(reached + REPLAYED_AT_ONCE, reached - reached % step + step)
+                reached = browser.evaluate(f"replayTo({wanted}, {PER_RECORD})")
+                if reached % step == 0:
+                    time.sleep(2.0)
+                    found.append(sample(browser, reached))
+                    print(json.dumps(found[-1]), file=sys.stderr, flush=True)
+            held = browser.evaluate(
+                "import('/map.js').then((map) => [map.footprintCount(), map.planShown().areas])"
+            )
+    finally:
+        service.end()
+        shutil.rmtree(folder, ignore_errors=True)
+    return {"samples": found, "growth_second_half_percent": growth_of(found), "held": held}
+
+
+def growth_of(found: Sequence[dict[str, Any]]) -> dict[str, float]:
+    """Growth of each figure over the second half of a flight, percent."""
+    names = ("heap_mb", "nodes", "renderer_mb", "renderer_purged_mb")
+    return {name: growth_percent([one[name] for one in found]) for name in names}
+
+
 def measure(exposures: int, samples: int) -> dict[str, Any]:
     """Replay and sample; afterwards the page is loaded again from the state of the service."""
     from daemon.configuration.model import WatchSection
@@ -192,11 +260,7 @@ def measure(exposures: int, samples: int) -> dict[str, Any]:
     finally:
         child.end(1.0)
         shutil.rmtree(folder, ignore_errors=True)
-    growth = {
-        key: growth_percent([one[key] for one in found])
-        for key in ("heap_mb", "renderer_mb", "renderer_purged_mb")
-    }
-    return {"samples": found, "growth_second_half_percent": growth, "loaded_again": again}
+    return {"samples": found, "growth_second_half_percent": growth_of(found), "loaded_again": again}
 
 
 def growth_percent(values: Sequence[float]) -> float:
@@ -222,8 +286,10 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--exposures", type=int, default=5000, help="default: 5000")
     parser.add_argument("--samples", type=int, default=20, help="default: 20")
+    parser.add_argument("--in-page", action="store_true", help="the page replays it to itself")
     given = parser.parse_args()
-    print(json.dumps(measure(given.exposures, given.samples), indent=1))
+    measured = measure_in_page if given.in_page else measure
+    print(json.dumps(measured(given.exposures, given.samples), indent=1))
     return 0
 
 

@@ -327,6 +327,29 @@ def test_an_alarm_marks_the_title_of_the_tab_until_it_is_seen(cockpit: Cockpit) 
     cockpit.until("!/[✖▲]/.test(document.title)")
 
 
+def test_footprints_of_a_long_flight_are_good_to_centimetres(cockpit: Cockpit) -> None:
+    worst_deg, size, number = cockpit.browser.evaluate(
+        """import('/older_exposures.js').then(({ OlderExposures }) => {
+          const older = new OlderExposures();
+          const at = (k, corner) => 3e-4 * k + 1e-3 * corner;
+          const footprint = (k) => [0, 1, 2, 3].map((corner) =>
+            [47.123456 + at(k, corner >> 1), 190.654321 + at(k, corner % 2)]);
+          for (let k = 0; k < 5000; k += 1) older.add(k + 1, 'good', footprint(k));
+          let worst = 0;
+          for (let k = 0; k < 5000; k += 1) {
+            for (const [corner, [y, x]] of footprint(k).entries()) {
+              const [latitude, longitude] = older.cornerAt(k, corner);
+              worst = Math.max(worst, Math.abs(latitude - y), Math.abs(longitude - x));
+            }
+          }
+          const inside = footprint(4321)[0].map((one) => one + 1e-4);
+          return [worst, older.size, older.numberAt(...inside)];
+        })"""
+    )
+    assert worst_deg * 111_000 < 0.03
+    assert (size, number) == (5000, 4322)
+
+
 def test_longitudes_stay_next_to_the_first_one(cockpit: Cockpit) -> None:
     found = cockpit.browser.evaluate(
         "import('/longitudes.js?alone').then(({ near, nearPlaces }) => ["

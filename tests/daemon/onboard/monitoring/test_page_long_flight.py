@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import base64
 import json
 from collections.abc import Iterator
+from pathlib import Path
 
+import cv2
 import pytest
 
 from daemon.onboard.monitoring import flight_state
 from daemon.onboard.monitoring.flight_state import FlightState
 from daemon.onboard.monitoring.telemetry import PAST_BYTES
 from tests.daemon.onboard.monitoring import flight_events
+from tests.daemon.onboard.monitoring.cockpit import picture_of
 from tests.daemon.onboard.monitoring.page_service import WITHIN_S, Service
 from tests.support.browser import Browser, chromium
 
@@ -235,3 +239,45 @@ def test_exposures_beyond_the_snapshot_keep_footprint_and_verdict(
     assert found is not None and (found["step"], found["verdict"]) == ("processed", "refly")
     assert state.exposure(1) is None
     assert state.brief()["verdicts"] == {"good": 7, "usable": 0, "refly": 1}
+
+
+def test_what_the_page_holds_does_not_grow_with_the_flight(tmp_path: Path) -> None:
+    """From 400 to 1,200 exposures, replayed by the page to itself; eight of them are gaps."""
+    chromium()
+    picture = base64.b64encode(cv2.imencode(".jpg", picture_of(1))[1].tobytes()).decode()
+    plan = {"lines": [{"id": "A0", "at": [[47.07, 15.43], [47.1, 15.43]], "places_m": [0.0]}]}
+    replay = {"plan": plan, "thumbnail": picture, "quicklook": picture}
+    script = Path(__file__).with_name("replayed_flight.js").read_text()
+    service = Service(tmp_path)
+    held = (
+        "import('/map.js').then((map) => [map.footprintCount(), map.planShown().areas,"
+        " document.querySelectorAll('#map *').length, document.querySelectorAll('#rows tr').length,"
+        " document.querySelectorAll('#segments tr').length])"
+    )
+    try:
+        with Browser(tmp_path / "profile") as browser:
+            browser.call(
+                "Page.addScriptToEvaluateOnNewDocument",
+                source=f"window.replay = {json.dumps(replay)};\n{script}",
+            )
+            browser.open(service.address)
+            browser.wait_for("document.body?.dataset.ready !== undefined", WITHIN_S)
+            found = []
+            for number, gaps in ((400, 4), (1200, 12)):
+                assert browser.evaluate(f"replayTo({number}, 80)") == number
+                shown = f"{held}.then(([, areas]) => areas === {gaps})"
+                browser.wait_for(shown, WITHIN_S)
+                browser.wait_for(
+                    "document.querySelectorAll('#map .placed').length === 60", WITHIN_S
+                )
+                found.append(browser.evaluate(held))
+    finally:
+        service.end()
+    assert [one[:2] for one in found] == [[400, 4], [1200, 12]]
+    (elements, rows, segments), (elements_of_many, rows_of_many, segments_of_many) = (
+        one[2:] for one in found
+    )
+    # Parts of tiles, tooltips and the like come and go.
+    assert elements_of_many <= elements + 5
+    assert (rows, rows_of_many) == (30, 30), "the table is not in view"
+    assert (segments, segments_of_many) == (4, 12)
