@@ -19,6 +19,8 @@ Array = NDArray[Any]
 _EVERY_ROW: Final = 16
 _ROWS: Final = 512
 """Of taller frames only every second, third .. row is looked at."""
+_PLACES: Final = 8
+"""Pixels of a row, evenly over it, that show whether it holds data."""
 _BUNDLE: Final = 32
 _AHEAD: Final = 2
 """Rows looked at between the one whose pixels are fetched and the one that is measured."""
@@ -59,6 +61,10 @@ def sharpness(
     pace = max(1, height // _ROWS)
     sums = np.zeros((-(-height // pace), 2, 4))
     _difference_sums(frame[first : last + 1], left, right + 1, pace, sums)
+    # Where data end, as next to lines that were not read out, there is an edge and no detail.
+    lines = np.minimum(first + pace * np.arange(len(sums))[:, None] + np.arange(3), last)
+    places = np.linspace(left, right, _PLACES).astype(np.int64)
+    sums[(frame[lines[:, :, None], places] == 0).any(axis=(1, 2))] = 0.0
     along, across = sums.sum(axis=0)
     counts = level1_counts_per_dn(sensor.bits)
     return _share(sensor, along, counts), _share(sensor, across, counts)
