@@ -62,6 +62,7 @@ def rinex(
             "unknown_signals": done.counts.unknown_signals,
             "unreadable_messages": done.counts.unreadable,
             "signals_of_other_antennas": done.counts.other_antennas,
+            "unread_navigation_messages": list(done.unread_messages),
             "other_receivers": list(done.other_receivers),
             "failures": [failure.as_json() for failure in done.failures],
         }
@@ -78,6 +79,12 @@ def rinex(
         console.print(
             f"No navigation file: the receiver recorded no complete {done.navigation_message}; use "
             "a broadcast ephemeris of the day",
+            style="yellow",
+            soft_wrap=True,
+        )
+    if done.unread_messages:
+        console.print(
+            f"Navigation messages that are not written: {', '.join(done.unread_messages)}",
             style="yellow",
             soft_wrap=True,
         )

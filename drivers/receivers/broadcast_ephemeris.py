@@ -1,11 +1,11 @@
 """Navigation messages of Galileo, GLONASS and BeiDou: raw pages into ephemerides.
 
 Receivers' own messages are taken apart next to their drivers and come as `RawPage`. Read are I/NAV
-of Galileo's E1-B, strings 1 to 4 of GLONASS, and D1 of BeiDou; F/NAV, D2 of geostationary
-satellites and CNAV are not.
+of Galileo's E1-B, strings 1 to 4 of GLONASS, and D1 of BeiDou, of geostationary satellites D2;
+F/NAV and CNAV are not.
 
 Source: Galileo OS SIS ICD 2.1, 4.3 and 5.1; GLONASS ICD L1, L2, edition 5.1, 4.4; BDS-SIS-ICD-B1I
-3.0, 5.2; RINEX 3.04, tables A8, A10 and A14.
+3.0, 5.2 and 5.3; RINEX 3.04, tables A8, A10 and A14.
 """
 
 from __future__ import annotations
@@ -91,6 +91,23 @@ _BEIDOU: Final = {
         "node:-32 omega:-32 spare2:1"
     ),
 }
+_HEAD_D2: Final = "preamble:11 spare:4 id:3 sow:20 page:4 "
+_BEIDOU_D2: Final = {
+    1: _layout(_HEAD_D2 + "health:1 aodc:5 ura:4 week:13 toc:17 tgd1:-10 tgd2:-10"),
+    3: _layout(_HEAD_D2 + "spare2:38 a0:-24 a1_high:-4"),
+    4: _layout(_HEAD_D2 + "a1_low:18 a2:-11 aode:5 dn:-16 cuc_high:-14"),
+    5: _layout(_HEAD_D2 + "cuc_low:4 m0:-32 cus:-18 e_high:10"),
+    6: _layout(_HEAD_D2 + "e_low:22 root_a:32 cic_high:-10"),
+    7: _layout(_HEAD_D2 + "cic_low:8 cis:-18 toe:17 i0_high:-21"),
+    8: _layout(_HEAD_D2 + "i0_low:11 crc:-18 crs:-18 node_rate_high:-19"),
+    9: _layout(_HEAD_D2 + "node_rate_low:5 node:-32 omega_high:-27"),
+    10: _layout(_HEAD_D2 + "omega_low:5 idot:-14"),
+}
+"""Pages of subframe 1; the second one has the ionosphere."""
+_LOW_BITS: Final = {
+    "a1": 18, "cuc": 4, "e": 22, "cic": 8, "i0": 11, "node_rate": 5, "omega": 5,
+}  # fmt: skip
+"""Bits in the later one of two pages that share a number."""
 _GLONASS: Final = {
     1: _layout("idle:1 number:4 spare:2 p1:2 hours:5 minutes:6 half:1 v:24 a:5 x:27 check:8"),
     2: _layout("idle:1 number:4 bn:3 p2:1 tb:7 spare:5 v:24 a:5 x:27 check:8"),
@@ -102,6 +119,8 @@ _GLONASS: Final = {
 _SIGNED_MAGNITUDE: Final = {"v": 24, "a": 5, "x": 27, "gamma": 11, "tau": 22, "delta": 5}
 _GALILEO_BITS, _BEIDOU_BITS, _GLONASS_BITS = 128, 224, 85
 _BEIDOU_SUBFRAME_S: Final = 6
+_BEIDOU_FRAME_D2_S: Final = 3
+_BEIDOU_MAX: Final = 63
 _BEIDOU_PREAMBLE: Final = 0b11100010010
 _FIRST_D1, _LAST_D1 = 6, 58
 _SLOTS: Final = 24
@@ -140,18 +159,18 @@ def _crc24q(bits: int) -> int:
 
 
 def beidou_page(satellite: int, bits: int) -> RawPage | None:
-    """A subframe of D1 from its 300 bits, parity taken out.
+    """A subframe of D1 or D2 from its 300 bits, parity taken out.
 
     Args:
         satellite: number, 1 to 63.
         bits: ten words of 30.
 
     Returns:
-        The page; None for geostationary satellites, whose message is D2, and other preambles.
+        The page; None for other preambles.
 
     Source: BDS-SIS-ICD-B1I 3.0, 5.1.3 and 5.2.1.
     """
-    if not _FIRST_D1 <= satellite <= _LAST_D1 or bits >> 289 != _BEIDOU_PREAMBLE:
+    if not 1 <= satellite <= _BEIDOU_MAX or bits >> 289 != _BEIDOU_PREAMBLE:
         return None
     data = 0
     for word in range(10):
@@ -258,6 +277,8 @@ def _sisa_m(index: int) -> float:
 def _beidou(
     page: RawPage, own: dict[int, dict[str, int]], near_week: int
 ) -> BroadcastEphemeris | None:
+    if not _FIRST_D1 <= page.satellite <= _LAST_D1:
+        return _beidou_d2(page, own)
     number = page.bits >> (_BEIDOU_BITS - 18) & 7
     if number not in _BEIDOU:
         return None
@@ -268,25 +289,48 @@ def _beidou(
     # Without an issue in each subframe, those of one frame follow each other.
     if {two["sow"] - one["sow"], three["sow"] - two["sow"]} != {_BEIDOU_SUBFRAME_S}:
         return None
-    toe_s = float((two["toe_high"] << 15 | three["toe_low"]) * 8)
-    toc_s, sow = one["toc"] * 8.0, float(one["sow"])
-    week = one["week"] + round((sow - toe_s) / WEEK_S)
+    toe = two["toe_high"] << 15 | three["toe_low"]
+    return _of_beidou(page.satellite, "D1", {**three, **two, **one, "toe": toe})
+
+
+def _beidou_d2(page: RawPage, own: dict[int, dict[str, int]]) -> BroadcastEphemeris | None:
+    """Pages of subframe 1 of geostationary satellites, one in each frame of 3 s."""
+    number = page.bits >> (_BEIDOU_BITS - 42) & 15
+    if page.bits >> (_BEIDOU_BITS - 18) & 7 != 1 or number not in _BEIDOU_D2:
+        return None
+    own[number] = _fields(page.bits, _BEIDOU_BITS, _BEIDOU_D2[number])
+    if number != max(_BEIDOU_D2) or len(own) < len(_BEIDOU_D2):
+        return None
+    sow = own[1]["sow"]
+    if any(part["sow"] - sow != _BEIDOU_FRAME_D2_S * (k - 1) for k, part in own.items()):
+        return None
+    found: dict[str, int] = {}
+    for part in own.values():
+        found |= part
+    for name, bits in _LOW_BITS.items():
+        found[name] = found[f"{name}_high"] << bits | found[f"{name}_low"]
+    return _of_beidou(page.satellite, "D2", {**found, "sow": sow})
+
+
+def _of_beidou(satellite: int, message: str, part: Mapping[str, int]) -> BroadcastEphemeris:
+    toe_s, toc_s, sow = part["toe"] * 8.0, part["toc"] * 8.0, float(part["sow"])
+    week = part["week"] + round((sow - toe_s) / WEEK_S)
     values = (
-        one["a0"] * 2.0**-33, one["a1"] * 2.0**-50, one["a2"] * 2.0**-66,
-        float(one["aode"]), two["crs"] * 2.0**-6, two["dn"] * 2.0**-43 * PI,
-        two["m0"] * 2.0**-31 * PI,
-        two["cuc"] * 2.0**-31, two["e"] * 2.0**-33, two["cus"] * 2.0**-31,
-        two["root_a"] * 2.0**-19,
-        toe_s, three["cic"] * 2.0**-31, three["node"] * 2.0**-31 * PI, three["cis"] * 2.0**-31,
-        three["i0"] * 2.0**-31 * PI, two["crc"] * 2.0**-6, three["omega"] * 2.0**-31 * PI,
-        three["node_rate"] * 2.0**-43 * PI,
-        three["idot"] * 2.0**-43 * PI, 0.0, float(week), 0.0,
-        URA_M[one["ura"]], float(one["health"]), one["tgd1"] * 1e-10, one["tgd2"] * 1e-10,
-        sow, float(one["aodc"]),
+        part["a0"] * 2.0**-33, part["a1"] * 2.0**-50, part["a2"] * 2.0**-66,
+        float(part["aode"]), part["crs"] * 2.0**-6, part["dn"] * 2.0**-43 * PI,
+        part["m0"] * 2.0**-31 * PI,
+        part["cuc"] * 2.0**-31, part["e"] * 2.0**-33, part["cus"] * 2.0**-31,
+        part["root_a"] * 2.0**-19,
+        toe_s, part["cic"] * 2.0**-31, part["node"] * 2.0**-31 * PI, part["cis"] * 2.0**-31,
+        part["i0"] * 2.0**-31 * PI, part["crc"] * 2.0**-6, part["omega"] * 2.0**-31 * PI,
+        part["node_rate"] * 2.0**-43 * PI,
+        part["idot"] * 2.0**-43 * PI, 0.0, float(week), 0.0,
+        URA_M[part["ura"]], float(part["health"]), part["tgd1"] * 1e-10, part["tgd2"] * 1e-10,
+        sow, float(part["aodc"]),
     )  # fmt: skip
     at = week + round((toe_s - toc_s) / WEEK_S)
     clock = _BEIDOU_EPOCH + timedelta(seconds=at * WEEK_S + toc_s)
-    return BroadcastEphemeris(f"C{page.satellite:02d}", "D1", clock, values)
+    return BroadcastEphemeris(f"C{satellite:02d}", message, clock, values)
 
 
 def _glonass(

@@ -1,9 +1,10 @@
-"""The GPS legacy navigation message: subframes into ephemerides.
+"""The legacy navigation message of GPS and QZSS: subframes into ephemerides.
 
 Receivers send subframes as words of 24 bits without parity; their own messages are taken apart next
 to their drivers. Subframes 1 to 3 of one issue of data make an ephemeris.
 
-Source: IS-GPS-200N, 20.3.3.3 and 20.3.3.4, figure 20-1, tables 20-I, 20-III and 20-XII.
+Source: IS-GPS-200N, 20.3.3.3 and 20.3.3.4, figure 20-1, tables 20-I, 20-III and 20-XII;
+IS-QZSS-PNT-005, 4.1.2, which has the same fields; RINEX 3.04, tables A6 and A12.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ PI: Final = 3.1415926535898
 WORD_BITS: Final = 24
 WORDS: Final = 10
 WEEKS: Final = 1024
+_SATELLITES: Final = {"G": 32, "J": 10}
 _URA_M: Final = (2.0, 2.8, 4.0, 5.7, 8.0, 11.3, 16.0, 32.0, 64.0, 128.0, 256.0, 512.0, 1024.0,
                  2048.0, 4096.0, 8192.0)  # fmt: skip
 _FIT_H: Final = (
@@ -29,10 +31,14 @@ _FIT_H: Final = (
 
 @dataclass(frozen=True)
 class Subframe:
-    """One subframe of one satellite: `bits` are its ten words of 24 bits, the first one highest."""
+    """One subframe of one satellite: `bits` are its ten words of 24 bits, the first one highest.
+
+    `system` is RINEX's letter, G or J.
+    """
 
     satellite: int
     bits: int
+    system: str = "G"
 
     def field(self, word: int, first: int, count: int, *, signed: bool = False) -> int:
         """A field.
@@ -74,24 +80,26 @@ class GpsEphemeris:
     toc_s: float
     toe_s: float
     values: tuple[float, ...]
+    system: str = "G"
 
 
-def subframe_of_words(satellite: int, words: Sequence[int]) -> Subframe | None:
+def subframe_of_words(satellite: int, words: Sequence[int], system: str = "G") -> Subframe | None:
     """A subframe from words of 30 bits.
 
     Args:
-        satellite: number, 1 to 32.
+        satellite: number, 1 to 32 of GPS, 1 to 10 of QZSS.
         words: ten, each with the data in bits 29 to 6, its parity in bits 5 to 0.
+        system: G or J.
 
     Returns:
-        The subframe; None where number or words are none of a satellite of GPS.
+        The subframe; None where number or words are none of such a satellite.
     """
-    if not 1 <= satellite <= 32 or len(words) != WORDS:
+    if not 1 <= satellite <= _SATELLITES[system] or len(words) != WORDS:
         return None
     bits = 0
     for word in words:
         bits = bits << WORD_BITS | (word >> 6 & 0xFFFFFF)
-    return Subframe(satellite, bits)
+    return Subframe(satellite, bits, system)
 
 
 def ephemerides_of(subframes: Iterable[Subframe], near_week: int) -> Iterator[GpsEphemeris]:
@@ -104,12 +112,12 @@ def ephemerides_of(subframes: Iterable[Subframe], near_week: int) -> Iterator[Gp
     Yields:
         An ephemeris as soon as its third subframe has come.
     """
-    parts: dict[int, dict[int, Subframe]] = {}
-    emitted: set[tuple[int, float, int]] = set()
+    parts: dict[tuple[str, int], dict[int, Subframe]] = {}
+    emitted: set[tuple[str, int, float, int]] = set()
     for subframe in subframes:
         if subframe.number not in (1, 2, 3):
             continue
-        own = parts.setdefault(subframe.satellite, {})
+        own = parts.setdefault((subframe.system, subframe.satellite), {})
         own[subframe.number] = subframe
         if len(own) < 3:
             continue
@@ -117,7 +125,7 @@ def ephemerides_of(subframes: Iterable[Subframe], near_week: int) -> Iterator[Gp
         if issue != own[3].field(10, 1, 8) or issue != own[1].field(8, 1, 8):
             continue
         found = _ephemeris(own, near_week)
-        key = (found.satellite, found.toe_s, issue)
+        key = (found.system, found.satellite, found.toe_s, issue)
         if key not in emitted:
             emitted.add(key)
             yield found
@@ -150,9 +158,9 @@ def _ephemeris(own: dict[int, Subframe], near_week: int) -> GpsEphemeris:
         float(_week(one.field(3, 1, 10), near_week, one.tow_s, toe_s)), float(one.field(4, 1, 1)),
         _URA_M[one.field(3, 13, 4)], float(one.field(3, 17, 6)), scaled(one, (7, 17, 8), -31),
         float(issue),
-        one.tow_s, _fit_h(issue, is_long=bool(two.field(10, 17, 1))),
+        one.tow_s, _fit(one.system, issue, is_long=bool(two.field(10, 17, 1))),
     )  # fmt: skip
-    return GpsEphemeris(one.satellite, round(values[21]), toc_s, toe_s, values)
+    return GpsEphemeris(one.satellite, round(values[21]), toc_s, toe_s, values, one.system)
 
 
 def _week(sent: int, near_week: int, tow_s: float, toe_s: float) -> int:
@@ -161,7 +169,10 @@ def _week(sent: int, near_week: int, tow_s: float, toe_s: float) -> int:
     return week + round((tow_s - toe_s) / 604_800.0)
 
 
-def _fit_h(issue: int, *, is_long: bool) -> float:
+def _fit(system: str, issue: int, *, is_long: bool) -> float:
+    """Curve fit: hours of GPS, the flag itself of QZSS."""
+    if system == "J":
+        return float(is_long)
     if not is_long:
         return 4.0
     return next((hours for issues, hours in _FIT_H if issue in issues), 6.0)

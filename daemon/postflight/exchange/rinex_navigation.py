@@ -1,7 +1,7 @@
-"""RINEX navigation files, 3.04, 4.00 and 4.02, of GPS, Galileo, GLONASS and BeiDou ephemerides.
+"""RINEX navigation files, 3.04, 4.00 and 4.02: GPS, QZSS, Galileo, GLONASS, BeiDou.
 
 Source: IGS and RTCM SC-104, RINEX 3.04 (2018), tables A5 to A14; RINEX 4.00 (2021), "EPH LNAV",
-"EPH INAV", "EPH FDMA", "EPH D1".
+"EPH INAV", "EPH FDMA", "EPH D1", "EPH D2".
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from drivers.receivers.gps_ephemeris import GpsEphemeris
 
 _GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC)
 _WEEK_S = 604_800.0
-_SYSTEMS = {"G": "G: GPS", "E": "E: Galileo", "R": "R: GLONASS", "C": "C: BDS"}
+_SYSTEMS = {"G": "G: GPS", "E": "E: Galileo", "R": "R: GLONASS", "C": "C: BDS", "J": "J: QZSS"}
 
 
 def navigation_text(
@@ -53,7 +53,9 @@ def navigation_text(
 
 
 def _of_gps(one: GpsEphemeris) -> BroadcastEphemeris:
-    return BroadcastEphemeris(f"G{one.satellite:02d}", "LNAV", _clock_time(one), one.values)
+    return BroadcastEphemeris(
+        f"{one.system}{one.satellite:02d}", "LNAV", _clock_time(one), one.values
+    )
 
 
 def _clock_time(one: GpsEphemeris) -> datetime:

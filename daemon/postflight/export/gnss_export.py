@@ -44,11 +44,13 @@ from drivers.receivers.septentrio.observations import (
     septentrio_observations,
     septentrio_pages,
     septentrio_subframes,
+    septentrio_unread,
 )
 from drivers.receivers.ublox.observations import (
     ublox_observations,
     ublox_pages,
     ublox_subframes,
+    ublox_unread,
 )
 
 Decoder = Callable[[bytes, ObservationCounts], Iterator[ObservationEpoch]]
@@ -64,12 +66,17 @@ SUBFRAMES: Mapping[str, Callable[[bytes], Iterator[Subframe]]] = {
     "novatel": novatel_subframes,
     "septentrio": septentrio_subframes,
 }
-"""Decoders of the navigation message of GPS by driver."""
+"""Decoders of the legacy navigation message of GPS and QZSS by driver."""
 PAGES: Mapping[str, Callable[[bytes], Iterator[RawPage]]] = {
     "ublox": ublox_pages,
     "septentrio": septentrio_pages,
 }
 """Decoders of the navigation messages of Galileo, GLONASS and BeiDou by driver."""
+UNREAD: Mapping[str, Callable[[bytes], tuple[str, ...]]] = {
+    "ublox": ublox_unread,
+    "septentrio": septentrio_unread,
+}
+"""Names of recorded navigation messages that are not written, by driver."""
 MESSAGES = {"ublox": "RXM-RAWX", "novatel": "RANGE", "septentrio": "MeasEpoch"}
 NAVIGATION_MESSAGES = {"ublox": "RXM-SFRBX", "novatel": "RAWEPHEM", "septentrio": "GPSRawCA"}
 MARK_SOURCE = "event-mark"
@@ -85,7 +92,7 @@ class GnssExport:
     """The folder, the written file, its figures, and exposures without a mark of the receiver.
 
     `other_receivers` have observations, too, and were not asked for. `navigation_message` names
-    what a receiver records for `ephemerides`.
+    what a receiver records for `ephemerides`, `unread_messages` recorded ones that are not written.
     """
 
     folder: Path
@@ -97,6 +104,7 @@ class GnssExport:
     failures: tuple[ExposureFailure, ...]
     ephemerides: tuple[GpsEphemeris | BroadcastEphemeris, ...]
     navigation_message: str
+    unread_messages: tuple[str, ...] = ()
     other_receivers: tuple[str, ...] = ()
 
 
@@ -171,7 +179,8 @@ def export_rinex(
     without = tuple(e.number for e in exposures if e.number not in with_mark)
     return GnssExport(
         folder, f"{name}.obs", written, counts, without, crowded, tuple(sealed.failures),
-        tuple(ephemerides), NAVIGATION_MESSAGES[driver], others,
+        tuple(ephemerides), NAVIGATION_MESSAGES[driver],
+        UNREAD[driver](recorded) if driver in UNREAD else (), others,
     )  # fmt: skip
 
 

@@ -40,6 +40,11 @@ GPS_RAW_CA: Final = 4017
 GAL_RAW_INAV: Final = 4023
 GLO_RAW_CA: Final = 4026
 BDS_RAW: Final = 4047
+QZS_RAW_L1CA: Final = 4066
+_UNREAD: Final = {
+    4018: "GPS CNAV", 4019: "GPS CNAV", 4022: "Galileo F/NAV", 4067: "QZSS CNAV", 4068: "QZSS CNAV",
+    4093: "NavIC", 4218: "BeiDou CNAV", 4219: "BeiDou CNAV", 4242: "BeiDou CNAV",
+}  # fmt: skip
 MEAS3_RANGES: Final = 4109
 _RAW_CA: Final = struct.Struct("<6xBB4x10I")
 _RAW_HEAD: Final = struct.Struct("<6xBBxBBx")
@@ -122,7 +127,9 @@ def septentrio_observations(data: bytes, counts: ObservationCounts) -> Iterator[
 
 
 def septentrio_subframes(data: bytes) -> Iterator[Subframe]:
-    """Subframes of GPS L1 C/A, of GPSRawCA in a recording; those with wrong parity are left out.
+    """Subframes of GPS and QZSS L1 C/A, of GPSRawCA and QZSRawL1CA in a recording.
+
+    Those with wrong parity are left out.
 
     Args:
         data: bytes as received.
@@ -131,13 +138,17 @@ def septentrio_subframes(data: bytes) -> Iterator[Subframe]:
         Subframes in the order received.
     """
     for frame in sbf_framer().feed(data):
-        if int.from_bytes(frame[4:6], "little") & 0x1FFF != GPS_RAW_CA:
+        block = int.from_bytes(frame[4:6], "little") & 0x1FFF
+        if block not in (GPS_RAW_CA, QZS_RAW_L1CA):
             continue
         body = frame[HEADER.size :]
         if len(body) < _RAW_CA.size:
             continue
-        satellite, is_right, *words = _RAW_CA.unpack_from(body)
-        subframe = subframe_of_words(satellite, words)
+        number, is_right, *words = _RAW_CA.unpack_from(body)
+        name = _name(number) or "S0"
+        if name[0] != ("G" if block == GPS_RAW_CA else "J"):
+            continue
+        subframe = subframe_of_words(int(name[1:]), words, name[0])
         if is_right and subframe is not None:
             yield subframe
 
@@ -181,6 +192,19 @@ def septentrio_pages(data: bytes) -> Iterator[RawPage]:
             page = beidou_page(int(name[1:]), bits >> 20)
         if page is not None:
             yield page
+
+
+def septentrio_unread(data: bytes) -> tuple[str, ...]:
+    """Navigation messages in a recording that are not read.
+
+    Args:
+        data: bytes as received.
+
+    Returns:
+        Their names, each once.
+    """
+    blocks = {int.from_bytes(frame[4:6], "little") & 0x1FFF for frame in sbf_framer().feed(data)}
+    return tuple(sorted({_UNREAD[block] for block in blocks & _UNREAD.keys()}))
 
 
 def has_meas3(data: bytes) -> bool:

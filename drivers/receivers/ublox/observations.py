@@ -70,8 +70,18 @@ def ublox_observations(data: bytes, counts: ObservationCounts) -> Iterator[Obser
             yield epoch
 
 
+_UNREAD: Final = {
+    (0, 3): "GPS CNAV", (0, 4): "GPS CNAV", (0, 6): "GPS CNAV", (0, 7): "GPS CNAV",
+    (2, 3): "Galileo F/NAV", (2, 4): "Galileo F/NAV", (3, 5): "BeiDou CNAV", (3, 6): "BeiDou CNAV",
+    (3, 7): "BeiDou CNAV", (3, 8): "BeiDou CNAV", (5, 4): "QZSS CNAV", (5, 5): "QZSS CNAV",
+    (5, 8): "QZSS CNAV", (5, 9): "QZSS CNAV", (7, 0): "NavIC",
+}  # fmt: skip
+_LEGACY: Final = {0: "G", 5: "J"}
+"""Systems with the legacy message of GPS."""
+
+
 def ublox_subframes(data: bytes) -> Iterator[Subframe]:
-    """Subframes of GPS L1 C/A, of RXM-SFRBX in a recording.
+    """Subframes of GPS and QZSS L1 C/A, of RXM-SFRBX in a recording.
 
     Args:
         data: bytes as received; the receiver has checked parities.
@@ -80,8 +90,8 @@ def ublox_subframes(data: bytes) -> Iterator[Subframe]:
         Subframes in the order received.
     """
     for system, satellite, signal, words, _ in _sfrbx(data):
-        if (system, signal) == (0, 0):
-            subframe = subframe_of_words(satellite, words)
+        if system in _LEGACY and signal == 0:
+            subframe = subframe_of_words(satellite, words, _LEGACY[system])
             if subframe is not None:
                 yield subframe
 
@@ -93,7 +103,7 @@ def ublox_pages(data: bytes) -> Iterator[RawPage]:
         data: bytes as received; the receiver has checked parities.
 
     Yields:
-        Pages in the order received; I/NAV of E1-B, strings, D1.
+        Pages in the order received; I/NAV of E1-B, strings, D1 and D2.
     """
     for system, satellite, signal, words, channel in _sfrbx(data):
         bits = 0
@@ -106,13 +116,26 @@ def ublox_pages(data: bytes) -> Iterator[RawPage]:
             page = galileo_page(satellite, bits >> 142, bits >> 14 & ((1 << 114) - 1))
         elif system == 6 and len(words) == 4:
             page = glonass_page(satellite, bits >> 43, channel - 7)
-        elif system == 3 and signal in (0, 2) and len(words) == 10:
+        elif system == 3 and signal in (0, 1, 2, 3) and len(words) == 10:
             bits = 0
             for word in words:
                 bits = bits << 30 | word & 0x3FFFFFFF
             page = beidou_page(satellite, bits)
         if page is not None:
             yield page
+
+
+def ublox_unread(data: bytes) -> tuple[str, ...]:
+    """Navigation messages in a recording that are not read.
+
+    Args:
+        data: bytes as received.
+
+    Returns:
+        Their names, each once.
+    """
+    kinds = {(system, signal) for system, _, signal, _, _ in _sfrbx(data)}
+    return tuple(sorted({_UNREAD[kind] for kind in kinds & _UNREAD.keys()}))
 
 
 def _sfrbx(data: bytes) -> Iterator[tuple[int, int, int, tuple[int, ...], int]]:
