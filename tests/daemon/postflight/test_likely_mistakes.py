@@ -91,7 +91,7 @@ def test_a_good_block_has_no_likely_mistake(block) -> None:
 
 
 def _with_second(block: Network, *, control: bool) -> Network:
-    """The block and a copy of it 1 km beside, without a common object point."""
+    """The block and a copy of it 1 km away, without a common object point."""
     both = np.concatenate
     aside = np.array([1000.0, 0.0, 0.0])
     stations, attitudes, images, points = (
