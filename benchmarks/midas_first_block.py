@@ -143,7 +143,8 @@ def _with_matches(
     """
     stations, cameras = exposures
     point = np.full(len(image), -1)
-    names, owner = [], []
+    names: list[str] = []
+    owner: list[int] = []
     for k in range(len(ground)):
         rows = np.flatnonzero(of_ground == k)
         groups = [rows]
