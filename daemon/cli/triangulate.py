@@ -216,6 +216,7 @@ def triangulate(
             crs=crs,
             position_sigma_m=position_sigma or POSITION_SIGMA_M,
             reject_beyond=reject,
+            compute=lambda step: where.compute(step, IMAGES_PER_PROCESS),
             as_json=as_json,
         )
         return

@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Mapping
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 from rich.progress import Progress
@@ -15,6 +16,9 @@ from daemon.cli.exit_status import ExitStatus
 from daemon.cli.options import lock_for
 from daemon.mission.layout import Mission
 from daemon.terminal.console import Console
+
+if TYPE_CHECKING:
+    from daemon.postflight.batch.batch_run import StepCompute
 
 POSITION_SIGMA_M = (3.0, 3.0, 5.0)
 """Of a camera's own receiver; the adjustment estimates them."""
@@ -29,6 +33,7 @@ def triangulate_photographs(
     crs: str | None,
     position_sigma_m: tuple[float, float, float],
     reject_beyond: float,
+    compute: StepCompute,
     as_json: bool,
 ) -> None:
     """Orient, adjust, write the results, print them; end with a status if photographs are missing.
@@ -60,16 +65,16 @@ def triangulate_photographs(
     from processing.bundle.rank_diagnosis import RankDefectError
 
     begun = time.perf_counter()
-    with (
-        lock_for(folder, results),
-        Progress(console=Console(stderr=True), transient=True) as progress,
-    ):
-        task = progress.add_task("features", total=None)
+    with lock_for(folder, results), ExitStack() as shown:
+        progress = Progress(console=Console(stderr=True), transient=True)
+        task = progress.add_task("orienting", total=None)
+        shown.callback(progress.stop)
 
         def step(what: str, done: int, total: int) -> None:
+            progress.start()  # not before processes have shown their own
             progress.update(task, description=what, completed=done, total=total)
 
-        found = photograph_block_of(folder, crs=crs, progress=step)
+        found = photograph_block_of(folder, crs=crs, compute=compute, progress=step)
         control = control_of(found, points, measured)
         if mistakes := control_mistakes(found, control):
             raise TriangulationError(f"{points}: {'; '.join(mistakes)}")

@@ -78,6 +78,8 @@ class BatchOutcome:
 
 Compute: TypeAlias = Callable[[BatchWork, Sequence[BatchTask]], BatchOutcome]
 """Computes all tasks of a work somewhere; after Ctrl-C it raises KeyboardInterrupt."""
+StepCompute: TypeAlias = Callable[[str], Compute]
+"""Where the tasks of a step are computed, such as "tiles"."""
 
 
 def in_this_process(work: BatchWork, tasks: Sequence[BatchTask]) -> BatchOutcome:

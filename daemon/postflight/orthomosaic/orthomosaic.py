@@ -13,12 +13,11 @@ import numpy as np
 from daemon.mission.canonical_json import canonical_bytes
 from daemon.mission.store import durable
 from daemon.mission.store.publication import published, sweep
-from daemon.postflight.batch.batch_run import in_this_process
+from daemon.postflight.batch.batch_run import StepCompute, in_this_process
 from daemon.postflight.orthomosaic.cells import CellSurvey, cell_grid, survey
 from daemon.postflight.orthomosaic.inputs import OrthoBlock, OrthomosaicError, described_ground
 from daemon.postflight.orthomosaic.orthomosaic_work import (
     OrthomosaicRequest,
-    StepCompute,
     make_tiles,
     survey_images,
     work_of,

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, TypeAlias
+from typing import Any, Final
 
 from daemon.mission.layout import Mission
 from daemon.postflight.batch.batch_run import Compute, in_this_process
@@ -22,9 +22,6 @@ from daemon.postflight.orthomosaic.tiles import TileJob, store_tile
 PIXEL_NBYTES: Final = 24
 """Of one pixel of an image that is read whole, with colour, its pansharpened bands and their
 means."""
-
-StepCompute: TypeAlias = Callable[[str], Compute]
-"""Where the tasks of a step are computed, such as "tiles"."""
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from daemon.mission.layout import Mission
 from daemon.mission.store.level0 import RasterError
 from daemon.orientation.exterior_orientation import sealed_exposure
-from daemon.postflight.triangulation.photograph_block import original_pixels
+from daemon.postflight.triangulation.photograph_matching import original_pixels
 from processing.image.kernels import DEFAULT_INTERPOLATION
 from processing.image.lattice import OUTSIDE
 from processing.image.resampling import SUPPORT_MARGIN_PX, WEIGHT_UNIT, resample

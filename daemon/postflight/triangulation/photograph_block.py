@@ -12,17 +12,17 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Final
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from daemon.mission.exposure import Exposure
 from daemon.mission.layout import Mission
-from daemon.mission.store.level0 import RasterError
 from daemon.orientation.exterior_orientation import ExteriorOrientation, sealed_exposures
 from daemon.orientation.geodesy import utm_of
 from daemon.orientation.georeference import Georeference
 from daemon.orientation.local_frame import LocalFrame
+from daemon.postflight.batch.batch_run import StepCompute, in_this_process
+from daemon.postflight.triangulation.photograph_matching import Photograph, matched_photographs
 from daemon.postflight.triangulation.triangulation import ImageBlock, TriangulationError
 from processing.bundle.incremental_orientation import (
     OrientedBlock,
@@ -37,9 +37,7 @@ from processing.matching.photograph_tracks import (
     MATCHES_MIN,
     ImageFeatures,
     Tracks,
-    features_of,
     join_tracks,
-    match_photographs,
     spread_tracks,
 )
 from processing.pipelines.perspective import perspective_of
@@ -56,6 +54,8 @@ _ORIENTED_MIN: Final = 3
 _CONTRADICTING_SHARE: Final = 0.5
 _UPWARD_MAX: Final = 0.2
 """Sine of the elevation of the axis of most photographs of the ground."""
+_AREA: Final = 0.2
+"""Spread of positions over an area: across their main direction, over that along it."""
 _WRONG_POSITION_M: Final = 15.0
 _WRONG_POSITION: Final = 6.0
 """Of a position that is not used: distance from the block, over the median of all."""
@@ -93,9 +93,19 @@ class PhotographBlock:
 
 
 def photograph_block_of(
-    mission: Mission, *, crs: str | None = None, progress: Progress = lambda _w, _d, _n: None
+    mission: Mission,
+    *,
+    crs: str | None = None,
+    compute: StepCompute = lambda _step: in_this_process,
+    progress: Progress = lambda _w, _d, _n: None,
 ) -> PhotographBlock:
     """Match and orient the photographs of a mission.
+
+    Args:
+        mission: of the photographs.
+        crs: such as EPSG:25833; None is the UTM zone of their middle.
+        compute: where the steps "features" and "matching" are computed.
+        progress: called with what is done, how much of it, and of how many.
 
     Raises:
         TriangulationError: fewer than three photographs that hang together, or positions that do
@@ -118,10 +128,11 @@ def photograph_block_of(
     position[known] = frame.from_geodetic(*geodetic[known].T)
     heads = {cone.name: k for k, cone in enumerate(rig.cones)}
     camera_of = np.array([heads[exposure.frames[0].sensor] for exposure in exposures], np.int64)
-    features = _features(mission, exposures, [sizes[k] for k in camera_of], progress)
-    candidates = candidate_pairs(position)
-    pairs = match_photographs(
-        features, candidates, progress=lambda done: progress("matching", done, len(candidates))
+    features, pairs = matched_photographs(
+        mission,
+        [Photograph(one, sizes[k]) for one, k in zip(exposures, camera_of, strict=True)],
+        candidate_pairs(position),
+        compute,
     )
     tracks = join_tracks(features, pairs)
     cameras = [provisional_camera(cone) for cone in rig.cones]
@@ -192,40 +203,6 @@ def candidate_pairs(position_m: Array) -> list[tuple[int, int]]:
     return sorted(found)
 
 
-def original_pixels(
-    mission: Mission, exposure: Exposure, image: VirtualImage, *, grey: bool
-) -> NDArray[np.uint8]:
-    """Pixels of a photograph as its sensor wrote them, (h, w) grey or (h, w, 3) red, green, blue.
-
-    Raises:
-        RasterError: no image, damaged, or of another size.
-    """
-    path = mission.level0(exposure.number) / exposure.frames[0].file
-    how = cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_COLOR_RGB
-    pixels = cv2.imread(str(path), how | cv2.IMREAD_IGNORE_ORIENTATION)
-    if pixels is None:
-        raise RasterError(f"{path}: no image that can be decoded; copy the original again")
-    if pixels.shape[:2] != (image.height_px, image.width_px):
-        raise RasterError(
-            f"{path}: {pixels.shape[1]} x {pixels.shape[0]} px; the camera has {image.width_px} x "
-            f"{image.height_px} px"
-        )
-    return np.ascontiguousarray(pixels, np.uint8)
-
-
-def _features(
-    mission: Mission, exposures: list[Exposure], sizes: list[VirtualImage], progress: Progress
-) -> list[ImageFeatures]:
-    found = []
-    for done, (exposure, image) in enumerate(zip(exposures, sizes, strict=True), start=1):
-        try:
-            found.append(features_of(original_pixels(mission, exposure, image, grey=True)))
-        except RasterError as error:
-            raise TriangulationError(str(error)) from error
-        progress("features", done, len(exposures))
-    return found
-
-
 def _position(exposure: Exposure) -> tuple[float, float, float]:
     settings = exposure.frames[0].settings if exposure.frames else {}
     keys = ("GpsLatitudeDeg", "GpsLongitudeDeg", "GpsAltitudeM")
@@ -286,12 +263,26 @@ def _placed(found: OrientedBlock, position: Array) -> tuple[OrientedBlock, NDArr
     upward = -placed.rotation[placed.oriented][:, 2, 2]
     if np.median(upward) > _UPWARD_MAX:
         raise TriangulationError(
-            "most photographs look upward where positions of EXIF place them: the positions do not "
-            "determine the attitude of the block. Lines across or control points do"
+            "most photographs look upward where positions of EXIF place them: "
+            + _why_upward(position[own])
         )
     wrong = np.zeros(len(position), bool)
     wrong[np.flatnonzero(own)[away > max(_WRONG_POSITION_M, _WRONG_POSITION * typical)]] = True
     return placed, wrong
+
+
+def _why_upward(position: Array) -> str:
+    """Positions over an area that let a block look upward are mirrored; on a line, roll is open."""
+    along, across = np.linalg.svd(position[:, :2] - position[:, :2].mean(axis=0))[1]
+    if across > _AREA * along:
+        return (
+            "they mirror the ground. Latitude and longitude are exchanged, or one has the wrong "
+            "sign (GPSLatitudeRef, GPSLongitudeRef). Correct the tags"
+        )
+    return (
+        "the positions do not determine the attitude of the block. Lines across or control points "
+        "do"
+    )
 
 
 def _assembled(
