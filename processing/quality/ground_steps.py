@@ -186,6 +186,20 @@ def read_out_frames(
     return frozenset(found | alone if len(alone) >= MIN_ALONE else found)
 
 
+def is_ground(steps: Sequence[LineStep], view: GroundView) -> bool:
+    """Whether most of the other heads show the steps of a frame at their places of the ground.
+
+    Args:
+        steps: of one frame along one axis.
+        view: frames and places.
+
+    Returns:
+        False where no other head sees enough of them.
+    """
+    shares = _shares_of_heads(steps, view)
+    return bool(shares) and float(np.median(list(shares.values()))) > MAX_SHARED
+
+
 def is_drawn_by_step(
     view: GroundView,
     steps: Collection[LineStep],

@@ -17,7 +17,13 @@ from numpy.typing import NDArray
 from processing.image.compiled_kernel import compiled_kernel
 from processing.image.line_means import LineMeans
 from processing.quality.figures.image import SignalStepFigures
-from processing.quality.ground_steps import Axis, GroundView, LineStep, read_out_frames
+from processing.quality.ground_steps import (
+    Axis,
+    GroundView,
+    LineStep,
+    is_ground,
+    read_out_frames,
+)
 from processing.radiometry.level1 import level1_counts_per_dn
 from processing.rig import Sensor
 
@@ -70,8 +76,9 @@ def signal_steps(
         view: frames and places; None where heads share no ground.
 
     Returns:
-        The largest step of each frame and axis that has one, the largest first. Where more than
-        `MAX_FRAMES` frames have one, only those that the ground cannot be the cause of.
+        The largest step of each frame and axis that has one and that other heads do not show, the
+        largest first. Where more than `MAX_FRAMES` frames have one, only those that the ground
+        cannot be the cause of.
     """
     found = []
     for sensor in sensors:
@@ -89,6 +96,8 @@ def signal_steps(
                 found.append(step)
     if len({step.sensor for step in found}) > MAX_FRAMES:
         found = _of_read_out(found, view)
+    elif view is not None:
+        found = [step for step in found if not is_ground(step.every, view)]
     return tuple(sorted(found, key=lambda step: -abs(step.relative)))
 
 

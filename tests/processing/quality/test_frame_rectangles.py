@@ -12,7 +12,13 @@ from numpy.typing import NDArray
 
 from processing.geometry.placement import nominal_placements, vip_mm_from_raw
 from processing.image.line_means import LineMeans, line_means
-from processing.quality.frame_blocks import _Edge, _shows_elsewhere, block_edges, edge_limits
+from processing.quality.frame_blocks import (
+    _Edge,
+    _rectangle,
+    _shows_elsewhere,
+    block_edges,
+    edge_limits,
+)
 from processing.quality.frame_rectangles import (
     SHARP,
     SHARP_BUNDLES,
@@ -202,6 +208,32 @@ def test_a_block_below_the_texture_is_named_where_no_other_head_shows_it() -> No
 
 def test_a_rectangle_that_other_heads_show_is_ground() -> None:
     assert _named("R G B N", "R G B N") == []
+
+
+@pytest.mark.parametrize(("shown", "named"), [(0.0, ["R"]), (1.0, [])])
+def test_a_corner_is_none_where_one_of_its_sides_is_an_edge_of_the_ground(
+    shown: float, named: list[str]
+) -> None:
+    temperatures = {cone.probe: cone.calibration_c for cone in RIG.cones}
+    placements = nominal_placements(RIG, temperatures, {})
+    edge_mm = vip_mm_from_raw(placements["R"], np.array([[399.5, 249.5]]))[0]
+    frames = {}
+    for name in "RGBN":
+        sensor = RIG.sensor(name)
+        rough = GROUND[: sensor.height_px, : sensor.width_px]
+        rows, columns = np.indices(rough.shape)
+        pixels = np.stack((columns.ravel(), rows.ravel()), axis=1).astype(np.float64)
+        off = (vip_mm_from_raw(placements[name], pixels) - edge_mm).reshape(*rough.shape, 2)
+        # Below the corner the other heads see more of the edge: mean shares are a third.
+        part = shown * (off[..., 0] < 0.0) * np.where(off[..., 1] < 0.0, 1.3, 1.0)
+        if name == "R":
+            part = (rows < 250) * (columns < 400)
+        frames[name] = _words(8000.0 + 0.3 * (rough - 8000.0) + 3.0 * STEP * part)
+    means = {n: line_means(frame, (0, len(frame) - 1)) for n, frame in frames.items()}
+    view = GroundView(RIG, placements, frames)
+    sides = next(changed_rectangles(RIG.sensor("R"), means["R"]))
+    assert {(side.axis, side.at) for side in sides} == {("rows", 249), ("columns", 399)}
+    assert [block.sensor for block in _rectangle(view, RIG.sensor("R"), means["R"])] == named
 
 
 def test_an_edge_that_another_head_shows_is_ground_whatever_lies_next_to_it() -> None:

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from processing.geometry.placement import nominal_placements, vip_mm_from_raw
 from processing.image.line_means import line_means
 from processing.quality.frame_blocks import _have_runs, _texture
+from processing.quality.ground_steps import GroundView
 from processing.quality.signal_steps import (
     SignalStep,
     _largest,
@@ -208,6 +210,33 @@ def test_steps_at_the_same_line_of_three_frames_that_share_no_ground_are_read_ou
     for frame in list(line_values.values())[:count]:
         frame[FIRST + 100 : FIRST + SIDE] = 4400
     assert len(steps_of(line_values)) == count
+
+
+@pytest.mark.parametrize(
+    ("showing", "found"), [("", ["R"]), ("B", ["R"]), ("G N", []), ("G B N", [])]
+)
+def test_a_step_that_most_other_heads_show_on_the_ground_is_none(
+    showing: str, found: list[str]
+) -> None:
+    rig = find_rig("ultracam-x-mini")
+    placements = nominal_placements(rig, {c.probe: c.calibration_c for c in rig.cones}, {})
+    edge_mm = vip_mm_from_raw(placements["R"], np.array([[300.5, 400.0]]))[0, 0]
+    line_values = {}
+    for name in "RGBN":
+        sensor = rig.sensor(name)
+        columns = np.arange(sensor.width_px, dtype=np.float64)
+        at = vip_mm_from_raw(placements[name], np.stack((columns, 0.0 * columns + 400.0), axis=1))
+        bright = np.where(name in showing.split(), at[:, 0] > edge_mm, False)
+        # A lens spreads the edge in the other frames.
+        spread = np.convolve(
+            np.pad(bright.astype(np.float64), 4, "edge"), np.ones(9) / 9.0, "valid"
+        )
+        line = 4000.0 + 600.0 * spread if name != "R" else 4000.0 + 600.0 * (columns > 300.0)
+        line_values[name] = np.tile(line.astype(np.uint16) & 0xFFFE, (sensor.height_px, 1))
+    means_of = {n: line_means(f, (0, len(f) - 1)) for n, f in line_values.items()}
+    view = GroundView(rig, placements, line_values)
+    steps = signal_steps(rig.sensors, means_of, view)
+    assert [(step.sensor, step.at) for step in steps] == [(name, 300) for name in found]
 
 
 @pytest.mark.parametrize(("step_dn", "found"), [(5.75, 0), (6.25, 1)])
