@@ -255,6 +255,30 @@ def test_panels_share_one_request_of_the_advice(cockpit: Cockpit) -> None:
     assert found == {"atOnce": 1, "isSame": True, "given": None, "other": [2]}
 
 
+def test_what_is_read_once_is_asked_for_again_until_it_comes(cockpit: Cockpit) -> None:
+    """A link that is lost for a moment must not cost the base maps or the plan of a flight."""
+    found = cockpit.browser.evaluate(
+        """import('/http.js').then(async ({ fetchPatiently }) => {
+          const [realFetch, realTimeout] = [window.fetch, window.setTimeout];
+          let asked = 0;
+          window.fetch = async () => {
+            asked += 1;
+            if (asked === 1) throw new TypeError('no network');
+            return new Response(asked === 2 ? '' : '[1]', { status: asked === 2 ? 429 : 200 });
+          };
+          window.setTimeout = (action) => realTimeout(action, 0);
+          try {
+            const came = [await fetchPatiently('/api/v1/maps'), asked];
+            asked = 0;
+            return [came, await fetchPatiently('/api/v1/maps', () => asked === 0), asked];
+          } finally {
+            [window.fetch, window.setTimeout] = [realFetch, realTimeout];
+          }
+        })"""
+    )
+    assert found == [[[1], 3], None, 1]
+
+
 def test_an_unreadable_record_ends_the_connection_that_brought_it(cockpit: Cockpit) -> None:
     """Values would otherwise be frozen on a link that looks live."""
     cockpit.browser.call(

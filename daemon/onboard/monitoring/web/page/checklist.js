@@ -3,7 +3,7 @@
 import { by, button, element, redraw } from "./dom.js";
 import { serverText, t } from "./i18n.js";
 import { bytes, number, percent } from "./format.js";
-import { fetchJson } from "./http.js";
+import { fetchJson, fetchPatiently } from "./http.js";
 import { lampStates } from "./lamps.js";
 import { lastWhere } from "./feed.js";
 
@@ -111,7 +111,7 @@ async function readPlan(id) {
   mission = id;
   test = null;
   by("exposure-suggestion").replaceChildren();
-  plan = id && await fetchJson("/api/v1/plan");
+  plan = id && await fetchPatiently("/api/v1/plan", () => mission === id);
 }
 
 export function start(root, feed) {

@@ -4,7 +4,7 @@ import { by, element, redraw, text } from "./dom.js";
 import { serverText, t } from "./i18n.js";
 import { angle, number, percent, sigma, speed } from "./format.js";
 import { lastWhere } from "./feed.js";
-import { fetchJson } from "./http.js";
+import { fetchPatiently } from "./http.js";
 import { presentPosition } from "./lamps.js";
 import { VisibleRows } from "./visible_rows.js";
 import { drawCharts, fitCharts } from "./charts.js";
@@ -41,7 +41,10 @@ function limitText(code) {
 async function readLimits(mission, redrawn) {
   if (mission === limitsOf) return;
   limitsOf = mission;
-  limits = (mission && await fetchJson("/api/v1/limits")) || {};
+  limits = {};
+  const found = mission && await fetchPatiently("/api/v1/limits", () => limitsOf === mission);
+  if (limitsOf !== mission) return;
+  limits = found || {};
   redrawn();
 }
 

@@ -42,6 +42,18 @@ export async function fetchJson(address, signal = null) {
   }
 }
 
+const AGAIN_MS = 3000;
+
+// What is read once: tried again until it comes or `isWanted()` is false, since the link may be lost for a moment.
+export async function fetchPatiently(address, isWanted = () => true) {
+  for (;;) {
+    const found = await fetchJson(address);
+    if (found || !isWanted()) return found;
+    await new Promise((resolve) => setTimeout(resolve, AGAIN_MS));
+    if (!isWanted()) return null;
+  }
+}
+
 // A browser follows a link without a token. A file that requires one is fetched here.
 document.addEventListener("click", async (event) => {
   const link = event.target.closest?.(".files a");

@@ -1,6 +1,6 @@
 // Layers below and above the lines of the map: base maps of the service, hill shade, thumbnails at their place.
 
-import { fetchJson, fetchOk } from "./http.js";
+import { fetchOk, fetchPatiently } from "./http.js";
 import { t } from "./i18n.js";
 import { element } from "./dom.js";
 import { drawTile } from "./mvt.js";
@@ -174,7 +174,7 @@ export function startLayers(map, feed) {
     }
     if (isAsked) return;
     isAsked = true;
-    listed = (await fetchJson("/api/v1/maps")) || [];
+    listed = await fetchPatiently("/api/v1/maps");
     drawChoices(map, tools);
   });
 }

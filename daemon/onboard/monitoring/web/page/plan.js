@@ -1,7 +1,7 @@
 // The flight plan of the mission, and the segments to re-fly.
 
 import { fetchAdvice } from "./advice.js";
-import { fetchJson } from "./http.js";
+import { fetchPatiently } from "./http.js";
 import { nearPlaces } from "./longitudes.js";
 import { flight } from "./telemetry.js";
 import { drawGaps, drawPlan } from "./map.js";
@@ -100,13 +100,9 @@ async function followPlan(hasNewExposures) {
   if (current !== mission || wantedRetakes !== retakes) {
     mission = current;
     retakes = wantedRetakes;
-    const received = current && await fetchJson("/api/v1/plan");
-    if (mission !== current) return;
-    // The link was lost, or the service refused: tried again.
-    if (current && !received) {
-      setTimeout(() => { if (mission === current) mission = null; }, REFRESH_MS);
-      return;
-    }
+    const isPresent = () => mission === current && retakes === wantedRetakes;
+    const received = current && await fetchPatiently("/api/v1/plan", isPresent);
+    if (!isPresent()) return;
     plan = received && { lines: placed(received.lines), retakes: placed(received.retakes) };
     hasPlan = Boolean(received?.lines);
     gapsFound = shownAdvice = null;
