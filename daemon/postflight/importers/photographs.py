@@ -93,7 +93,9 @@ def import_photographs(
     """
     if out.exists():
         raise ImagesError([f"{out}: is there already; give the path of a new mission folder"])
-    photographs = read_photographs(folder, focal_mm=focal_mm, pixel_um=pixel_um)
+    photographs, copies = _without_copies(
+        read_photographs(folder, focal_mm=focal_mm, pixel_um=pixel_um)
+    )
     heads = head_names(photographs)
     cameras = {name: photographs[heads.index(name)] for name in in_order(heads)}
     rig = rig_of(cameras)
@@ -112,7 +114,7 @@ def import_photographs(
             _write_exposure(part, number, (one, head), written, sha256_hex(content))
             if progress is not None:
                 progress(number, len(photographs))
-    notes = _notes(photographs, heads)
+    notes = (*_notes(photographs, heads), *copies)
     return ImportedPhotographs(Mission.open(out), tuple(photographs), heads, notes)
 
 
@@ -151,11 +153,27 @@ def read_photographs(
     if not problems and placed < POSITIONS_MIN:
         problems.append(
             f"{folder}: {placed} of {len(found)} photographs have a position in EXIF (GPSLatitude, "
-            f"GPSLongitude); {POSITIONS_MIN} are needed to place a block"
+            "GPSLongitude with GPSLatitudeRef N or S, GPSLongitudeRef E or W); "
+            f"{POSITIONS_MIN} are needed to place a block"
         )
     if problems:
         raise ImagesError(problems)
     return found
+
+
+def _without_copies(
+    photographs: Sequence[Photograph],
+) -> tuple[list[Photograph], tuple[str, ...]]:
+    """Each photograph once, that of the shortest name, and a sentence for each copy of its file."""
+    by_size = Counter(one.path.stat().st_size for one in photographs)
+    first: dict[str, Path] = {}
+    copies: dict[Path, str] = {}
+    for one in sorted(photographs, key=lambda one: (len(one.path.name), one.path.name)):
+        if by_size[one.path.stat().st_size] > 1:
+            original = first.setdefault(sha256_hex(one.path.read_bytes()), one.path)
+            if original != one.path:
+                copies[one.path] = f"{one.path.name} is a copy of {original.name} and left out."
+    return [one for one in photographs if one.path not in copies], tuple(copies.values())
 
 
 def is_photographs(mission: Mission) -> bool:

@@ -135,6 +135,23 @@ def test_every_camera_of_a_folder_is_a_head(tmp_path) -> None:
     assert (out / "L0/000004/C2.jpg").read_bytes() == other.read_bytes()
 
 
+def test_a_copy_of_a_photograph_is_left_out(tmp_path) -> None:
+    """The original keeps its name, by which control is measured, though the copy sorts before."""
+    folder = tmp_path / "copies"
+    folder.mkdir()
+    for number in USED[:3]:
+        reduced(number, folder)
+    original = min(folder.iterdir())
+    copy = folder / f"{original.stem} (1){original.suffix}"
+    copy.write_bytes(original.read_bytes())
+    assert min(folder.iterdir()) == copy
+    out = tmp_path / "out"
+    done = RUN.invoke(app, ["import", "photographs", str(folder), "--out", str(out), "--json"])
+    about = json.loads(done.stdout)
+    assert about["photographs"] == 3
+    assert f"{copy.name} is a copy of {original.name} and left out." in about["notes"]
+
+
 def test_photographs_of_a_zoom_lens_are_refused(tmp_path) -> None:
     for k in range(21):
         reduced(484, tmp_path, name=f"{k}.jpg", pixels=np.full((90, 120 + 4 * k, 3), 90, np.uint8))
@@ -178,7 +195,7 @@ def test_photographs_without_positions_or_focal_length_are_refused(tmp_path) -> 
         cv2.imwrite(str(bare / f"{k}.jpg"), np.full((600, 800, 3), 90, np.uint8))
     assert "--focal-mm" in refused(bare, tmp_path / "out")
     sentence = refused(bare, tmp_path / "out", "--focal-mm", "5", "--pixel-um", "5")
-    assert "0 of 3 photographs have a position" in sentence
+    assert "0 of 3 photographs have a position" in sentence and "GPSLatitudeRef N or S" in sentence
 
 
 def without_height(path: Path, xmp: str = "") -> None:

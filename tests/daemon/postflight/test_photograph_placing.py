@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -76,7 +78,12 @@ def test_positions_of_other_photographs_are_refused() -> None:
 
 
 def test_photographs_that_would_look_upward_are_refused() -> None:
-    """As where positions in one plane were those of a mirrored block."""
+    """Mirrored by exchanged coordinates or a wrong sign; nearly on a line, the roll is open."""
     own, position = flown()
-    with pytest.raises(TriangulationError, match="look upward"):
-        _placed(own, position * [-1.0, 1.0, 1.0])
+    for mirrored in (position[:, [1, 0, 2]], position * [-1.0, 1.0, 1.0]):
+        with pytest.raises(TriangulationError, match=r"look upward .* longitude are exchanged"):
+            _placed(own, mirrored)
+    narrow = position * [1.0, 0.1, 1.0]
+    turned = replace(own, station=own.station @ np.diag([1.0, 0.1, 1.0]))
+    with pytest.raises(TriangulationError, match="do not determine the attitude"):
+        _placed(turned, narrow * [-1.0, 1.0, 1.0])
