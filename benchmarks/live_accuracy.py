@@ -39,7 +39,7 @@ from processing.bundle.camera_orientations import camera_orientations
 from processing.bundle.initial_values import completed
 from processing.bundle.measured_points import measured_point
 from processing.geometry.rotation import vectors_from_rotations
-from processing.matching.block_matching import image_mm
+from processing.matching.block_matching import BlockMatching, image_mm
 from processing.rig import VirtualImage, shipped_rigs
 from sim_hw.processes.exposures import EPOCH_GPS_NS, FIRST_AFTER_S
 from sim_hw.world.flight import Pose, SimulatedFlight
@@ -178,11 +178,13 @@ def live(mission: Path) -> tuple[Orientations, Array, dict[str, Any]]:
     return found, block.image_sigma_px, figures
 
 
-def after_landing(mission: Path, trajectory: Path) -> tuple[Orientations, dict[str, Any]]:
-    """As `syntopic triangulate`."""
+def after_landing(
+    mission: Path, trajectory: Path, cells: tuple[int, int]
+) -> tuple[Orientations, dict[str, Any]]:
+    """As `syntopic triangulate`, with a grid of that many features."""
     begun = time.perf_counter()
     block = block_of(Mission.open(mission), trajectory_file=trajectory)
-    settings = TriangulationSettings()
+    settings = TriangulationSettings(matching=BlockMatching(cells=cells))
     tied = match_mission_block(block, settings.matching)
     project = weight_by_residuals(project_of(block, tied, settings), tied.points)
     done = adjust(completed(project.network), project.settings)
@@ -286,6 +288,10 @@ def main() -> None:
     parser.add_argument("--crossings", type=int, default=2)
     parser.add_argument("--points", type=int, default=120)
     parser.add_argument("--seed", type=int, default=5)
+    parser.add_argument(
+        "--cells", type=int, nargs=2, default=BlockMatching().cells,
+        help="columns and rows of features of an image after landing",
+    )  # fmt: skip
     parser.add_argument("--folder", type=Path, default=None, help="where the mission is kept")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="syntopic-bench-") as temporary:
@@ -295,7 +301,8 @@ def main() -> None:
         points = ground_points(flown, options.points, options.seed, sigma_px=MEASURED_PX)
         image = flown.world.image
         at_landing, sigma_px, flight = live(flown.mission)
-        final, landed = after_landing(flown.mission, write_navigation(flown))
+        columns, rows = options.cells
+        final, landed = after_landing(flown.mission, write_navigation(flown), (columns, rows))
         found = {
             "exposures": len(flown.marks),
             "gsd_m": flown.world.plan.gsd_m,

@@ -3,7 +3,7 @@
 Lines flown there and back are rendered as the ideal camera sees them, with shot noise and errors of
 navigation. The process of the live triangulation receives one exposure after the other at the frame
 interval, as the service sends them. `--exposures-in-memory` instead lays one picture along many
-lines and measures the memory of the map alone.
+lines and measures memory of the map alone, and time of its last levelling and of its files.
 """
 
 from __future__ import annotations
@@ -20,6 +20,12 @@ import numpy as np
 
 from daemon.cli.benchmark.measurement import machine
 from daemon.configuration.model import TriangulationSection
+from daemon.onboard.live_orthomosaic.delivery import (
+    COG_FILE,
+    PMTILES_FILE,
+    write_cog,
+    write_map,
+)
 from daemon.onboard.live_orthomosaic.live_orthomosaic import LiveOrthomosaic
 from daemon.onboard.live_orthomosaic.map_ground import PlaneGround
 from daemon.onboard.live_orthomosaic.tile_files import TileFiles
@@ -143,7 +149,20 @@ def remember(folder: Path, rig_name: str, count: int, each: int = 100) -> dict[s
         seconds.append(time.perf_counter() - before)
         if number % (count // 5) == 0:
             memory[str(number)] = _resident_mb() - begun
+    landing_s, cpu = [time.perf_counter()], [time.process_time()]
+    for name in (names := ("level", "cog", "pmtiles")):
+        if name == "level":
+            live.level(orientations, live.ground)
+            live.publish_levelled()
+        elif name == "cog":
+            write_cog(live, folder / COG_FILE, {})
+        else:
+            write_map(live, folder / PMTILES_FILE, {})
+        landing_s.append(time.perf_counter())
+        cpu.append(time.process_time())
     return {
+        "landing_s": dict(zip(names, np.diff(landing_s).tolist(), strict=True)),
+        "landing_cpu_s": dict(zip(names, np.diff(cpu).tolist(), strict=True)),
         "rig": rig_name,
         "exposures": count,
         "memory_mb": memory,

@@ -24,7 +24,7 @@ from processing.bundle.flown_network import (
 from processing.bundle.frame_patterns import FramePatterns
 from processing.bundle.initial_values import intersect
 from processing.bundle.network import CameraModel, ImagePoints, Images, Network, Points
-from processing.bundle.residual_weights import block_settings
+from processing.bundle.residual_weights import block_settings, weighted_by_residuals
 from processing.geometry.rotation import vectors_from_rotations
 
 Array = NDArray[np.float64]
@@ -33,8 +33,6 @@ Indices = NDArray[np.int64]
 _IMAGE_GROUPS: Final = (0, 1)
 _GNSS_GROUPS: Final = (4, 5)
 _ATTITUDE_GROUP: Final = 6
-_WEIGHT_ROUNDS: Final = 4
-_WEIGHT_CHANGED: Final = 0.1
 
 
 @dataclass(frozen=True)
@@ -159,14 +157,12 @@ def adjust_as_after_landing(
 ) -> BlockAdjustment:
     """Adjust a whole block as the triangulation after landing does.
 
-    Blunders are found with weights that fall with the residual, and image points have the standard
-    deviations that their residuals show. Where those to begin with are right to a tenth in
-    variance, it takes one adjustment.
+    Blunders are found with weights that fall with the residual.
 
     Args:
         f_mm: principal distance.
         measured: orientations of the images.
-        ties: image points, with the sigmas to begin with.
+        ties: image points, with the sigmas of `sigma_by_residuals`.
         xyz_m: (p, 3) starting values.
         prior: of the mounting; None holds it.
         start: as of `adjust_images`.
@@ -181,16 +177,41 @@ def adjust_as_after_landing(
     Source: docs/explanation/mathematics/bundle.md#adjustment.
     """
     network, points = _network(f_mm, measured, ties, xyz_m, prior, start, patterns)
-    done = _of(adjust(network, block_settings()), points, prior)
-    for _ in range(_WEIGHT_ROUNDS):
-        factor = np.array(done.image_factors)
-        if (np.abs(factor - 1.0) < _WEIGHT_CHANGED).all():
-            break
-        table = network.image_points
-        weighted = replace(table, sigma_mm=table.sigma_mm * np.sqrt(factor))
-        network = replace(network, image_points=weighted)
-        done = _of(adjust(network, block_settings()), points, prior)
-    return done
+    return _of(adjust(network, block_settings()), points, prior)
+
+
+def sigma_by_residuals(
+    f_mm: float,
+    measured: MeasuredOrientations,
+    ties: TieObservations,
+    xyz_m: Array,
+    prior: MountingPrior | None,
+    *,
+    start: tuple[Array, Array] | None = None,
+    patterns: Sequence[FramePatterns | None] = (),
+) -> tuple[float, float]:
+    """Standard deviations of image coordinates, as the triangulation after landing finds them.
+
+    Args:
+        f_mm: principal distance.
+        measured: orientations of the images.
+        ties: image points, with sigmas to begin with.
+        xyz_m: (p, 3) starting values.
+        prior: of the mounting; None holds it.
+        start: as of `adjust_images`.
+        patterns: as of `adjust_images`.
+
+    Returns:
+        Of x and y, mm.
+
+    Raises:
+        NetworkError, RankDefectError: as `processing.bundle.adjust.adjust`.
+    """
+    network, _ = _network(f_mm, measured, ties, xyz_m, prior, start, patterns)
+    matched = np.ones(len(ties.image), dtype=bool)
+    weighted = weighted_by_residuals(network, block_settings(), matched)
+    x, y = weighted.image_points.sigma_mm[0]
+    return float(x), float(y)
 
 
 def _network(

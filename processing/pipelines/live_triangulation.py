@@ -17,10 +17,14 @@ from processing import ProcessingError
 from processing.bundle.block_adjustment import (
     BlockAdjustment,
     TieObservations,
+    adjust_as_after_landing,
     adjust_images,
     intersected,
+    sigma_by_residuals,
 )
 from processing.bundle.flown_network import MeasuredOrientations, MountingPrior
+from processing.bundle.frame_patterns import FramePatterns
+from processing.bundle.residual_weights import TIE_SIGMA_PX
 from processing.geometry.rotation import rotations_from_vectors
 from processing.matching.block_matching import image_mm
 from processing.matching.growing_block import GrowingBlock, GrowingSettings, ImageTies
@@ -30,16 +34,16 @@ from processing.rig import VirtualImage
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 Source = Literal["measured", "window", "block"]
+Kind = Literal["window", "block", "landing"]
 
-_FACTOR_RANGE: Final = (0.25, 9.0)
-_FACTOR_CHANGED: Final = 0.3
-"""A variance factor that differs more from one repeats the adjustment with the new weights."""
-_WEIGHT_ROUNDS: Final = 3
+_FEW_IMAGES: Final = 100
+"""Of fewer images the weights are estimated in each adjustment of the block."""
 _WINDOW_ROUNDS: Final = 2
 _BLOCK_ROUNDS: Final = 8
 _MIN_RAYS: Final = 2
 _FLOOR_SIGMA_PX: Final = 0.02
-"""Relief within a patch displaces its matches by about this much, alike in neighbouring images."""
+"""Least sigma in flight. Relief within a patch displaces its matches by about this much, alike in
+neighbouring images; a block that grows has few of them."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +57,8 @@ class LiveSettings:
         neighbours: images of earlier lines that take part, those with most common points.
         points_per_image: that are adjusted; the ones with most rays.
         images_max: latest images that are adjusted as one block; bounds time and memory.
+        patterns_max: amplitudes of patterns of stitching in one adjustment; of a larger block the
+            patterns of each image that hold most of its variance.
         image_sigma_px: of an image coordinate, to begin with.
     """
 
@@ -62,7 +68,8 @@ class LiveSettings:
     neighbours: int = 6
     points_per_image: int = 40
     images_max: int = 600
-    image_sigma_px: float = 0.03
+    patterns_max: int = 1500
+    image_sigma_px: float = TIE_SIGMA_PX
 
 
 @dataclass(frozen=True)
@@ -78,6 +85,7 @@ class MeasuredImage:
         position_sigma_m, attitude_sigma_rad: (3,), the latter about the camera's axes.
         velocity_mps: (3,) in the same frame, NaN if unknown.
         temperature_c: of the camera, NaN if unknown.
+        patterns: what stitching may have left in it; None if that is not known.
     """
 
     number: int
@@ -89,6 +97,7 @@ class MeasuredImage:
     attitude_sigma_rad: Array
     velocity_mps: Array
     temperature_c: float = math.nan
+    patterns: FramePatterns | None = None
 
 
 @dataclass(frozen=True)
@@ -141,6 +150,7 @@ class LiveTriangulation:
         self.last_images: Indices = np.zeros(0, dtype=np.int64)
         self.problems: list[str] = []
         self._sigma_px = np.full(2, self.settings.image_sigma_px)
+        self._weighted_by = 0
 
     @property
     def image_sigma_px(self) -> Array:
@@ -177,21 +187,31 @@ class LiveTriangulation:
         Returns:
             The adjustment; None if it failed (`problems`) or if there are fewer than two images.
         """
+        return self._adjust_latest("block")
+
+    def land(self) -> BlockAdjustment | None:
+        """Adjust the latest `images_max` images as the triangulation after landing does.
+
+        Returns:
+            The adjustment, that of `adjust_block` if this one fails (`problems`); None as there.
+        """
+        before = len(self.problems)
+        done = self._adjust_latest("landing")
+        if done is None:
+            failed = self.problems[before:]
+            done = self.adjust_block()
+            self.problems += [one for one in failed if one not in self.problems]
+        return done
+
+    def _adjust_latest(self, kind: Kind) -> BlockAdjustment | None:
         count = len(self.images)
         own = np.arange(max(0, count - self.settings.images_max), count)
         if len(own) < 2:
             return None
-        done = self._adjust(own, "block")
-        if done is None:
-            return None
-        for _ in range(_WEIGHT_ROUNDS):
-            factor = np.clip(done.image_factors, *_FACTOR_RANGE)
-            if (np.abs(factor - 1.0) < _FACTOR_CHANGED).all():
-                break
-            self._sigma_px = np.maximum(self._sigma_px * np.sqrt(factor), _FLOOR_SIGMA_PX)
-            done = self._adjust(own, "block") or done
-        self.last, self.last_images = done, own
-        self.problems.clear()
+        done = self._adjust(own, kind)
+        if done is not None:
+            self.last, self.last_images = done, own
+            self.problems.clear()
         return done
 
     def tied_points(self) -> tuple[Indices, Array, Array]:
@@ -258,8 +278,17 @@ class LiveTriangulation:
             image[keep].astype(np.int64),
             point[keep],
             image_mm(self.image, px[keep]),
-            (self._sigma_px[0] * self.image.pitch_mm, self._sigma_px[1] * self.image.pitch_mm),
+            (self.settings.image_sigma_px * self.image.pitch_mm,) * 2,
         )
+
+    def _weights_are_old(self, images: int) -> bool:
+        """Whether the sigmas of image coordinates follow from few of the block's images."""
+        return images < _FEW_IMAGES or images >= 2 * self._weighted_by
+
+    def _sigma_mm(self, kind: Kind) -> tuple[float, float]:
+        floor = 0.0 if kind == "landing" else _FLOOR_SIGMA_PX
+        x, y = np.maximum(self._sigma_px, floor) * self.image.pitch_mm
+        return float(x), float(y)
 
     def _measured(self, own: Indices) -> MeasuredOrientations:
         """Orientations as measured, also of images that were adjusted before: adjusted ones share
@@ -272,7 +301,20 @@ class LiveTriangulation:
             np.array([one.attitude_sigma_rad for one in images]),
         )
 
-    def _adjust(self, own: Indices, source: Source) -> BlockAdjustment | None:
+    def _patterns(self, own: Indices) -> list[FramePatterns | None]:
+        """Patterns of stitching of images, as many of each as the block may have.
+
+        They are in the order of their variance.
+        """
+        most = self.settings.patterns_max // len(own)
+        result: list[FramePatterns | None] = []
+        for one in (self.images[k].patterns for k in own):
+            if one is not None and one.count > most:
+                one = replace(one, coefficients=one.coefficients[:most])
+            result.append(one if one is not None and one.count else None)
+        return result
+
+    def _adjust(self, own: Indices, kind: Kind) -> BlockAdjustment | None:
         ties = self._observations(own)
         if not len(ties.image):
             return None
@@ -288,17 +330,26 @@ class LiveTriangulation:
         ties = replace(ties, image=ties.image[seen], point=ties.point[seen], xy_mm=ties.xy_mm[seen])
         if not len(ties.image):
             return None
-        prior = self.settings.prior
-        measured = self._measured(own)
+        measured, f_mm, prior = self._measured(own), self.image.f_mm, self.settings.prior
+        patterns = self._patterns(own) if kind != "window" else []
         try:
-            done = adjust_images(
-                self.image.f_mm, measured, ties, xyz, prior, start=start,
-                rounds=_BLOCK_ROUNDS if source == "block" else _WINDOW_ROUNDS,
-            )  # fmt: skip
+            if kind != "window" and self._weights_are_old(len(own)):
+                sigma_mm = sigma_by_residuals(
+                    f_mm, measured, ties, xyz, prior, start=start, patterns=patterns
+                )
+                self._sigma_px = np.array(sigma_mm) / self.image.pitch_mm
+                self._weighted_by = len(own)
+            ties = replace(ties, sigma_mm=self._sigma_mm(kind))
+            given = (f_mm, measured, ties, xyz, prior)
+            if kind == "landing":
+                done = adjust_as_after_landing(*given, start=start, patterns=patterns)
+            else:
+                rounds = _BLOCK_ROUNDS if kind == "block" else _WINDOW_ROUNDS
+                done = adjust_images(*given, start=start, rounds=rounds, patterns=patterns)
         except ProcessingError as error:
-            self.problems.append(f"image {self.images[-1].number}, {source}: {error}")
+            self.problems.append(f"image {self.images[-1].number}, {kind}: {error}")
             return None
-        self._put(own, source, done, ties)
+        self._put(own, "window" if kind == "window" else "block", done, ties)
         return done
 
     def _put(

@@ -10,6 +10,7 @@ import numpy as np
 
 from daemon.onboard.triangulation.drifts import MOUNTING, Drift
 from daemon.onboard.triangulation.exposure_ranges import ranges
+from daemon.onboard.triangulation.heading_check import headings_off, typical_off
 from processing.bundle.adjust import Adjustment
 from processing.bundle.statistics import ObservationGroup
 from processing.pipelines.live_triangulation import LiveTriangulation
@@ -27,6 +28,8 @@ LEFT_OUT_SHARE: Final = 0.25
 """Of the exposures; fewer attitudes or positions that were left out are single blunders."""
 HEIGHT_MODEL_SIGMAS: Final = 3.0
 HEIGHT_MODEL_MIN_M: Final = 5.0
+GROUND_CHANGED_SHARE: Final = 0.1
+"""Of the tie points."""
 
 LOST: Final = "lost, no head delivered an image"
 NOT_SEALED: Final = "it is not sealed"
@@ -56,11 +59,27 @@ class TriangulationFinding:
 @dataclass(frozen=True)
 class HeightModelCheck:
     """Tie points against the configured height model: median difference and its standard deviation
-    in m; `problem` where the model cannot be used."""
+    in m; `share_off` of the points differ from the median by more than the limit of a wrong model;
+    `problem` where the model cannot be used."""
 
     difference_m: float | None = None
     sigma_m: float | None = None
     problem: str = ""
+    share_off: float = 0.0
+
+    @property
+    def limit_m(self) -> float:
+        """The largest difference that is not a contradiction."""
+        return height_limit_m(self.sigma_m or 0.0)
+
+
+def height_limit_m(sigma_m: float) -> float:
+    """The largest difference from a height model that is not a contradiction.
+
+    Args:
+        sigma_m: median standard deviation of tie points in height.
+    """
+    return max(HEIGHT_MODEL_MIN_M, HEIGHT_MODEL_SIGMAS * sigma_m)
 
 
 @dataclass(frozen=True)
@@ -76,6 +95,7 @@ class BlockTies:
         problems: sentences of adjustments that failed.
         attitudes_left_out, positions_left_out: exposures whose measured attitude or position the
             adjustment left out.
+        headings_off_deg: by image, see `headings_off`; empty if they were not compared.
     """
 
     numbers: tuple[int, ...]
@@ -87,6 +107,7 @@ class BlockTies:
     problems: tuple[str, ...] = ()
     attitudes_left_out: tuple[int, ...] = ()
     positions_left_out: tuple[int, ...] = ()
+    headings_off_deg: tuple[float, ...] = ()
 
     @property
     def untied_numbers(self) -> tuple[int, ...]:
@@ -140,6 +161,14 @@ def live_ties(live: LiveTriangulation) -> BlockTies:
             else left_out_exposures(
                 live.last.result, [live.images[k].number for k in live.last_images]
             )
+        ),
+        headings_off_deg=tuple(
+            headings_off(
+                [one.line for one in live.images],
+                np.array([one.time_s for one in live.images]),
+                np.array([one.position_m for one in live.images]).reshape(-1, 3),
+                np.array([one.rotation for one in live.images]).reshape(-1, 3, 3),
+            ).tolist()
         ),
     )
 
@@ -223,15 +252,30 @@ def _untied(block: BlockTies) -> list[TriangulationFinding]:
     numbers = block.untied_numbers
     if not numbers:
         return []
-    return [
+    found = [
         TriangulationFinding(
             "UNTIED_EXPOSURES",
             f"Exposures {ranges(numbers)} do not tie to their neighbours (water, cloud, uniform "
-            "ground, no overlap, or another exposure's image). Do not rely on more than their "
-            "measured orientation. Fly a cross line over land, or fly them again.",
+            "ground, no overlap, another exposure's image, or a wrong measured orientation). Do "
+            "not rely on more than their measured orientation. Fly a cross line over land, or "
+            "fly them again.",
             numbers,
         )
     ]
+    # What ties has a right heading, wherever the nose points.
+    off = dict(zip(block.numbers, block.headings_off_deg, strict=False))
+    turned = tuple(number for number in numbers if off.get(number))
+    if len(turned) >= MIN_LEFT_OUT:
+        found.append(
+            TriangulationFinding(
+                "HEADING_CONTRADICTED",
+                f"The headings of exposures {ranges(turned)} do not fit the direction of flight, "
+                f"by {typical_off(np.array([off[k] for k in turned]))} degrees. Check the sign and "
+                "the zero of the inertial unit's heading, and [mount].",
+                turned,
+            )
+        )
+    return found
 
 
 def _lines(block: BlockTies) -> list[TriangulationFinding]:
@@ -276,7 +320,7 @@ def _contradicted(block: BlockTies, drifts: Sequence[Drift]) -> list[Triangulati
         ("Attitudes", "ATTITUDE_CONTRADICTED", block.attitudes_left_out,
          "Check the inertial unit's alignment and mounting."),
         ("Positions", "GNSS_CONTRADICTED", block.positions_left_out,
-         "Check the receiver's corrections."),
+         "Check the receiver's corrections, and whether its clock or the event marks stepped."),
     ):  # fmt: skip
         if len(numbers) >= max(MIN_LEFT_OUT, LEFT_OUT_SHARE * len(block.numbers)):
             found.append(
@@ -320,9 +364,22 @@ def _contradicted(block: BlockTies, drifts: Sequence[Drift]) -> list[Triangulati
             name = "PRINCIPAL_DISTANCE"
             cure = "Calibrate the camera, or run `syntopic triangulate MISSION --interior`."
         elif one.name.startswith("time offset"):
-            name, cure = "TIME_OFFSET", "Check the event mark's edge and [mount] time_offset_ms."
+            name, cure = (
+                "TIME_OFFSET",
+                (
+                    "Check the event mark's edge, the receiver's clock, and time_offset_ms and "
+                    "antenna_m in [mount]: at one speed, a wrong lever arm along the flight is "
+                    "the same."
+                ),
+            )
         elif one.name.startswith("boresight"):
-            name, cure = "BORESIGHT_CHANGED", "Calibrate the boresight after landing."
+            name, cure = (
+                "BORESIGHT_CHANGED",
+                (
+                    "Calibrate the boresight after landing, and check the sign of antenna_m in "
+                    "[mount]: at one flying height, a wrong lever arm is the same."
+                ),
+            )
         else:
             name, cure = "LEVER_ARM_CHANGED", "Check antenna_m in [mount]."
         found.append(
@@ -344,9 +401,18 @@ def _heights(check: HeightModelCheck | None) -> list[TriangulationFinding]:
         ]
     if check.difference_m is None or check.sigma_m is None:
         return []
-    limit_m = max(HEIGHT_MODEL_MIN_M, HEIGHT_MODEL_SIGMAS * check.sigma_m)
-    if abs(check.difference_m) <= limit_m:
-        return []
+    if abs(check.difference_m) <= check.limit_m:
+        if check.share_off < GROUND_CHANGED_SHARE:
+            return []
+        return [
+            TriangulationFinding(
+                "GROUND_CHANGED",
+                f"{100.0 * check.share_off:.0f} % of the tie points lie more than "
+                f"{check.limit_m:.1f} m from the height model, the others fit: it is older than "
+                "the ground there, or without its buildings and trees. Do not rely on places in "
+                "the orthomosaic there, or give a newer model ([plan] elevation).",
+            )
+        ]
     return [
         TriangulationFinding(
             "HEIGHT_MODEL_CONTRADICTED",

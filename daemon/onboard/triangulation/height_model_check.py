@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from daemon import DaemonError
 from daemon.configuration.model import PlanSection
-from daemon.onboard.triangulation.findings import HeightModelCheck
+from daemon.onboard.triangulation.findings import HeightModelCheck, height_limit_m
 from daemon.orientation.local_frame import LocalFrame
 from daemon.planning.relief import TerrainRelief, relief_of
 
@@ -42,4 +42,6 @@ def check_heights(
     known = known[np.isfinite(known)]
     if not len(known):
         return HeightModelCheck(problem="it does not cover the block")
-    return HeightModelCheck(float(np.median(known)), float(np.median(sigma_m[:, 2])))
+    median, sigma = float(np.median(known)), float(np.median(sigma_m[:, 2]))
+    off = np.abs(known - median) > height_limit_m(sigma)
+    return HeightModelCheck(median, sigma, share_off=float(off.mean()))

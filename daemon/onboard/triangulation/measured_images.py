@@ -12,6 +12,7 @@ from daemon.orientation.exterior_orientation import ExteriorOrientation, Navigat
 from daemon.orientation.in_flight_orientation import recorded_orientations
 from daemon.orientation.local_frame import LocalFrame
 from daemon.orientation.navigation_sigmas import NavigationSigmas
+from processing.bundle.frame_patterns import FramePatterns
 from processing.pipelines.live_triangulation import MeasuredImage
 from processing.rig import Rig
 
@@ -25,7 +26,11 @@ def oriented(
 
 
 def measured_image(
-    exposure: Exposure, eo: ExteriorOrientation, frame: LocalFrame, sigmas: NavigationSigmas
+    exposure: Exposure,
+    eo: ExteriorOrientation,
+    frame: LocalFrame,
+    sigmas: NavigationSigmas,
+    patterns: FramePatterns | None = None,
 ) -> MeasuredImage:
     """The measured orientation in a local frame; sigmas of the receiver where it states them."""
     here = (np.array(eo.latitude_deg), np.array(eo.longitude_deg), np.array(eo.height_m))
@@ -46,6 +51,7 @@ def measured_image(
         sigmas.about_camera_rad,
         velocity,
         camera_temperature_c(exposure),
+        patterns,
     )
 
 

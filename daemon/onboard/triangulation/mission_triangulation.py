@@ -31,6 +31,7 @@ from daemon.onboard.triangulation.control_points import (
     residuals_of,
 )
 from daemon.onboard.triangulation.drifts import Drift, live_drifts
+from daemon.onboard.triangulation.exposure_patterns import exposure_patterns
 from daemon.onboard.triangulation.findings import (
     CUT_OFF,
     LOST,
@@ -196,7 +197,8 @@ class MissionTriangulation:
                 np.array(self.plan.ground_height_m),
             )
             self.live = LiveTriangulation(image, float(ground[2]), self.settings)
-        measured = measured_image(exposure, eo, self.frame, self.sigmas)
+        patterns = exposure_patterns(self.mission, number)
+        measured = measured_image(exposure, eo, self.frame, self.sigmas, patterns)
         above_m = max(float(measured.position_m[2]) - self.live.block.ground_m, 0.0)
         width_m = image.width_px * image.pitch_mm / image.f_mm * above_m
         measured = replace(measured, line=self._lines.name(measured, width_m))
@@ -217,7 +219,10 @@ class MissionTriangulation:
             self._find()
             return
         begun = time.perf_counter()
-        self.live.adjust_block()
+        if self.has_landed:
+            self.live.land()
+        else:
+            self.live.adjust_block()
         self.block_seconds = time.perf_counter() - begun
         self.block_count += 1
         self._find()

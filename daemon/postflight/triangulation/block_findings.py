@@ -21,6 +21,7 @@ from daemon.onboard.triangulation.findings import (
     findings_of,
     left_out_exposures,
 )
+from daemon.onboard.triangulation.heading_check import headings_off
 from daemon.onboard.triangulation.height_model_check import check_heights, read_relief
 from daemon.orientation.exterior_orientation import mount_of
 from daemon.planning.plan_readers import read_plan
@@ -124,7 +125,16 @@ def block_ties(block: ImageBlock, tied: BlockTiePoints, result: Adjustment) -> B
         result.groups,
         (),
         *left_out_exposures(result, [block.oriented[k].exposure for k in block.arrangement.first]),
+        headings_off_deg=_headings_off(block, lines),
     )
+
+
+def _headings_off(block: ImageBlock, lines: tuple[str, ...]) -> tuple[float, ...]:
+    """Of stitched images; heads look wherever they are mounted."""
+    if not all(eo.is_virtual for eo in block.oriented):
+        return ()
+    time_s = np.array([eo.gps_ns - block.oriented[0].gps_ns for eo in block.oriented]) * 1e-9
+    return tuple(headings_off(lines, time_s, block.station_m, block.rotation).tolist())
 
 
 def _with_all_navigation(result: Adjustment) -> Adjustment:

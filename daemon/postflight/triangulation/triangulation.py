@@ -35,7 +35,6 @@ from daemon.postflight.adjustment.project_file import ProjectFile
 from daemon.postflight.triangulation.head_arrangement import HeadArrangement, arrangement_of
 from daemon.postflight.triangulation.measured_points import MeasuredPoints, no_measured_points
 from daemon.postflight.triangulation.stitching_of_exposures import stitching_patterns_of
-from processing.bundle.adjust import AdjustmentSettings, adjust
 from processing.bundle.flown_network import (
     MOUNTING,
     FlownExposures,
@@ -45,7 +44,6 @@ from processing.bundle.flown_network import (
     flown_exposures,
 )
 from processing.bundle.gauss_newton import Progress
-from processing.bundle.initial_values import completed
 from processing.bundle.network import (
     CameraModel,
     ImagePoints,
@@ -53,14 +51,18 @@ from processing.bundle.network import (
     Network,
     Points,
 )
+from processing.bundle.residual_weights import (
+    REJECT_BEYOND,
+    TIE_SIGMA_PX,
+    block_settings,
+    weighted_by_residuals,
+)
 from processing.bundle.self_calibration import SetName, parts_of, with_self_calibration
 from processing.matching.block_matching import BlockMatching, BlockTiePoints, image_mm
 from processing.pipelines.perspective import perspective_of
 from processing.rig import Rig, VirtualImage, load_rig
 
 Array = NDArray[np.float64]
-
-TIE_SIGMA_PX = 0.03
 
 
 class TriangulationError(DaemonError, ValueError):
@@ -82,7 +84,7 @@ class TriangulationSettings:
     sigmas: NavigationSigmas = field(default_factory=NavigationSigmas)
     drift: GnssDrift = "none"
     patterns: bool = True
-    reject_beyond: float = 4.0
+    reject_beyond: float = REJECT_BEYOND
     matching: BlockMatching = field(default_factory=BlockMatching)
 
 
@@ -307,9 +309,7 @@ def project_of(
         measured_attitudes=flown.measured_attitudes,
         patterns=stitching_patterns_of(block.mission, block.oriented) if options.patterns else (),
     )
-    settings = AdjustmentSettings(
-        robust=True, reject_beyond=options.reject_beyond, variance_components=True
-    )
+    settings = replace(block_settings(options.reject_beyond), variance_components=True)
     checks = CheckPoints(
         tuple(name for name, c in zip(surveyed.names, control, strict=True) if not c),
         surveyed.xyz_m[~control],
@@ -345,30 +345,14 @@ def _flown(
 def weight_by_residuals(project: Project, ties: int, progress: Progress | None = None) -> Project:
     """The project with the sigma of matched coordinates as matching shows it.
 
-    Adjusted without measured points; these keep the sigma they were given, and would otherwise be
-    scaled with coordinates many times better than theirs.
-
     Raises:
         NetworkError, RankDefectError: as `processing.bundle.adjust.adjust`.
     """
-    network = project.network
-    table = network.image_points
-    own = table.point < ties
-    unweighted = replace(
-        network,
-        image_points=ImagePoints(
-            table.image[own], table.point[own], table.xy_mm[own], table.sigma_mm[own]
-        ),
-        points=replace(network.points, sigma_m=np.full_like(network.points.sigma_m, np.nan)),
+    network = weighted_by_residuals(
+        project.network, project.settings, project.network.image_points.point < ties, progress
     )
-    settings = replace(project.settings, reject_beyond=None, variance_components=True)
-    found = adjust(completed(unweighted), settings, progress=progress)
-    factor = [found.factors.get(name, 1.0) for name in ("image x", "image y")]
-    scale = np.where(own[:, None], np.sqrt(factor), 1.0)
     return replace(
-        project,
-        network=replace(network, image_points=replace(table, sigma_mm=table.sigma_mm * scale)),
-        settings=replace(project.settings, variance_components=False),
+        project, network=network, settings=replace(project.settings, variance_components=False)
     )
 
 
