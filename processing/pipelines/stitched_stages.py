@@ -35,6 +35,7 @@ from processing.pipelines.product import PipelineSettings
 from processing.quality.band_levels import level_figures
 from processing.quality.block_sides import sides_of_blocks
 from processing.quality.common_windows import measure_common_windows
+from processing.quality.confirmed_ground import confirmed_ground_figures
 from processing.quality.defect_lines import defect_line_figures, defect_lines
 from processing.quality.figures import FigureGroup
 from processing.quality.figures.circumstances import ParallaxFigures
@@ -161,6 +162,7 @@ def figures_of(
             explained=_explained_frames(adjusted),
         )
     )
+    yield confirmed_ground_figures(rig, level1, tie_points, image.registrations)
     yield relative_sharpness_figures(rig, start, level1)
     yield step_figures(steps)
     yield defect_line_figures(defect_lines(rig.sensors, means))

@@ -48,6 +48,18 @@ class OtherGroundFigures(FigureGroup):
 
 
 @dataclass(frozen=True)
+class ConfirmedGroundFigures(FigureGroup):
+    """How much of a frame other heads show as well."""
+
+    confirmed_least_fraction: Annotated[
+        float | None,
+        "share of the 8 by 8 parts of a frame where points match those of another head, of the "
+        "frame that has the least; in the others a part of another exposure may stay unseen",
+    ] = None
+    confirmed_least_sensor: Annotated[str | None, "which frame that is"] = None
+
+
+@dataclass(frozen=True)
 class UnreadFigures(FigureGroup):
     """Pixels that were not read out."""
 
