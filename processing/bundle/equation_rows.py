@@ -85,9 +85,18 @@ class RowBuilder:
         weight: Array | None = None,
         axis: int = 0,
     ) -> None:
-        """Append rows (n,); entries are (columns (n, k), values (n, k)).
+        """Append rows; an observation with an infinite sigma has none.
 
-        An observation with an infinite sigma has no row.
+        Args:
+            misclosure: observed less computed, shape (n,).
+            sigma: standard deviations, shape (n,).
+            group: index into `GROUPS`, shape (n,).
+            source: row of the table the observation comes from, shape (n,).
+            entries: columns, -1 where held, and derivatives by them, each of shape (n, k).
+            point: position among the eliminated points, -1 where there is none, shape (n,).
+            point_part: derivatives by that point, shape (n, 3).
+            weight: factor on the weight, shape (n,); None: one.
+            axis: coordinate of the row of the table.
         """
         taken = np.isfinite(sigma)
         n = int(taken.sum())
@@ -120,6 +129,11 @@ class RowBuilder:
         self.count += n
 
     def equations(self) -> Equations:
+        """All rows.
+
+        Returns:
+            The rows in the order in which they were appended.
+        """
         joined = [np.concatenate(part) for part in self._tables]
         shape = (self.count, self.layout.columns)
         if self._entries:

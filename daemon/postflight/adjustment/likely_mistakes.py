@@ -21,7 +21,7 @@ from processing import ProcessingError
 from processing.bundle.adjust import Adjustment, AdjustmentSettings, adjust
 from processing.bundle.camera_model import principal_distance_mm
 from processing.bundle.initial_values import completed
-from processing.bundle.network import Network, NetworkError
+from processing.bundle.network import Network, NetworkError, no_distances, no_gnss
 from processing.bundle.rank_diagnosis import RankDefect
 
 SUSPICIOUS_SIGMA0: Final = 20.0
@@ -33,6 +33,9 @@ _BETTER: Final = 0.2
 _MAX_ITERATIONS: Final = 15
 _OTHER_DISTANCE: Final = 1.2
 """Ratio of principal distances from which another one is tried."""
+
+_CONSTANT: Final = 5.0
+"""Mean difference in height over the others from which it is that of two height systems."""
 
 _UNITS: Final = (
     (1000.0, "millimetres"),
@@ -65,6 +68,8 @@ def likely_mistakes(network: Network, sigma0: float | None) -> list[str]:
         or _another_principal_distance(network, sigma0)
         or _control_of_another_unit(network)
         or misplaced_control(network)
+        or _contradicting_distances(network, sigma0)
+        or _contradicting_positions(network, sigma0)
     )
 
 
@@ -177,6 +182,49 @@ def _another_principal_distance(network: Network, sigma0: float | None) -> list[
         f"the principal distance is wrong: estimated, it is {', '.join(found)} and sigma0 is "
         f"{result.sigma0:.4g}"
     ]
+
+
+def _contradicting_distances(network: Network, sigma0: float | None) -> list[str]:
+    """The distance that is farthest off, where the block without distances is good."""
+    given = network.distances
+    if not len(given.point_a):
+        return []
+    result = _explaining(replace(network, distances=no_distances()), sigma0)
+    if result is None:
+        return []
+    xyz, names = result.state.points, network.points.names
+    length = np.linalg.norm(xyz[given.point_b] - xyz[given.point_a], axis=1)
+    worst = int(np.argmax(np.abs(given.distance_m - length) / given.sigma_m))
+    return [
+        f"distances contradict the other observations, without them sigma0 is {result.sigma0:.4g}: "
+        f"{names[given.point_a[worst]]} to {names[given.point_b[worst]]} is given as "
+        f"{given.distance_m[worst]:.6g} m and adjusted to {length[worst]:.6g} m"
+    ]
+
+
+def _contradicting_positions(network: Network, sigma0: float | None) -> list[str]:
+    """By how much antenna positions are off, where the block without them is good."""
+    given = network.gnss
+    if not len(given.station):
+        return []
+    result = _explaining(replace(network, gnss=no_gnss()), sigma0)
+    if result is None:
+        return []
+    rotation = result.state.attitude[given.attitude]
+    antenna = result.state.station[given.station]
+    antenna = antenna + np.einsum("nij,nj->ni", rotation, given.lever_m)
+    mean = (given.position_m - antenna).mean(axis=0)
+    spread = (given.position_m - antenna).std(axis=0)
+    sentence = (
+        "antenna positions contradict the other observations, without them sigma0 is "
+        f"{result.sigma0:.4g}: on average they are {mean[0]:.3g}, {mean[1]:.3g}, {mean[2]:.3g} m "
+        f"off in X, Y, Z (standard deviations {spread[0]:.2g}, {spread[1]:.2g}, {spread[2]:.2g} m)"
+    )
+    if abs(mean[2]) > _CONSTANT * max(spread[2], abs(mean[0]), abs(mean[1])):
+        sentence += ": are they ellipsoidal heights, and the control points' above sea level?"
+    elif (spread > np.abs(mean)).any():
+        sentence += ": is their unit another one, or are X and Y exchanged?"
+    return [sentence]
 
 
 def _mirrored(network: Network, sigma0: float | None) -> list[str]:

@@ -17,7 +17,15 @@ from daemon.postflight.adjustment.project_file import AdjustSection, CameraSecti
 from daemon.postflight.adjustment.project_writer import write_project
 from daemon.postflight.adjustment.separate_blocks import separate_blocks
 from processing.bundle.adjust import adjust
-from processing.bundle.network import Attitudes, ImagePoints, Images, Network, Points, Stations
+from processing.bundle.network import (
+    Attitudes,
+    Distances,
+    ImagePoints,
+    Images,
+    Network,
+    Points,
+    Stations,
+)
 from processing.bundle.rank_diagnosis import RankDefectError
 from processing.geometry.rotation import rotation_matrix
 from tests.processing.bundle.simulated_networks import aerial
@@ -84,6 +92,43 @@ def test_a_control_point_20_m_off_is_named(block) -> None:
     wrong = replace(block, points=replace(block.points, xyz_m=xyz))
     (sentence,) = likely_mistakes(wrong, 50.0)
     assert "but p4 by " in sentence and "exchanged" not in sentence
+
+
+@pytest.fixture(scope="module")
+def with_positions() -> Network:
+    """The block with antenna positions of 5 cm and a distance."""
+    simulated = aerial(seed=3, sigma_mm=1e-3, points=40, gnss_sigma_m=0.05)
+    length = float(np.linalg.norm(simulated.points[10] - simulated.points[11]))
+    distances = Distances(np.array([10]), np.array([11]), np.array([length]), np.array([0.01]))
+    return replace(simulated.network, distances=distances)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda xyz: xyz + np.array([0.0, 0.0, 47.0]), "ellipsoidal heights"),
+        (lambda xyz: xyz[:, [1, 0, 2]], "X and Y exchanged"),
+        (lambda xyz: xyz / 0.3048, "unit another one"),
+    ],
+)
+def test_antenna_positions_that_contradict_are_named_with_their_offset(
+    with_positions, change, words
+) -> None:
+    gnss = with_positions.gnss
+    wrong = replace(with_positions, gnss=replace(gnss, position_m=change(gnss.position_m)))
+    (sentence,) = likely_mistakes(wrong, 100.0)
+    assert sentence.startswith("antenna positions contradict") and words in sentence
+    if "ellipsoidal" in words:
+        assert ", 47 m off in X, Y, Z" in sentence
+
+
+def test_a_distance_that_contradicts_is_named_with_the_adjusted_one(with_positions) -> None:
+    given = with_positions.distances
+    wrong = replace(with_positions, distances=replace(given, distance_m=10.0 * given.distance_m))
+    (sentence,) = likely_mistakes(wrong, 300.0)
+    length = float(given.distance_m[0])
+    assert "p10 to p11 is given as" in sentence
+    assert float(sentence.split("adjusted to ")[1].split()[0]) == pytest.approx(length, abs=0.3)
 
 
 def test_a_good_block_has_no_likely_mistake(block) -> None:
