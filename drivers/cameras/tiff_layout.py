@@ -1,7 +1,10 @@
 """Tags of a TIFF that change what its words mean: refused, since a frame is stored as it was read.
 
+A thumbnail of EXIF, a compressed JPEG without NewSubfileType, is no image of its own.
+
 Source: TIFF 6.0, sections 8 (Orientation, PhotometricInterpretation, NewSubfileType) and 5;
-TIFF/EP (ISO 12234-2) for colour filter arrays, DNG 1.6 for linear raw.
+EXIF 2.32, 4.5.5, for thumbnails; TIFF/EP (ISO 12234-2) for colour filter arrays, DNG 1.6 for
+linear raw.
 """
 
 from __future__ import annotations
@@ -50,6 +53,9 @@ def layout_problem(tiff: Any) -> str | None:
             further = pages[number]
         except IndexError:
             return None
-        if not int(further.subfiletype) & _REDUCED:
+        is_thumbnail = (
+            "JPEGInterchangeFormat" in further.tags and further.imagewidth < page.imagewidth
+        )
+        if not int(further.subfiletype) & _REDUCED and not is_thumbnail:
             return f"holds several images (page {number + 1}); write one frame a file"
     return f"holds more than {MAX_PAGES} pages; write one frame a file"

@@ -25,7 +25,7 @@ from processing.image.band_registration import band_placements
 from processing.pipelines.bands import BandPipeline, BandProduct
 from processing.quality.report import Flag, Verdict
 from processing.rig import load_rig
-from tests.daemon.multispectral_data import write_image, xmp
+from tests.daemon.multispectral_data import directory, entry, write_image, xmp
 
 RUN = CliRunner()
 SIZE = (320, 240)
@@ -309,6 +309,29 @@ def test_an_image_that_dji_dewarped_has_no_distortion_left(scene, tmp_path) -> N
         straight_px = corner - [170.5, 112.75]
         away_px = np.abs(ideal(rig, "G", corner) * 1913.333 - straight_px).max()
         assert away_px < 0.001 if is_straight else away_px > 0.3
+
+
+def test_a_thumbnail_of_exif_is_no_second_image(scene, tmp_path) -> None:
+    """A second directory with a compressed JPEG; one with words of its own is refused."""
+    path = tmp_path / "in/a.tif"
+    dji(path.parent, scene, "Green", "a.tif")
+    written = path.read_bytes()
+    at = int.from_bytes(written[4:8], "little")
+    link = at + 2 + 12 * int.from_bytes(written[at : at + 2], "little")
+
+    def with_second(entries: list) -> bytes:
+        data = written[:link] + len(written).to_bytes(4, "little") + written[link + 4 :]
+        return data + directory(entries, len(written))
+
+    thumbnail = [entry(259, "short", 6), entry(513, "long", 8), entry(514, "long", 100)]
+    path.write_bytes(with_second(thumbnail))
+    (camera,) = imported(path.parent, tmp_path / "out")
+    assert camera["frames"] == 1
+    sides = [entry(256, "long", 320), entry(257, "long", 240), entry(258, "short", 16)]
+    path.write_bytes(
+        with_second([*sides, entry(259, "short", 1), entry(273, "long", 8), entry(279, "long", 8)])
+    )
+    assert "holds several images (page 2)" in refused(path.parent, tmp_path / "two")
 
 
 def test_captures_of_a_sentera_6x_are_named_by_their_unique_id(scene, tmp_path) -> None:
