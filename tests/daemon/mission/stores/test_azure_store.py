@@ -8,7 +8,6 @@ from __future__ import annotations
 import base64
 import hashlib
 import hmac
-import json
 import shutil
 import socket
 import subprocess
@@ -20,14 +19,13 @@ from email.utils import formatdate
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
-from daemon.cli import app
 from daemon.mission.transfer.object_store import ObjectStore, ObjectStoreError
-from daemon.mission.transfer.store_products import commit_stored, is_stored, publish_stored
-from daemon.mission.transfer.store_transfer import transfer_to_store
-from daemon.mission.transfer.store_verification import verify_in_store
-from tests.daemon.diverging_camera import flown_mission
+from tests.daemon.mission.stores.store_behaviour import (
+    check_a_list_has_all_its_pages_and_a_removed_object_is_gone,
+    check_a_mission_is_copied_verified_and_processed,
+    check_of_many_writers_of_a_key_one_commits,
+)
 
 pytestmark = [pytest.mark.peer, pytest.mark.trust, pytest.mark.soak]
 ACCOUNT = "devstoreaccount1"
@@ -103,30 +101,15 @@ def create_container(endpoint: str, name: str) -> None:
 def test_a_mission_is_copied_verified_and_processed_in_a_container(
     container: str, tmp_path: Path
 ) -> None:
-    mission = flown_mission(tmp_path / "flown", (1, 2))
-    (mission.export_dir / "large.bin").write_bytes(bytes(range(256)) * 80_000)
-    report = transfer_to_store(mission, ObjectStore(container))
-    place = ObjectStore(report.target)
-    assert verify_in_store(place).problems == ()
-    assert transfer_to_store(mission, ObjectStore(container)).copied == 0
-    done = CliRunner().invoke(app, ["process", place.url, "--processes", "0", "--json"])
-    assert done.exit_code == 0, (done.output, done.exception)
-    assert json.loads(done.stdout)["done"] == 2
-    assert verify_in_store(place).problems == ()
-    again = CliRunner().invoke(app, ["process", place.url, "--processes", "0", "--json"])
-    assert json.loads(again.stdout)["complete_before"] == 2
+    check_a_mission_is_copied_verified_and_processed(container, tmp_path)
 
 
-def test_of_two_writers_of_a_key_one_commits_in_a_container(container: str) -> None:
-    place, key = ObjectStore(f"{container}/m"), "a" * 64
-    manifest, _ = publish_stored(place, 1, key, {"quality.json": [b"{}"]})
-    assert commit_stored(place, 1, manifest, {"host": "one"}) is True
-    assert commit_stored(place, 1, manifest, {"host": "two"}) is False
-    assert is_stored(place, 1, key)
-    assert place.create_small("x", b"one") is True
-    assert place.create_small("x", b"one") is False
-    with pytest.raises(ObjectStoreError, match="another content"):
-        place.create_small("x", b"two")
+def test_of_many_writers_of_a_key_one_commits_in_a_container(container: str) -> None:
+    check_of_many_writers_of_a_key_one_commits(container)
+
+
+def test_a_list_of_a_container_has_all_objects(container: str) -> None:
+    check_a_list_has_all_its_pages_and_a_removed_object_is_gone(container)
 
 
 def test_a_store_without_tls_is_refused_unless_it_is_permitted(
