@@ -159,13 +159,15 @@ def figures_of(
             image.registrations,
             settings=settings.tie_points,
             colour=settings.colour,
-            explained=_explained_frames(adjusted),
+            explained=_explained_frames(corrected, adjusted),
         )
     )
     yield confirmed_ground_figures(rig, level1, tie_points, image.registrations)
     yield relative_sharpness_figures(rig, start, level1)
     yield step_figures(steps)
-    yield defect_line_figures(defect_lines(rig.sensors, means))
+    # The defects of another head are not those that were filled.
+    own = [sensor for sensor in rig.sensors if sensor.name not in corrected.by_pattern]
+    yield defect_line_figures(defect_lines(own, means))
     yield block_figures(rig, limits, blocks)
     shared = measure_common_windows(rig, mosaic.placements, level1)
     yield local_blur_figures(rig, shared)
@@ -189,11 +191,11 @@ def figures_of(
     yield ParallaxFigures(parallax_px(rig, conditions, settings.relief_fraction))
 
 
-def _explained_frames(adjusted: AdjustedFrames) -> set[str]:
+def _explained_frames(corrected: CorrectedFrames, adjusted: AdjustedFrames) -> set[str]:
     """Frames of which the report knows why points of theirs do not match."""
     content = adjusted.content
     slipped = {slip.sensor for slip in adjusted.stitching.slips}
-    return {*content.mismatched, *content.shifted_px, *slipped}
+    return {*content.mismatched, *content.shifted_px, *slipped, *corrected.by_pattern}
 
 
 def misplaced_px(rig: Rig, content: ContentCheck) -> float:

@@ -116,6 +116,14 @@ def test_tie_points_that_an_edge_of_a_block_draws_are_no_slip_of_the_neighbour()
 
 
 @pytest.mark.trust
+def test_of_exchanged_bands_nothing_else_is_called_wrong() -> None:
+    case = Case(7, "bands-swapped", X, exposure=0, share=1.0, seed=10200007)
+    outcome = run(case)
+    assert outcome.description == "frames of B and R swapped"
+    assert outcome.result == "found" and outcome.named == {"exchanged": "B, R"}
+
+
+@pytest.mark.trust
 @pytest.mark.parametrize("kind", ["heads-swapped", "frame-copied"])
 def test_frames_of_heads_that_share_no_ground_are_known_by_their_fixed_pattern(kind: str) -> None:
     outcome = run(Case(0, kind, MIDAS, exposure=0, share=1.0, seed=7))
