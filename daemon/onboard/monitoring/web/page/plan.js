@@ -62,12 +62,18 @@ const rows = new VisibleRows(document.getElementById("segments"), (one) => cells
 
 function drawRows(found) {
   rows.table.closest(".scroll").hidden = !found.length;
-  rows.set(found.map((one) => ({ ...one, number: `${one.line} ${one.from_m}` })));
+  rows.set(found.map((one) => Object.assign(one, { number: `${one.line} ${one.from_m}` })));
 }
 
-// Gaps with their places next to those of the flight.
-const gapsOf = (advice) => advice.segments.filter((one) => one.kind === "hole").map((one) => ({ ...one, at: nearPlaces(one.at),
-  holes: one.holes.map((gap) => ({ ...gap, rings: gap.rings.map(nearPlaces) })) }));
+// Gaps of an advice, their places next to those of the flight. They are moved where they are: a copy would be held as well.
+function gapsOf(advice) {
+  const found = advice.segments.filter((one) => one.kind === "hole");
+  for (const one of found) {
+    one.at = nearPlaces(one.at);
+    for (const gap of one.holes) gap.rings = gap.rings.map(nearPlaces);
+  }
+  return found;
+}
 
 function drawCoverage() {
   const advice = shownAdvice;
