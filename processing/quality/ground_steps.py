@@ -189,6 +189,8 @@ def read_out_frames(
 def is_ground(steps: Sequence[LineStep], view: GroundView) -> bool:
     """Whether most of the other heads show the steps of a frame at their places of the ground.
 
+    What the frame shows there is step and ground; what of that another head shows is ground.
+
     Args:
         steps: of one frame along one axis.
         view: frames and places.
@@ -196,8 +198,11 @@ def is_ground(steps: Sequence[LineStep], view: GroundView) -> bool:
     Returns:
         False where no other head sees enough of them.
     """
-    shares = _shares_of_heads(steps, view)
-    return bool(shares) and float(np.median(list(shares.values()))) > MAX_SHARED
+    shares = []
+    for step in _separate(steps, view):
+        own, seen = _changes(step, view)
+        shares += [1.0 - (own - change) / step.relative for change in seen.values()]
+    return bool(shares) and float(np.median(shares)) > MAX_SHARED
 
 
 def is_drawn_by_step(
@@ -298,14 +303,20 @@ def _edges_on_ground(
 def _shares_of_heads(steps: Sequence[LineStep], view: GroundView) -> dict[str, float]:
     """What of the steps of a frame other colour heads, by name, and all PAN heads, "", show."""
     by_head: dict[str, list[float]] = {}
+    for step in _separate(steps, view):
+        own, seen = _changes(step, view)
+        for head, change in seen.items():
+            by_head.setdefault(head, []).append(change / own)
+    return {head: float(np.median(some)) for head, some in by_head.items()}
+
+
+def _separate(steps: Sequence[LineStep], view: GroundView) -> list[LineStep]:
+    """The largest steps of a frame that are compared with other heads."""
     reach = view.reach_px(steps[0].sensor) + 1.0
     lines = np.array([step.at for step in steps])
     # Between lines that step near each other, the sides of one lie beyond the next.
     separate = [s for s in steps if np.count_nonzero(np.abs(lines - s.at) < reach) == 1]
-    for step in sorted(separate, key=lambda step: -abs(step.relative))[:LINES]:
-        for head, share in _shares(step, view).items():
-            by_head.setdefault(head, []).append(share)
-    return {head: float(np.median(some)) for head, some in by_head.items()}
+    return sorted(separate, key=lambda step: -abs(step.relative))[:LINES]
 
 
 def _is_contradicted(name: str, shares: Mapping[str, float], view: GroundView) -> bool:
@@ -325,8 +336,9 @@ def _is_alone(shares: Mapping[str, float], view: GroundView) -> bool:
     return len(shares) == every and max(map(abs, shares.values())) < MAX_SHARED
 
 
-def _shares(step: LineStep, view: GroundView) -> dict[str, float]:
-    """What of one step other colour heads, by name, and all PAN heads together, "", show."""
+def _changes(step: LineStep, view: GroundView) -> tuple[float, dict[str, float]]:
+    """The change of the frame at one step, and what other colour heads, by name, and all PAN heads
+    together, "", show there; nothing where the frame does not show it."""
     sensor = view.rig.sensor(step.sensor)
     length = sensor.width_px if step.axis == "rows" else sensor.height_px
     along = np.linspace(2.0, length - 3.0, SAMPLES)
@@ -336,7 +348,7 @@ def _shares(step: LineStep, view: GroundView) -> dict[str, float]:
     own = signal_change(view.frames[step.sensor], placement, sides, own_reach, least=_HALF)
     # Of narrow bands of lines the sides may lie beyond the band: such a line shows nothing.
     if own is None or own * np.sign(step.relative) < _HALF * abs(step.relative):
-        return {}
+        return 0.0, {}
     ground = tuple(vip_mm_from_raw(placement, side) for side in sides)
     found: dict[str, float] = {}
     pan: list[float] = []
@@ -352,9 +364,9 @@ def _shares(step: LineStep, view: GroundView) -> dict[str, float]:
             frame, view.placements[name], (before, after), 1 if of_pan else 0, least=least
         )
         if seen is not None and of_pan:
-            pan.append(seen / own)
+            pan.append(seen)
         elif seen is not None:
-            found[name] = seen / own
+            found[name] = seen
     if pan:
         found[""] = float(np.median(pan))
-    return found
+    return own, found
