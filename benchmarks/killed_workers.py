@@ -306,7 +306,9 @@ def one_pace(pristine: Mission, root: Path, workers: int) -> dict[str, float]:
     else:
         with cluster(root.parent, workers, Killer()) as executor:
             outcome, pace = computed(mission, executor, notes, 0.0, workers)
-    assert not outcome.failures and pace is not None, outcome.failures
+    assert not outcome.failures, outcome.failures
+    if pace is None:
+        sys.exit("all was done before every process had loaded its work; give more --exposures")
     return vars(pace)
 
 
