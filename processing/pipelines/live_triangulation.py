@@ -41,6 +41,8 @@ _FEW_IMAGES: Final = 100
 _WINDOW_ROUNDS: Final = 2
 _BLOCK_ROUNDS: Final = 8
 _MIN_RAYS: Final = 2
+_ORIENTATION: Final = 6
+"""Unknowns of an image."""
 _FLOOR_SIGMA_PX: Final = 0.02
 """Least sigma in flight. Relief within a patch displaces its matches by about this much, alike in
 neighbouring images; a block that grows has few of them."""
@@ -57,8 +59,8 @@ class LiveSettings:
         neighbours: images of earlier lines that take part, those with most common points.
         points_per_image: that are adjusted; the ones with most rays.
         images_max: latest images that are adjusted as one block; bounds time and memory.
-        patterns_max: amplitudes of patterns of stitching in one adjustment; of a larger block the
-            patterns of each image that hold most of its variance.
+        unknowns_max: with patterns of stitching; of a larger block fewer of them, those of each
+            image that hold most of its variance.
         image_sigma_px: of an image coordinate, to begin with.
     """
 
@@ -68,7 +70,7 @@ class LiveSettings:
     neighbours: int = 6
     points_per_image: int = 40
     images_max: int = 600
-    patterns_max: int = 1500
+    unknowns_max: int = 3600
     image_sigma_px: float = TIE_SIGMA_PX
 
 
@@ -306,7 +308,7 @@ class LiveTriangulation:
 
         They are in the order of their variance.
         """
-        most = self.settings.patterns_max // len(own)
+        most = max(self.settings.unknowns_max // len(own) - _ORIENTATION, 0)
         result: list[FramePatterns | None] = []
         for one in (self.images[k].patterns for k in own):
             if one is not None and one.count > most:
