@@ -160,6 +160,10 @@ def triangulate(
 
     folder = Mission.open(mission)
     where.check()
+    if transfer and (points is None or measured is None or live):
+        raise ConfigurationError(
+            ["--transfer needs --points and --measured, the points to find, and is not of --live"]
+        )
     if live:
         from daemon.cli.triangulate_live import triangulate_live
 

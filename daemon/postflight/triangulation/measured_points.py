@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from daemon import DaemonError
 from daemon.orientation.local_frame import LocalFrame
 from daemon.postflight.adjustment.csv_tables import CsvTable, read_table
+from daemon.postflight.adjustment.plausibility import check_rows, check_sigmas
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -86,12 +87,30 @@ def read_measured_points(
     point = _index(seen, "point", names)
     px = np.array([seen.numbers("column_px"), seen.numbers("row_px")]).T.reshape(-1, 2)
     spread = np.array(seen.numbers("sigma_px", MEASURED_SIGMA_PX))
+    check_rows(table)
+    check_rows(seen)
+    check_sigmas(seen, ("sigma_px",))
+    _check_repeated(seen)
     problems = [*table.problems, *seen.problems]
     if problems or not np.isfinite(place).all() or not np.isfinite(px).all():
         raise MeasuredPointsError("; ".join(problems) or "an empty cell where a number is needed")
     return MeasuredPoints(
         tuple(names), tuple(roles), frame.from_geodetic(*place), sigma, image, point, px, spread
     )
+
+
+def _check_repeated(seen: CsvTable) -> None:
+    """Report a point that is measured twice in an image."""
+    first: dict[tuple[str, str], int] = {}
+    pairs = zip(seen.text("image"), seen.text("point"), strict=True)
+    for pair, line in zip(pairs, seen.lines, strict=True):
+        if pair in first:
+            seen.add_problem(
+                line,
+                f"image {pair[0]} measures point {pair[1]} a second time (line {first[pair]}); "
+                "leave one out",
+            )
+        first.setdefault(pair, line)
 
 
 def _index(table: CsvTable, column: str, names: Sequence[str]) -> Indices:
