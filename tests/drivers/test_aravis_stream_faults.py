@@ -34,7 +34,7 @@ def test_the_counter_that_grew_is_reported_alone(counter: str) -> None:
     assert remedy in found[0][1]
 
 
-def test_counters_that_stay_or_begin_anew_are_not_reported() -> None:
+def test_counters_that_stay_or_start_at_zero_are_not_reported() -> None:
     before = Counter(dict.fromkeys(EVENTS, 2))
     for now in (before, Counter()):
         assert not list(stream_faults("PAN-1", before, now, others="", byte_order="big"))

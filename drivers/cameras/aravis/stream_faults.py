@@ -52,7 +52,14 @@ def stream_faults(
 
 
 def restarted_sentence(head: str) -> str:
-    """What it means that the numbers of frames went backwards, and the remedy."""
+    """What it means that the numbers of frames went backwards, and the remedy.
+
+    Args:
+        head: name of the head.
+
+    Returns:
+        Sentences for the operator.
+    """
     return (
         f"The head {head} numbered its frames out of order, so they were dropped as old. The "
         "stream was restarted; one exposure may have no frame. Check the head's power supply and "
