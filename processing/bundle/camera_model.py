@@ -101,20 +101,43 @@ def interior_derivatives(camera: CameraModel, interior: Array, terms: Array, xy_
 def measured_by_ideal(camera: CameraModel, interior: Array, xy_mm: Array) -> Array | None:
     """d(measured) / d(ideal), which carries residuals of ideal coordinates to measured ones.
 
+    Ideal residuals shrink with a correction that makes the image smaller, such as a longer
+    principal distance of `australis`: their sum of squares prefers it, residuals as measured do
+    not.
+
     Args:
         camera: model, principal point and principal distance.
         interior: the ten, shape (10,).
         xy_mm: measured, shape (n, 2), mm.
 
     Returns:
-        Shape (n, 2, 2); None for models that correct measured coordinates: their residuals are of
-        ideal ones, which are as large.
+        Shape (n, 2, 2); None for `centred`, whose published results have residuals of ideal
+        coordinates.
 
-    Source: docs/explanation/mathematics/bundle.md#forward-models.
+    Source: docs/explanation/mathematics/bundle.md#residuals.
     """
-    if camera.model not in FORWARD:
+    if camera.model == "centred":
         return None
-    return np.asarray(np.linalg.inv(forward_derivatives(camera, interior, xy_mm)[1]))
+    if camera.model in FORWARD:
+        return np.asarray(np.linalg.inv(forward_derivatives(camera, interior, xy_mm)[1]))
+    about = _about_given(camera, xy_mm)
+    return _inverse(_ideal_by_measured(camera, interior, about[:, 0], about[:, 1]))
+
+
+def _ideal_by_measured(camera: CameraModel, interior: Array, x: Array, y: Array) -> Array:
+    """d(ideal) / d(measured) of `australis`, without the additional terms."""
+    affine = np.array([[1.0 + interior[8], interior[9]], [0.0, 1.0]])
+    scale = np.eye(2) * interior[2] / camera.f_mm
+    return np.asarray(affine + _by_place(interior, x, y) + scale)
+
+
+def _inverse(matrix: Array) -> Array:
+    """Of matrices of two rows, (n, 2, 2)."""
+    a, b, c, d = matrix[:, 0, 0], matrix[:, 0, 1], matrix[:, 1, 0], matrix[:, 1, 1]
+    result = np.empty_like(matrix)
+    result[:, 0, 0], result[:, 0, 1], result[:, 1, 0], result[:, 1, 1] = d, -b, -c, a
+    result /= (a * d - b * c)[:, None, None]
+    return result
 
 
 def term_derivatives(camera: CameraModel, interior: Array, terms: Array, xy_mm: Array) -> Array:
@@ -134,11 +157,11 @@ def term_derivatives(camera: CameraModel, interior: Array, terms: Array, xy_mm: 
     place = _about_given(camera, xy_mm)
     moved = np.stack([term_design(term, place) for term in camera.terms], axis=2)
     xy_mm = _placed(camera, terms, xy_mm)
-    affine = np.array([[1.0 + interior[8], interior[9]], [0.0, 1.0]])
     if camera.model == "australis":
         x, y = xy_mm[:, 0] - camera.xp_mm, xy_mm[:, 1] - camera.yp_mm
-        through = affine + _by_place(interior, x, y) + np.eye(2) * interior[2] / camera.f_mm
+        through = _ideal_by_measured(camera, interior, x, y)
     else:
+        affine = np.array([[1.0 + interior[8], interior[9]], [0.0, 1.0]])
         x, y, _ = _centred(camera, interior, xy_mm)
         through = (np.eye(2) + _by_place(interior, x, y)) @ affine
     return np.asarray(through @ moved)

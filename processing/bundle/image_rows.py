@@ -16,7 +16,7 @@ from processing.bundle.camera_model import (
 from processing.bundle.curvature_refraction import corrected_rays
 from processing.bundle.equation_rows import RowBuilder, columns_where
 from processing.bundle.exposure_motion import RowMotion, row_motion, time_columns
-from processing.bundle.network import Network
+from processing.bundle.network import CameraModel, Network
 from processing.bundle.unknowns import ParameterLayout, ParameterValues
 from processing.geometry.rotation import skew
 
@@ -24,6 +24,8 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 _ROWS_AT_ONCE = 50_000
+_NEWTON_STEPS = 4
+_AT_REST_MM = 1e-6
 
 
 class BehindCameraError(ProcessingError, ValueError):
@@ -111,13 +113,14 @@ def _camera_rows(
     c = principal_distance_mm(camera, interior)
     projected = -c * seen[:, :2] / seen[:, 2:]
     measured_mm = measured.xy_mm[rows]
-    misclosure = ideal_mm(camera, interior, state.terms[index], measured_mm) - projected
     patterns = _pattern_design(network, image, measured_mm) if network.patterns else None
+    target = projected
     if patterns is not None:
-        misclosure = misclosure - np.einsum("nak,nk->na", patterns, state.pattern[image])
-    to_measured = measured_by_ideal(camera, interior, measured_mm)
-    if to_measured is not None:
-        misclosure = np.einsum("nij,nj->ni", to_measured, misclosure)
+        target = projected + np.einsum("nak,nk->na", patterns, state.pattern[image])
+    terms = state.terms[index]
+    misclosure, adjusted_mm, to_measured = _misclosures(
+        camera, interior, terms, measured_mm, target
+    )
     entries: list[tuple[Indices, Array]] = []
     by_point = np.zeros((len(rows), 2, 3))
     if build.derivatives:
@@ -138,7 +141,7 @@ def _camera_rows(
             (layout.retained_points[point], by_point),
         ]
         if (layout.interior[index] >= 0).any():
-            by_interior = -interior_derivatives(camera, interior, state.terms[index], measured_mm)
+            by_interior = -interior_derivatives(camera, interior, terms, adjusted_mm)
             if camera.model == "centred":
                 by_interior[:, :, 2] = -projected / c
             elif camera.model != "australis":
@@ -147,7 +150,7 @@ def _camera_rows(
             blocks.append((columns, by_interior))
         if camera.terms:
             columns = np.broadcast_to(layout.terms[index], (len(rows), len(camera.terms)))
-            by_term = -term_derivatives(camera, interior, state.terms[index], measured_mm)
+            by_term = -term_derivatives(camera, interior, terms, adjusted_mm)
             blocks += _active(columns, by_term)
         if patterns is not None:
             blocks.append((layout.pattern[image], patterns))
@@ -178,6 +181,34 @@ def _camera_rows(
             axis=axis,
         )
     return rows[:0]
+
+
+def _misclosures(
+    camera: CameraModel, interior: Array, terms: Array, measured_mm: Array, target: Array
+) -> tuple[Array, Array, Array | None]:
+    """Misclosures, where derivatives are taken, and d(measured) / d(ideal) there.
+
+    With `australis` both are those of adjusted image points, whose ideal coordinates are the
+    target: derivatives at what was measured would share its errors with the misclosures.
+
+    Source: docs/explanation/mathematics/bundle.md#residuals.
+    """
+    adjusted_mm = measured_mm
+    if camera.model != "australis":
+        misclosure = ideal_mm(camera, interior, terms, measured_mm) - target
+        to_measured = measured_by_ideal(camera, interior, measured_mm)
+        if to_measured is not None:
+            misclosure = np.einsum("nij,nj->ni", to_measured, misclosure)
+        return misclosure, measured_mm, to_measured
+    for _ in range(_NEWTON_STEPS):
+        to_measured = measured_by_ideal(camera, interior, adjusted_mm)
+        assert to_measured is not None
+        left = ideal_mm(camera, interior, terms, adjusted_mm) - target
+        step = np.einsum("nij,nj->ni", to_measured, left)
+        adjusted_mm = adjusted_mm - step
+        if np.abs(step).max(initial=0.0) < _AT_REST_MM:
+            break
+    return measured_mm - adjusted_mm, adjusted_mm, to_measured
 
 
 def _pattern_design(network: Network, image: Indices, xy_mm: Array) -> Array:

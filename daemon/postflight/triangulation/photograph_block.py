@@ -22,7 +22,10 @@ from daemon.orientation.geodesy import utm_of
 from daemon.orientation.georeference import Georeference
 from daemon.orientation.local_frame import LocalFrame
 from daemon.postflight.batch.batch_run import StepCompute, in_this_process
-from daemon.postflight.triangulation.photograph_matching import Photograph, matched_photographs
+from daemon.postflight.triangulation.photograph_matching import (
+    UnmatchedPhotograph,
+    matched_photographs,
+)
 from daemon.postflight.triangulation.triangulation import ImageBlock, TriangulationError
 from processing.bundle.incremental_orientation import (
     OrientedBlock,
@@ -130,7 +133,7 @@ def photograph_block_of(
     camera_of = np.array([heads[exposure.frames[0].sensor] for exposure in exposures], np.int64)
     features, pairs = matched_photographs(
         mission,
-        [Photograph(one, sizes[k]) for one, k in zip(exposures, camera_of, strict=True)],
+        [UnmatchedPhotograph(one, sizes[k]) for one, k in zip(exposures, camera_of, strict=True)],
         candidate_pairs(position),
         compute,
     )

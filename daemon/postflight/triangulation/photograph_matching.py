@@ -36,7 +36,7 @@ DETECTOR_NBYTES: Final = 1_000_000_000
 
 
 @dataclass(frozen=True)
-class Photograph:
+class UnmatchedPhotograph:
     """A photograph whose features are to be found; payload of a task."""
 
     exposure: Exposure
@@ -45,7 +45,7 @@ class Photograph:
 
 @dataclass(frozen=True)
 class PhotographMatchingWork:
-    """The number of a task is that of its photograph, the payload a `Photograph` or its partners.
+    """The number of a task is that of its photograph, the payload itself or its partners.
 
     `folder` has the features of each photograph.
     """
@@ -83,7 +83,7 @@ class PhotographMatchingAction:
             OSError: the disk refused.
         """
         work, number = self._work, task.number
-        if isinstance(task.payload, Photograph):
+        if isinstance(task.payload, UnmatchedPhotograph):
             pixels = original_pixels(
                 work.mission, task.payload.exposure, task.payload.image, grey=True
             )
@@ -97,7 +97,7 @@ class PhotographMatchingAction:
 
 def matched_photographs(
     mission: Mission,
-    photographs: Sequence[Photograph],
+    photographs: Sequence[UnmatchedPhotograph],
     candidates: Sequence[tuple[int, int]],
     compute: StepCompute,
 ) -> tuple[list[ImageFeatures], Pairs]:

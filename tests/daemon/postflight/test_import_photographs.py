@@ -274,7 +274,18 @@ def triangulated(triangulated_block) -> tuple[Path, dict]:
 
 @pytest.fixture(scope="module")
 def block(triangulated_block) -> PhotographBlock:
-    return triangulated_block[2]
+    """Adjusted without control, so that points of it as control contradict no photograph."""
+    found = triangulated_block[2]
+    project = photograph_project(
+        found, no_control(), position_sigma_m=(3.0, 3.0, 5.0), reject_beyond=3.5
+    )
+    state = adjust(completed(project.network), project.settings).state
+    return replace(
+        found,
+        block=replace(found.block, station_m=state.station, rotation=state.attitude),
+        xyz_m=state.points,
+        cameras=(replace(found.cameras[0], interior=state.interior[0]),),
+    )
 
 
 def test_photographs_are_triangulated_without_attitudes(triangulated) -> None:

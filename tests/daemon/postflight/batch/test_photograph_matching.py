@@ -22,7 +22,7 @@ from daemon.postflight.batch.batch_run import (
 from daemon.postflight.batch.executor import BatchExecutor, BatchTask, BatchWork
 from daemon.postflight.batch.local_processes import LocalProcessExecutor
 from daemon.postflight.triangulation.photograph_matching import (
-    Photograph,
+    UnmatchedPhotograph,
     matched_photographs,
     original_pixels,
 )
@@ -36,7 +36,7 @@ PAIRS = [(0, 1), (0, 2), (1, 3), (2, 3)]
 
 
 @pytest.fixture(scope="module")
-def flown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Mission, list[Photograph]]:
+def flown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Mission, list[UnmatchedPhotograph]]:
     """Four photographs of one ground of blobs, each shifted by a third."""
     mission = Mission(tmp_path_factory.mktemp("field"), "field")
     noise = np.random.default_rng(5).normal(0.0, 1.0, (500, 900)).astype(np.float32)
@@ -49,7 +49,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Mission, list[Photo
         pixels = grey[top : top + IMAGE.height_px, left : left + IMAGE.width_px]
         cv2.imwrite(str(mission.level0(number) / "C1.png"), pixels)
         exposure: Any = SimpleNamespace(number=number, frames=[SimpleNamespace(file="C1.png")])
-        photographs.append(Photograph(exposure, IMAGE))
+        photographs.append(UnmatchedPhotograph(exposure, IMAGE))
     return mission, photographs
 
 
@@ -60,13 +60,13 @@ def on(executor: BatchExecutor) -> StepCompute:
     return lambda _step: compute
 
 
-def matched(flown: tuple[Mission, list[Photograph]], compute: StepCompute) -> list[bytes]:
+def matched(flown: tuple[Mission, list[UnmatchedPhotograph]], compute: StepCompute) -> list[bytes]:
     features, pairs = matched_photographs(*flown, PAIRS, compute)
     assert not list(flown[0].export_dir.iterdir())  # the features are removed
     return [*(one.px.tobytes() for one in features), *(p.tobytes() for p in pairs.values())]
 
 
-def test_matches_are_those_of_one_call(flown: tuple[Mission, list[Photograph]]) -> None:
+def test_matches_are_those_of_one_call(flown: tuple[Mission, list[UnmatchedPhotograph]]) -> None:
     mission, photographs = flown
     direct = [
         features_of(original_pixels(mission, one.exposure, one.image, grey=True))
@@ -84,13 +84,15 @@ def test_matches_are_those_of_one_call(flown: tuple[Mission, list[Photograph]]) 
 
 
 @pytest.mark.soak
-def test_processes_match_with_the_same_bytes(flown: tuple[Mission, list[Photograph]]) -> None:
+def test_processes_match_with_the_same_bytes(
+    flown: tuple[Mission, list[UnmatchedPhotograph]],
+) -> None:
     own = matched(flown, lambda _step: in_this_process)
     assert matched(flown, lambda _step: on(LocalProcessExecutor(2))("")) == own
 
 
 def test_a_photograph_that_cannot_be_read_is_named(
-    flown: tuple[Mission, list[Photograph]], tmp_path: Path
+    flown: tuple[Mission, list[UnmatchedPhotograph]], tmp_path: Path
 ) -> None:
     mission = Mission(tmp_path, "empty")
     with pytest.raises(TriangulationError, match=r"C1\.png: no image that can be decoded"):
