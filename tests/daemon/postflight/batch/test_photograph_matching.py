@@ -31,12 +31,14 @@ from processing.matching.photograph_tracks import features_of, match_photographs
 from processing.rig import VirtualImage
 from tests.daemon.postflight.batch.test_commands_on_executors import OtherProcess
 
+Flown = tuple[Mission, list[UnmatchedPhotograph]]
+
 IMAGE = VirtualImage(360, 270, 5.0, 5.0)
 PAIRS = [(0, 1), (0, 2), (1, 3), (2, 3)]
 
 
 @pytest.fixture(scope="module")
-def flown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Mission, list[UnmatchedPhotograph]]:
+def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
     """Four photographs of one ground of blobs, each shifted by a third."""
     mission = Mission(tmp_path_factory.mktemp("field"), "field")
     noise = np.random.default_rng(5).normal(0.0, 1.0, (500, 900)).astype(np.float32)
@@ -60,13 +62,13 @@ def on(executor: BatchExecutor) -> StepCompute:
     return lambda _step: compute
 
 
-def matched(flown: tuple[Mission, list[UnmatchedPhotograph]], compute: StepCompute) -> list[bytes]:
+def matched(flown: Flown, compute: StepCompute) -> list[bytes]:
     features, pairs = matched_photographs(*flown, PAIRS, compute)
     assert not list(flown[0].export_dir.iterdir())  # the features are removed
     return [*(one.px.tobytes() for one in features), *(p.tobytes() for p in pairs.values())]
 
 
-def test_matches_are_those_of_one_call(flown: tuple[Mission, list[UnmatchedPhotograph]]) -> None:
+def test_matches_are_those_of_one_call(flown: Flown) -> None:
     mission, photographs = flown
     direct = [
         features_of(original_pixels(mission, one.exposure, one.image, grey=True))
@@ -85,15 +87,13 @@ def test_matches_are_those_of_one_call(flown: tuple[Mission, list[UnmatchedPhoto
 
 @pytest.mark.soak
 def test_processes_match_with_the_same_bytes(
-    flown: tuple[Mission, list[UnmatchedPhotograph]],
+    flown: Flown,
 ) -> None:
     own = matched(flown, lambda _step: in_this_process)
     assert matched(flown, lambda _step: on(LocalProcessExecutor(2))("")) == own
 
 
-def test_a_photograph_that_cannot_be_read_is_named(
-    flown: tuple[Mission, list[UnmatchedPhotograph]], tmp_path: Path
-) -> None:
+def test_a_photograph_that_cannot_be_read_is_named(flown: Flown, tmp_path: Path) -> None:
     mission = Mission(tmp_path, "empty")
     with pytest.raises(TriangulationError, match=r"C1\.png: no image that can be decoded"):
         matched_photographs(mission, flown[1], PAIRS, lambda _step: in_this_process)
