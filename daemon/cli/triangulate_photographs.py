@@ -141,4 +141,8 @@ def triangulate_photographs(
 
 def _principal_distance(camera: Mapping[str, Any]) -> str:
     sigma = f"+- {camera['f_sigma_px']:.1f} px" if camera["f_sigma_px"] > 0.0 else "px (held)"
-    return f"f {camera['f_px']:.1f} {sigma} of {camera['camera']} (EXIF {camera['f_exif_px']:.1f})"
+    text = f"f {camera['f_px']:.1f} {sigma} of {camera['camera']} (EXIF {camera['f_exif_px']:.1f})"
+    if not camera["principal_point_estimated"]:
+        return text
+    x, y = camera["principal_point_free"]["point_px"]
+    return f"{text}, principal point {x:+.1f} columns and {y:+.1f} rows from the middle"

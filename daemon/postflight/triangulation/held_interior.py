@@ -17,7 +17,7 @@ import numpy as np
 
 from daemon.postflight.adjustment.adjusted_project import used_network
 from processing.bundle.adjust import Adjustment, AdjustmentSettings, adjust
-from processing.bundle.network import INTERIOR, NetworkError
+from processing.bundle.network import INTERIOR, CameraModel, NetworkError
 from processing.bundle.rank_diagnosis import RankDefectError
 
 SIGNIFICANT: Final = 4.0
@@ -68,22 +68,14 @@ def free_principal_point(
         The change of each camera; None where that adjustment has no solution.
     """
     network, state = used_network(result), result.state
-    pitch_mm = [camera.pixel_mm or 1e-3 for camera in network.cameras]
+    if all(camera.free.issuperset(_POINT) for camera in network.cameras):
+        return _changes(result, result)
+    cameras = with_principal_point(network.cameras, longer_side_px)
     network = replace(
         network,
         cameras=tuple(
-            replace(
-                camera,
-                interior=interior,
-                free=camera.free | set(_POINT),
-                sigma={
-                    **camera.sigma,
-                    **dict.fromkeys(_POINT, PRINCIPAL_POINT_SHARE * side * pitch),
-                },
-            )
-            for camera, interior, side, pitch in zip(
-                network.cameras, state.interior, longer_side_px, pitch_mm, strict=True
-            )
+            replace(camera, interior=interior)
+            for camera, interior in zip(cameras, state.interior, strict=True)
         ),
         stations=replace(network.stations, position_m=state.station),
         attitudes=replace(network.attitudes, rotation=state.attitude),
@@ -96,12 +88,44 @@ def free_principal_point(
         free = adjust(network, _SETTINGS, progress=progress)
     except (NetworkError, RankDefectError):
         return None
+    return _changes(result, free)
+
+
+def with_principal_point(
+    cameras: Sequence[CameraModel], longer_side_px: Sequence[int]
+) -> tuple[CameraModel, ...]:
+    """The cameras with an unknown principal point, which is observed in the middle.
+
+    Args:
+        cameras: of photographs; without a pixel size it is 1 um.
+        longer_side_px: of the photographs of each camera; the standard deviation is 1 % of it.
+    """
+    return tuple(
+        replace(
+            camera,
+            free=camera.free | set(_POINT),
+            sigma={
+                **camera.sigma,
+                **dict.fromkeys(_POINT, PRINCIPAL_POINT_SHARE * side * _pitch_mm(camera)),
+            },
+        )
+        for camera, side in zip(cameras, longer_side_px, strict=True)
+    )
+
+
+def _pitch_mm(camera: CameraModel) -> float:
+    return camera.pixel_mm or 1e-3
+
+
+def _changes(held: Adjustment, free: Adjustment) -> tuple[FreePrincipalPoint, ...]:
+    """Of each camera, from one adjustment to the other."""
     at = {name: INTERIOR.index(name) for name in ("df", *_POINT)}
     found = []
-    for k, pitch in enumerate(pitch_mm):
-        columns = free.layout.interior[k]
-        change = state.interior[k][at["df"]] - free.state.interior[k][at["df"]]
-        x, y = (float(free.state.interior[k][at[name]]) / pitch for name in _POINT)
+    for k, camera in enumerate(held.network.cameras):
+        pitch = _pitch_mm(camera)
+        columns, interior = free.layout.interior[k], free.state.interior[k]
+        change = held.state.interior[k][at["df"]] - interior[at["df"]]
+        x, y = (float(interior[at[name]]) / pitch for name in _POINT)
         sx, sy = (
             free.sigma0
             * float(np.sqrt(free.cofactor[columns[at[name]], columns[at[name]]]))

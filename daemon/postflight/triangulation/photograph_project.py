@@ -1,6 +1,7 @@
 """The adjustment of a block of photographs: network, report section, adjusted rig.
 
-Principal distance and distortion are estimated with the orientations, the principal point is held.
+Principal distance and distortion are estimated with the orientations. The principal point is held,
+except where control points determine it.
 Positions of EXIF are observations; their standard deviations are estimated as variance components,
 and with control their common shift, such as that between heights above the ellipsoid and the geoid.
 """
@@ -18,9 +19,11 @@ from daemon.postflight.adjustment.project import CheckPoints, Project
 from daemon.postflight.adjustment.project_file import AdjustSection, CameraSection, ProjectFile
 from daemon.postflight.triangulation.control_mistakes import shift_to_control, unmeasured
 from daemon.postflight.triangulation.ground_control import GroundControl
-from daemon.postflight.triangulation.held_interior import FreePrincipalPoint
+from daemon.postflight.triangulation.held_interior import (
+    FreePrincipalPoint,
+    with_principal_point,
+)
 from daemon.postflight.triangulation.photograph_block import (
-    FREE,
     PhotographBlock,
     provisional_camera,
 )
@@ -48,6 +51,7 @@ TIE_SIGMA_PX: Final = 0.7
 _ROLL_MAX_DEG: Final = 1.0
 ITERATIONS_MAX: Final = 300
 """Blocks of few lines without control come to rest slowly."""
+_CONTROL_OF_PRINCIPAL_POINT: Final = 3
 EXIF_LINE: Final = "EXIF"
 """The positions of EXIF as one line, whose common shift against the control is unknown."""
 OWN_INTERIOR_MIN: Final = 5
@@ -85,6 +89,10 @@ def photograph_project(
     spread = np.concatenate([np.full(len(tied.image), TIE_SIGMA_PX), control.sigma_px])
     spread *= np.array([size.pitch_mm for size in found.sizes])[found.camera_of[image]]
     cameras = _cameras(found)
+    if _determines_principal_point(control):
+        cameras = with_principal_point(
+            cameras, [max(size.width_px, size.height_px) for size in found.sizes]
+        )
     every = np.arange(n)
     placed = np.flatnonzero(np.isfinite(found.position_m[:, 0]))
     network = Network(
@@ -134,7 +142,7 @@ def photograph_project(
                 pixel_um=size.pitch_um,
                 width_px=size.width_px,
                 height_px=size.height_px,
-                free=FREE,
+                free=tuple(name for name in INTERIOR if name in camera.free),
                 sigma=dict(camera.sigma),
             )
             for camera, size in zip(cameras, found.sizes, strict=True)
@@ -321,6 +329,7 @@ def _camera_section(
         "f_px": (size.f_mm - df_mm) / size.pitch_mm,
         "f_sigma_px": sigma_px,
         "principal_point_free": None if free is None else vars(free),
+        "principal_point_estimated": int(result.layout.interior[camera][0]) >= 0,
         "f_depends_on_principal_point": free is not None and free.contradicts(sigma_px),
     }
 
@@ -456,6 +465,13 @@ def _places_block(control: GroundControl) -> bool:
     is_control = np.array([role == "control" for role in control.roles], dtype=bool)
     views = np.bincount(control.point, minlength=len(control.names))[is_control]
     return bool((views >= 2).any() or (views >= 1).sum() >= 3)
+
+
+def _determines_principal_point(control: GroundControl) -> bool:
+    """Whether three control points are each measured in two photographs."""
+    is_control = np.array([role == "control" for role in control.roles], dtype=bool)
+    views = np.bincount(control.point, minlength=len(control.names))[is_control]
+    return bool((views >= 2).sum() >= _CONTROL_OF_PRINCIPAL_POINT)
 
 
 def _measured_control(result: Adjustment) -> int:

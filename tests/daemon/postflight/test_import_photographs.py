@@ -446,6 +446,21 @@ def test_control_shifts_the_block_against_exif(block, count, views) -> None:
     assert section["f_and_height_separated"] and section["ground_sigma_of_f_m"] < 0.05
 
 
+def test_control_determines_the_principal_point(block) -> None:
+    elsewhere = perspective_block(block, (6.0, -5.0))
+    control = control_from(elsewhere, 5)
+    project = photograph_project(
+        elsewhere, control, position_sigma_m=(3.0, 3.0, 5.0), reject_beyond=3.5
+    )
+    assert project.file.camera[0].free == ("dx0", "dy0", "df", "k1", "k2", "p1", "p2")
+    result = adjust(completed(project.network), project.settings)
+    (free,) = free_principal_point(result, longer_side_px=[block.block.image.width_px])
+    assert free.point_px == pytest.approx((6.0, -5.0), abs=4 * max(free.point_sigma_px))
+    section = photographs_section(elsewhere, control, result, [free])
+    assert section["principal_point_estimated"] and section["control_rejected"] == []
+    assert not any("principal point is held" in one for one in photograph_cautions(section))
+
+
 def test_control_that_no_photograph_shows_separates_nothing(block) -> None:
     control = control_from(block, 3)
     none = np.zeros(0, np.int64)
@@ -486,13 +501,20 @@ def test_a_wrong_control_point_is_named_where_the_adjustment_fails(block) -> Non
     assert re.search(r"p1 by [78]\.\d m;", sentence)
 
 
-def test_a_control_point_that_the_adjustment_rejects_is_named(block) -> None:
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_control_point_that_the_adjustment_rejects_is_named(block, axis) -> None:
+    """By its coordinates, or by all of its measurements."""
     control = control_from(block, 6)
     xyz = control.xyz_m.copy()
-    xyz[1, 1] += 2.0
+    xyz[1, axis] += 2.0
     section = section_of(block, replace(control, xyz_m=xyz))
-    assert section["control_rejected"] == ["p1"]
-    assert any("control rejected by the adjustment: p1;" in s for s in photograph_cautions(section))
+    measurements = [
+        one["point"]
+        for one in section["control_measurements_rejected"]
+        if one["rejected"] == one["measured"]
+    ]
+    assert section["control_rejected"] + measurements == ["p1"]
+    assert any("rejected by the adjustment: p1" in one for one in photograph_cautions(section))
 
 
 def test_a_control_point_that_all_others_contradict_is_named(block) -> None:
