@@ -26,6 +26,8 @@ Indices = NDArray[np.int64]
 _ROWS_AT_ONCE = 50_000
 _NEWTON_STEPS = 4
 _AT_REST_MM = 1e-6
+_NEAR = 0.01
+"""Misclosure over principal distance below which a point is no blunder."""
 
 
 class BehindCameraError(ProcessingError, ValueError):
@@ -188,8 +190,9 @@ def _misclosures(
 ) -> tuple[Array, Array, Array | None]:
     """Misclosures, where derivatives are taken, and d(measured) / d(ideal) there.
 
-    With `australis` both are those of adjusted image points, whose ideal coordinates are the
-    target: derivatives at what was measured would share its errors with the misclosures.
+    Derivatives at what was measured would share its errors with the misclosures, so they are taken
+    at the adjusted image points, whose ideal coordinates are the target; with forward models to
+    first order, and for blunders, where the distortion may have no inverse, at what was measured.
 
     Source: docs/explanation/mathematics/bundle.md#residuals.
     """
@@ -199,7 +202,9 @@ def _misclosures(
         to_measured = measured_by_ideal(camera, interior, measured_mm)
         if to_measured is not None:
             misclosure = np.einsum("nij,nj->ni", to_measured, misclosure)
-        return misclosure, measured_mm, to_measured
+            near = np.abs(misclosure).max(axis=1) < _NEAR * camera.f_mm
+            adjusted_mm = measured_mm - np.where(near[:, None], misclosure, 0.0)
+        return misclosure, adjusted_mm, to_measured
     for _ in range(_NEWTON_STEPS):
         to_measured = measured_by_ideal(camera, interior, adjusted_mm)
         assert to_measured is not None
