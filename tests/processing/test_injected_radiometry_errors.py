@@ -18,7 +18,7 @@ from processing.geometry.placement import nominal_placements
 from processing.quality.common_windows import measure_common_windows
 from processing.quality.figures.image import BandLevelFigures, SignalStepFigures
 from processing.quality.level_steps import level_steps
-from processing.quality.local_sharpness import local_blur_figures
+from processing.quality.local_sharpness import SUSPICIOUS, local_blur_figures
 from processing.quality.report import Verdict
 from processing.quality.word_format import wrong_format
 from tests.processing.injected_errors import (
@@ -281,8 +281,10 @@ def test_common_ground_of_few_frames_finds_no_blur_and_raises_nothing(
             s.name for s in error_free.rig.sensors if s.name in names
         )
         blur = local_blur_figures(error_free.rig, ground)
-        for deficit in (blur.pan_blur_deficit, blur.colour_blur_deficit):
-            assert deficit is None or deficit < 0.12
+        for deficit, limit in zip(
+            (blur.colour_blur_deficit, blur.pan_blur_deficit), SUSPICIOUS, strict=True
+        ):
+            assert deficit is None or deficit < limit
 
 
 def test_ground_that_changes_several_bands_is_no_step_of_one() -> None:

@@ -69,9 +69,9 @@ OBSERVED = """(async () => {
     const requestedMs = Date.now();
     const answer = await real(address, ...further);
     if (address !== '/api/v1/advice' || !answer.ok) return answer;
-    const json = answer.json.bind(answer);
-    answer.json = async () => {
-      const content = await json();
+    const text = answer.text.bind(answer);
+    answer.text = async () => {
+      const content = await text();
       requestAnimationFrame(() => observed.coverage.push([requestedMs, Date.now()]));
       return content;
     };

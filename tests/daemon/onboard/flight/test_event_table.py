@@ -37,6 +37,11 @@ def _event_of(node: ast.AST, *, is_driver: bool) -> str | None:
         for key, value in zip(node.keys, node.values, strict=True):
             if isinstance(key, ast.Constant) and key.value == "event":
                 return str(value.value) if isinstance(value, ast.Constant) else None
+    if is_driver and isinstance(node, ast.Yield) and isinstance(node.value, ast.Tuple):
+        # An event and its sentence, which the caller emits.
+        first = node.value.elts[0]
+        is_event = isinstance(first, ast.Constant) and str(first.value).islower()
+        return f"device/{first.value!s}" if is_event else None
     if not isinstance(node, ast.Call) or not node.args:
         return None
     called = node.func.attr if isinstance(node.func, ast.Attribute) else ""
