@@ -49,10 +49,10 @@ def triangulate_photographs(
     from daemon.postflight.triangulation.ground_control import control_of
     from daemon.postflight.triangulation.held_interior import free_principal_point
     from daemon.postflight.triangulation.photograph_block import photograph_block_of
+    from daemon.postflight.triangulation.photograph_cautions import photograph_cautions
     from daemon.postflight.triangulation.photograph_project import (
         adjusted_photographs,
         adjusted_rig,
-        photograph_cautions,
         photographs_section,
     )
     from daemon.postflight.triangulation.report import (

@@ -39,8 +39,8 @@ from daemon.postflight.triangulation.ground_control import (
 )
 from daemon.postflight.triangulation.held_interior import free_principal_point
 from daemon.postflight.triangulation.photograph_block import PhotographBlock
+from daemon.postflight.triangulation.photograph_cautions import photograph_cautions
 from daemon.postflight.triangulation.photograph_project import (
-    photograph_cautions,
     photograph_project,
     photographs_section,
 )
@@ -443,6 +443,7 @@ def test_control_shifts_the_block_against_exif(block, count, views) -> None:
     assert section["control_points"] == count
     assert -np.array(section["position_shift_m"]) == pytest.approx(SHIFT_M, abs=3.0)
     assert max(section["position_rms_m"]) < 5.0
+    assert section["principal_point_estimated"] == (count == 3 and views is None)
     assert section["f_and_height_separated"] and section["ground_sigma_of_f_m"] < 0.05
 
 
