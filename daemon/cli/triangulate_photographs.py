@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -130,13 +130,21 @@ def triangulate_photographs(
         console.print(
             f"{section['oriented']} photographs oriented, {len(section['left_out'])} not; "
             f"{', '.join(map(_principal_distance, section['cameras']))}; positions of EXIF "
-            f"differ by {', '.join(f'{v:.1f}' for v in section['position_rms_m'])} m RMS",
+            f"differ by {', '.join(f'{v:.1f}' for v in section['position_rms_m'])} m RMS"
+            f"{_shift(section['position_shift_m'])}",
             highlight=False,
             soft_wrap=True,
         )
         console.print(f"Results: {results}, report {results / 'report.html'}", soft_wrap=True)
     if incomplete:
         raise typer.Exit(ExitStatus.PROBLEM)
+
+
+def _shift(shift_m: Sequence[float] | None) -> str:
+    if shift_m is None:
+        return ""
+    named = ", ".join(f"{value:+.1f}" for value in shift_m)
+    return f", after a common shift of {named} m (east, north, up) against the control"
 
 
 def _principal_distance(camera: Mapping[str, Any]) -> str:
