@@ -21,7 +21,8 @@ __all__ = ["pytest_addoption", "pytest_sessionfinish", "pytest_terminal_summary"
 
 FLIGHTS = Path(__file__).parent / "system"
 PAGES = Path(__file__).parent / "repository" / "test_document_examples.py"
-NICENESS = 10
+# Where other programs keep all cores busy, less than their priority would be a standstill.
+NICENESS = int(os.environ.get("SYNTOPIC_TEST_NICENESS", "10"))
 
 # A command in this process would set it for itself, and the threads of all later tests with it.
 os.environ.setdefault("NUMBA_NUM_THREADS", str(len(os.sched_getaffinity(0))))

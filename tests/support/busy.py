@@ -23,6 +23,9 @@ ROOT: Final = Path(__file__).parents[2]
 PAGE: Final = Path(__file__).parents[1] / "busy.md"
 LOOP: Final = (sys.executable, "-c", "while True: pass")
 SELECTED: Final = ("-m", "realtime and not soak")
+# As `make test` runs them, at the priority of the loops.
+WORKERS: Final = ("-n", "2", "--dist", "loadfile", "--no-loadscope-reorder")
+PRIORITY: Final = {"SYNTOPIC_TEST_NICENESS": "0"}
 
 
 @contextmanager
@@ -39,9 +42,12 @@ def busy_loops(count: int) -> Iterator[None]:
 
 def run_once(arguments: Sequence[str]) -> tuple[int, str]:
     """Exit status and the line in which pytest counts its tests; the output is passed on."""
-    command = [sys.executable, "-m", "pytest", *arguments]
+    command = [sys.executable, "-m", "pytest", *WORKERS, *arguments]
     last = ""
-    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
+    environment = os.environ | PRIORITY
+    with subprocess.Popen(
+        command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, text=True
+    ) as process:
         assert process.stdout is not None
         for line in process.stdout:
             print(line, end="", flush=True)
