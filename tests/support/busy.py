@@ -22,7 +22,8 @@ from typing import Final
 ROOT: Final = Path(__file__).parents[2]
 PAGE: Final = Path(__file__).parents[1] / "busy.md"
 LOOP: Final = (sys.executable, "-c", "while True: pass")
-SELECTED: Final = ("-m", "realtime and not soak")
+MARK: Final = "realtime"
+FLIGHTS: Final = "tests/system"
 # As `make test` runs them, at the priority of the loops.
 WORKERS: Final = ("-n", "2", "--dist", "loadfile", "--no-loadscope-reorder")
 PRIORITY: Final = {"SYNTOPIC_TEST_NICENESS": "0"}
@@ -38,6 +39,16 @@ def busy_loops(count: int) -> Iterator[None]:
         for loop in loops:
             loop.kill()
             loop.wait(10)
+
+
+def real_time_tests() -> list[str]:
+    """Arguments that select them; only files that name the mark are collected."""
+    files = [
+        str(path.relative_to(ROOT))
+        for path in sorted((ROOT / "tests").rglob("test_*.py"))
+        if MARK in path.read_text(encoding="utf-8") and FLIGHTS not in path.as_posix()
+    ]
+    return ["-m", f"{MARK} and not soak", FLIGHTS, *files]
 
 
 def run_once(arguments: Sequence[str]) -> tuple[int, str]:
@@ -67,7 +78,7 @@ def main(arguments: Sequence[str]) -> int:
     with busy_loops(options.loops):
         for _ in range(options.runs):
             begun_s = time.monotonic()
-            status, summary = run_once(selected or SELECTED)
+            status, summary = run_once(selected or real_time_tests())
             minutes = (time.monotonic() - begun_s) / 60
             results.append(f"{summary} ({minutes:.0f} min)")
             if status != 0:
@@ -79,8 +90,9 @@ def main(arguments: Sequence[str]) -> int:
         capture_output=True,
         text=True,
     ).stdout.strip()
+    what = " ".join(selected) or "all that need real time"
     row = (
-        f"| {datetime.now(UTC):%Y-%m-%d}, {commit} | {' '.join(selected or SELECTED)} "
+        f"| {datetime.now(UTC):%Y-%m-%d}, {commit} | {what} "
         f"| {options.loops} | {os.cpu_count()} | {load:.1f} to {os.getloadavg()[0]:.1f} "
         f"| {'; '.join(results)} |\n"
     )
