@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.postflight.adjustment.csv_tables import UNUSED, CsvTable
+from daemon.postflight.adjustment.project_file import CameraSection
 from processing.bundle.network import CameraModel, ImagePoints, Images
 
 Array = NDArray[np.float64]
@@ -20,6 +21,12 @@ _MAX_TANGENT = 4.0
 
 _MIN_TANGENT = 2e-3
 _MIN_POINTS = 4
+_OUTSIDE = 0.1
+"""Of the longer side, from the edge of the image: as far off a measurement may be a blunder of the
+matching, which data snooping finds."""
+
+_MANY_OUTSIDE = 0.2
+"""Share of a camera's measurements from which its format is wrong, or their origin."""
 
 
 def check_sigmas(table: CsvTable, columns: Sequence[str]) -> None:
@@ -115,6 +122,54 @@ def check_image_points(
             )
         elif tangent[worst] < _MIN_TANGENT:
             table.add_problem(where, f"{about}, and no other point is farther; are these metres?")
+
+
+def check_format(
+    table: CsvTable, points: ImagePoints, images: Images, cameras: Sequence[CameraSection]
+) -> None:
+    """Report image points far outside the format of their camera.
+
+    The format is that of the pixels about the origin of coordinates or about the principal point:
+    files of other programs count millimetres from a corner.
+
+    Args:
+        table: of image points; problems are added to it.
+        points: its rows, in order.
+        images: which camera an image has.
+        cameras: their sections; those without pixels, width and height are not checked.
+    """
+    of = images.camera[points.image]
+    names = table.text("image"), table.text("point")
+    for index, camera in enumerate(cameras):
+        if camera.pixel_um is None or camera.width_px is None or camera.height_px is None:
+            continue
+        rows = np.flatnonzero(of == index)
+        size_mm = np.array([camera.width_px, camera.height_px]) * camera.pixel_um * 1e-3
+        reach = size_mm / 2.0 + _OUTSIDE * size_mm.max()
+        off = [
+            (np.abs(points.xy_mm[rows] - origin) > reach).any(axis=1)
+            for origin in (np.zeros(2), np.array([camera.xp_mm, camera.yp_mm]))
+        ]
+        outside = rows[off[0] & off[1]]
+        about = (
+            f"outside the format of camera {camera.name}, {camera.width_px} x {camera.height_px} "
+            f"px of {camera.pixel_um:g} um ({size_mm[0]:.5g} x {size_mm[1]:.5g} mm)"
+        )
+        if len(outside) >= max(_MIN_POINTS, _MANY_OUTSIDE * len(rows)):
+            table.add_problem(
+                table.lines[int(outside[0])],
+                f"{len(outside)} of {len(rows)} image points, this one first, are far {about}: "
+                "correct width_px, height_px or pixel_um, exchange width and height, or count "
+                "coordinates from the middle of the image",
+            )
+            continue
+        for row in outside:
+            x, y = points.xy_mm[row]
+            table.add_problem(
+                table.lines[row],
+                f"image {names[0][row]} measures point {names[1][row]} at {x:.6g}, {y:.6g} mm, far "
+                f"{about}: correct the coordinates, or leave the row out",
+            )
 
 
 def check_control(table: CsvTable, roles: Sequence[str], xyz_m: Array) -> None:

@@ -20,6 +20,7 @@ from daemon.postflight.adjustment.patterns_file import patterns_of_project
 from daemon.postflight.adjustment.plausibility import (
     check_control,
     check_distances,
+    check_format,
     check_image_points,
     check_observations,
     check_rows,
@@ -127,7 +128,7 @@ def read_project(path: Path) -> Project:
         rays=RayModel(file.adjust.earth_radius_m, file.adjust.refraction, file.adjust.ground_m),
         patterns=patterns_of_project(folder, file.files.patterns, build.image_names, problems),
     )
-    build.check(network)
+    build.check(network, file)
     problems += [p for table in build.tables for p in table.problems]
     if problems:
         raise ProjectError(problems)
@@ -297,12 +298,14 @@ class _TableIndex:
             table.add_problem(table.lines[row], "an image point needs both coordinates")
         return ImagePoints(image, point, np.nan_to_num(xy), sigma * 1e-3)
 
-    def check(self, network: Network) -> None:
+    def check(self, network: Network, file: ProjectFile) -> None:
         """Report what cannot be right although it can be read."""
         for table in self.tables:
             if table.problems:
                 return
         check_image_points(self._seen, network.image_points, network.images, network.cameras)
+        if not self._seen.problems:
+            check_format(self._seen, network.image_points, network.images, file.camera)
         if self._points is not None:
             check_control(self._points, self._roles, network.points.xyz_m[: len(self._roles)])
 

@@ -107,7 +107,7 @@ def import_block(
         )
     pitches = [camera.pitch_mm or NOMINAL_PITCH_MM for camera in block.cameras]
     fits = [_lens_of(c, pitch) for c, pitch in zip(block.cameras, pitches, strict=True)]
-    block, fits, models = _carried(block, pitches, fits)
+    block, fits, models, corrected = _carried(block, pitches, fits)
     lenses = [lens for lens, _ in fits]
     network = _network(block, pitches, lenses, models, sigma_px, position_sigma_m)
     file = ProjectFile(
@@ -115,9 +115,9 @@ def import_block(
         name=f"{block.name}, imported from {program}",
         adjust=AdjustSection(robust=True, minimum_norm=position_sigma_m is None),
         camera=tuple(
-            _section(camera, pitch, lens, model)
-            for camera, pitch, lens, model in zip(
-                block.cameras, pitches, lenses, models, strict=True
+            _section(camera, pitch, lens, model, has_format=number not in corrected)
+            for number, (camera, pitch, lens, model) in enumerate(
+                zip(block.cameras, pitches, lenses, models, strict=True)
             )
         ),
     )
@@ -167,11 +167,11 @@ def _lens_of(camera: BlockCamera, pitch_mm: float) -> tuple[Lens, float]:
 
 def _carried(
     block: Block, pitches: list[float], fits: list[tuple[Lens, float]]
-) -> tuple[Block, list[tuple[Lens, float]], list[Model]]:
+) -> tuple[Block, list[tuple[Lens, float]], list[Model], set[int]]:
     """The block, lenses and models, where the ten parameters do not fit a distortion.
 
     Brown's model is kept: its coefficients go into the lens without a unit. For others the
-    measurements are corrected.
+    measurements are corrected; the last are these cameras, of which the format does not hold.
 
     Raises:
         BlockError: a measurement that no ray has in the other program's model.
@@ -181,6 +181,7 @@ def _carried(
     notes = list(block.notes)
     found = list(fits)
     models: list[Model] = ["australis"] * len(fits)
+    corrected: set[int] = set()
     for number, (camera, pitch, (_, worst_px)) in enumerate(
         zip(block.cameras, pitches, fits, strict=True)
     ):
@@ -210,11 +211,13 @@ def _carried(
             continue
         px[own] = [model.cx_px, model.cy_px] + model.fy_px * rays
         found[number] = Lens(f_mm=model.fy_px * pitch), 0.0
+        corrected.add(number)
         notes.append(
             f"camera {camera.name}: its distortion {finding}. The measurements are corrected for "
             "it, and the camera of the project has none"
         )
-    return replace(block, points=replace(block.points, px=px), notes=tuple(notes)), found, models
+    block = replace(block, points=replace(block.points, px=px), notes=tuple(notes))
+    return block, found, models, corrected
 
 
 def _brown(model: ForwardDistortion, pitch_mm: float) -> Lens:
@@ -243,7 +246,9 @@ def _principal_point_mm(camera: BlockCamera, pitch_mm: float) -> tuple[float, fl
     )
 
 
-def _section(camera: BlockCamera, pitch_mm: float, lens: Lens, model: Model) -> CameraSection:
+def _section(
+    camera: BlockCamera, pitch_mm: float, lens: Lens, model: Model, *, has_format: bool
+) -> CameraSection:
     xp_mm, yp_mm = _principal_point_mm(camera, pitch_mm)
     return CameraSection(
         name=camera.name,
@@ -252,8 +257,8 @@ def _section(camera: BlockCamera, pitch_mm: float, lens: Lens, model: Model) -> 
         yp_mm=yp_mm,
         model=model,
         pixel_um=pitch_mm * 1e3,
-        width_px=camera.width_px,
-        height_px=camera.height_px,
+        width_px=camera.width_px if has_format else None,
+        height_px=camera.height_px if has_format else None,
     )
 
 

@@ -241,8 +241,11 @@ def test_another_distortion_that_does_not_fit_is_taken_out_of_the_measurements(t
     content, report = imported_and_adjusted(path, tmp_path / "project")
     assert "The measurements are corrected for it" in content["notes"][-1]
     assert report["sigma0"] == pytest.approx(1.0, abs=0.1)
-    (camera,) = read_project(tmp_path / "project/project.toml").network.cameras
+    project = read_project(tmp_path / "project/project.toml")
+    (camera,) = project.network.cameras
     assert camera.model == "australis" and not camera.interior.any()
+    # Corrected measurements may lie outside the frame.
+    assert project.file.camera[0].width_px is None
 
 
 def test_a_measurement_that_no_ray_has_is_refused(tmp_path) -> None:
