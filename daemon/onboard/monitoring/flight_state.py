@@ -19,7 +19,7 @@ from daemon.onboard.flight.fault_latches import (
     FaultLatches,
 )
 from daemon.onboard.flight.phases import Phase
-from daemon.onboard.monitoring.finite_values import finite
+from daemon.onboard.monitoring.finite_values import finite, is_place, places_or_none
 from daemon.onboard.monitoring.live_map_state import LiveMapState
 from daemon.onboard.monitoring.previews import Preview
 
@@ -238,6 +238,8 @@ class FlightState:
     # Handlers by event
 
     def _on_mission(self, event: Mapping[str, Any]) -> None:
+        if self._mission and self._mission["id"] != event.get("id"):
+            self._forget_flight()
         self._mission = {
             key: event.get(key) for key in ("id", "path", "resumed", "rig", "simulated", "recovery")
         }
@@ -286,8 +288,10 @@ class FlightState:
             self._phase = str(phase)
         position = status.get("position")
         if isinstance(position, Mapping):
-            at = [float(position["latitude_deg"]), float(position["longitude_deg"])]
-            if not self._track or self._track[-1]["at"] != at:
+            at = [position.get("latitude_deg"), position.get("longitude_deg")]
+            if not is_place(*at):
+                self._status = {**status, "position": None}
+            elif not self._track or self._track[-1]["at"] != at:
                 self._track.append({"sequence": self.sequence, "at": at})
 
     def _on_triggered(self, event: Mapping[str, Any]) -> None:
@@ -307,7 +311,7 @@ class FlightState:
         record["step"] = "sealed"
         self._temperatures[record["number"]] = event.get("temperatures_c", {})
         if event.get("navigation"):
-            record["footprint"] = self._footprint(event["navigation"])
+            record["footprint"] = places_or_none(self._footprint(event["navigation"]))
             record["place"] = {key: event["navigation"].get(key) for key in PLACE_KEYS}
 
     def _on_verdict(self, event: Mapping[str, Any]) -> None:
@@ -397,6 +401,15 @@ class FlightState:
         self._status = {**self._status, "ledger": event.get("ledger")}
 
     # Bookkeeping
+
+    def _forget_flight(self) -> None:
+        """Exposures and curves are those of one mission; devices and faults outlive it."""
+        for kept in (self._exposures, self._dropped, self._temperatures):
+            kept.clear()
+        for curve in (self._history, self._track, self._residuals, self._pieces):
+            curve.clear()
+        self._dropped_verdicts = dict.fromkeys(VERDICT_RANK, 0)
+        self._status, self.guidance = {}, {}
 
     def _device(self, name: str) -> Json:
         initial: Json = {

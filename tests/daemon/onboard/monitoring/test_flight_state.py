@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
+
+import pytest
 
 from daemon.onboard.monitoring.flight_state import EVENTS_MAX, EXPOSURES_MAX, FlightState
 from tests.daemon.onboard.monitoring import flight_events
@@ -106,3 +109,49 @@ def test_counters_are_listed_with_their_devices_and_are_no_part_of_telemetry() -
     assert "counters" not in state.snapshot()["devices"][0]
     state.apply({"event": "counters", "devices": {"SU02": {"frames": 9}}})
     assert state.devices()[0]["counters"] == {"frames": 9}
+
+
+@pytest.mark.parametrize(
+    ("latitude_deg", "longitude_deg"),
+    [(math.nan, 15.0), (47.0, math.inf), (90.5, 15.0), (47.0, 1e9), (None, 15.0)],
+)
+def test_what_is_no_place_on_earth_is_no_position_and_no_footprint(
+    latitude_deg: float | None, longitude_deg: float
+) -> None:
+    place = {"latitude_deg": latitude_deg, "longitude_deg": longitude_deg}
+    corner = [47.0, 15.0]
+    state = FlightState("syntopic test", lambda _: [corner, corner, corner, list(place.values())])
+    status = flight_events.status(triggers=1)
+    state.apply(status | {"position": status["position"] | place})
+    assert state.brief()["status"]["position"] is None
+    assert state.brief()["phase"] == "flying"
+    assert state.changed("track", 0) == []
+    for event in flight_events.exposure(1):
+        state.apply(event)
+    reported = state.exposure(1)
+    assert reported is not None
+    assert (reported["footprint"], reported["verdict"]) == (None, "good")
+    json.dumps(state.snapshot(), allow_nan=False)
+
+
+def test_the_poles_and_the_antimeridian_are_places() -> None:
+    state = FlightState(
+        "syntopic test", lambda _: [[90.0, 180.0], [-90.0, 190.0], [0, -180], [0, 0]]
+    )
+    for event in flight_events.exposure(1):
+        state.apply(event)
+    reported = state.exposure(1)
+    assert reported is not None and len(reported["footprint"]) == 4
+
+
+def test_another_mission_has_nothing_of_the_one_before_and_the_same_one_keeps_all() -> None:
+    state = state_of(flight_events.mission(), *flight_events.exposure(1, "refly"))
+    state.apply(flight_events.status(triggers=1))
+    state.apply(flight_events.lost("SU02"))
+    state.apply(flight_events.mission() | {"resumed": True})
+    assert [one["number"] for one in state.exposures()] == [1]
+    state.apply(flight_events.mission() | {"id": "20261122T080000Z-small"})
+    assert state.exposures() == [] and state.changed("history", 0) == []
+    assert state.changed("track", 0) == [] and state.brief()["status"] == {}
+    assert state.brief()["verdicts"] == {"good": 0, "usable": 0, "refly": 0}
+    assert [one["device"] for one in state.faults()] == ["SU02"]
