@@ -6,7 +6,7 @@ The selection of observations is in `adjust`, robust weights are in `robust_weig
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -30,6 +30,7 @@ from processing.bundle.step_control import (
     RECIPROCAL_BELOW,
     Damping,
     Rays,
+    corrected_state,
     held_depths,
     lowering_step,
     rays_of,
@@ -57,6 +58,18 @@ _WEAK_INFORMATION: Final = 1e-3
 _USELESS_TIME_S: Final = 0.1
 """A priori standard deviation of a delay that is not determined: the motion within it is not that
 of the second order, and iterations do not converge."""
+
+_SECOND_DIFFERENCE: Final = 0.1
+"""Share of a step at which its second order is taken."""
+
+_BENT_BELOW: Final = 0.1
+"""Predicted decrease over the sum of squares: far from a solution the second order misleads."""
+
+_MAX_NARROW: Final = 0.1
+"""Share of points of nearly parallel rays up to which steps are bent: these go to infinity."""
+
+_BENT_LENGTHS: Final = (1.0, 0.5, 0.2)
+"""Of a step that is bent by its second order."""
 
 _FLAT: Final = 1e-12
 _WEAK_MOVE: Final = 1e-3
@@ -202,6 +215,8 @@ class _Trial:
         normals = point_normals(rows, run.layout)
         self._share = weakest_share(normals)
         self._reciprocal = rays.free & (self._share < RECIPROCAL_BELOW)
+        narrow = rays.free & (self._share < _WEAK_INFORMATION)
+        self._is_wide = narrow.sum() <= _MAX_NARROW * len(narrow)
         self._held = held_depths(rows, run.layout, run.state, rays, normals)
         flat = (self._share <= _FLAT) & ~self._held.any(axis=1)
         if flat.any():
@@ -209,9 +224,12 @@ class _Trial:
 
     def step(self, damping: float) -> tuple[ReducedEquations, GaussNewtonStep]:
         """Reduced equations with damping, and the corrections."""
+        return self._solved(self._rows, damping)
+
+    def _solved(self, rows: Equations, damping: float) -> tuple[ReducedEquations, GaussNewtonStep]:
         held = self._held if self._held.any() else None
         run, directions = self._run, None
-        reduced = reduced_equations(self._rows, run.layout, damping, held)
+        reduced = reduced_equations(rows, run.layout, damping, held)
         if run.minimum_norm:
             motions = free_motions(run.layout, run.state, reduced)
             directions = scaled_directions(motions, reduced)
@@ -219,32 +237,78 @@ class _Trial:
             return reduced, solve(reduced, directions=directions)
         except SingularError:
             # Again, for a factor of blocks is written in the place of the matrix.
-            reduced = reduced_equations(self._rows, run.layout, damping, held)
+            reduced = reduced_equations(rows, run.layout, damping, held)
             found = rank_defects(run.network, run.layout, run.state, reduced)
             raise RankDefectError(found) from None
 
-    def take(self, step: GaussNewtonStep, damping: Damping) -> bool:
-        """Take the step, or a damped one that lowers the sum of squares; whether there is one."""
+    def take(self, step: GaussNewtonStep, damping: Damping, *, bends: bool = True) -> bool:
+        """Take the step, or a damped one that lowers the sum of squares; whether there is one.
+
+        Before a step is damped more, it is bent by its second order: along a curved valley, as of a
+        principal distance and heights, short straight steps would be needed.
+        """
         run = self._run
         objective = float(self._rows.misclosure @ self._rows.misclosure)
         while True:
-            found = lowering_step(
-                lambda state: run.rows(state, derivatives=False),
-                run.network,
-                run.layout,
-                run.state,
-                step,
-                self._rays,
-                self._reciprocal,
-                self._rows,
-            )
+            tried = step
+            found = self._lowering(step)
+            near = step.predicted_decrease < _BENT_BELOW * objective
+            if found is None and bends and near and self._is_wide:
+                for tried in self._bent(step, damping.value):
+                    found = self._lowering(tried)
+                    if found is not None:
+                        break
             if found is not None:
                 run.state, value = found
-                damping.adapt(objective - value, step.predicted_decrease)
+                damping.adapt(objective - value, tried.predicted_decrease)
                 return True
             if not damping.raise_():
                 return False
             _, step = self.step(damping.value)
+
+    def _lowering(self, step: GaussNewtonStep) -> tuple[ParameterValues, float] | None:
+        run = self._run
+        return lowering_step(
+            lambda state: run.rows(state, derivatives=False),
+            run.network,
+            run.layout,
+            run.state,
+            step,
+            self._rays,
+            self._reciprocal,
+            self._rows,
+        )
+
+    def _bent(self, step: GaussNewtonStep, damping: float) -> list[GaussNewtonStep]:
+        """The step with its second-order correction, from second differences of misclosures.
+
+        Empty where these are not known; otherwise whole and shorter ways along the parabola.
+
+        Source: Transtrum and Sethna (2012), section 3.
+        """
+        run, share = self._run, np.ones(len(step.dpoints))
+        sides = []
+        for length in (_SECOND_DIFFERENCE, -_SECOND_DIFFERENCE):
+            part = GaussNewtonStep(length * step.dx, length * step.dpoints, 0.0)
+            state = corrected_state(
+                run.state, run.layout, part, self._rays, self._reciprocal, share,
+                rotates=not run.network.constraints,
+            )  # fmt: skip
+            try:
+                sides.append(run.rows(state, derivatives=False).misclosure)
+            except BehindCameraError:
+                return []
+        second = sides[0] - 2.0 * self._rows.misclosure + sides[1]
+        rows = replace(self._rows, misclosure=second / _SECOND_DIFFERENCE**2)
+        _, bend = self._solved(rows, damping)
+        return [
+            GaussNewtonStep(
+                t * step.dx + 0.5 * t**2 * bend.dx,
+                t * step.dpoints + 0.5 * t**2 * bend.dpoints,
+                t * (2.0 - t) * step.predicted_decrease,
+            )
+            for t in _BENT_LENGTHS
+        ]
 
     def refuse_held(self) -> None:
         """Points whose rays meet nowhere in front of the cameras."""
@@ -280,5 +344,5 @@ def robust_step(run: Run, rows: Equations, damping: Damping) -> GaussNewtonStep:
     """
     trial = _Trial(run, rows, rays_of(run.network, run.layout))
     _, step = trial.step(damping.value)
-    trial.take(step, damping)
+    trial.take(step, damping, bends=False)
     return step
