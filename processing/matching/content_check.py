@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -103,12 +103,12 @@ def check_content(
         Shifted and mismatched frames; empty where every frame has enough matches.
     """
     settings, image = settings or TiePointSettings(), rig.virtual_image
+    pan = {s.name for cone in rig.pan_cones for s in cone.sensors}
     attempted, found = _counts(tie_points)
-    suspicious = {
-        name
-        for name, count in attempted.items()
-        if count >= MIN_ATTEMPTED and found[name] < SUSPICIOUS_SHARE * count
-    }
+    unmatched = _suspicious(attempted, found)
+    # Green is searched three times as far in PAN pixels: a shifted frame may match it alone.
+    apart = _suspicious(*_counts(tie_points, pan)) - unmatched
+    suspicious = unmatched | apart
     if not suspicious or image is None:
         return ContentCheck()
     ratio = exact_colour_ratio(rig) or 1.0
@@ -119,37 +119,79 @@ def check_content(
     matched = dict.fromkeys(suspicious, 0)
     searched = dict.fromkeys(suspicious, 0)
     ambiguous = dict.fromkeys(suspicious, 0)
-    shifts: dict[str, list[Array]] = {name: [] for name in suspicious}
+    differences_px: dict[tuple[str, str], Array] = {}
     for search in searches:
         if not len(search.at_b) or search.pair[0] not in frames:
             continue
-        for name in set(search.pair) & suspicious:
-            rough = _textured(rig, frames, search, settings)
-            if np.count_nonzero(rough) < MIN_AGREEING:
-                continue
+        names = set(search.pair) & (suspicious if search.kind == PAN_TO_PAN else unmatched)
+        rough = _textured(rig, frames, search, settings) if names else np.zeros(0, np.bool_)
+        if np.count_nonzero(rough) < MIN_AGREEING:
+            continue
+        wide = _wide_search(placements, frames, search, rough, settings)
+        differences_px[search.pair] = wide.differences_mm / image.pitch_mm
+        for name in names:
             textured[name] += int(np.count_nonzero(rough))
             matched[name] += tried[search.pair]
-            wide = _wide_search(placements, frames, search, rough, settings)
             searched[name] += len(wide.correlated)
             ambiguous[name] += int(np.count_nonzero(wide.correlated & ~wide.distinct))
-            other = search.pair[search.pair[0] == name]
-            if other not in suspicious or len(suspicious) == len(attempted):
-                # The first frame lies where its neighbour shows the ground: it goes by what it is
-                # off.
-                sign = -1.0 if name == search.pair[0] else 1.0
-                shifts[name] += list(sign * wide.differences_mm / image.pitch_mm)
+    shifts = _shifts_px(suspicious, set(attempted) - suspicious, differences_px)
     shifted, mismatched = {}, {}
     for name in sorted(suspicious):
-        if textured[name] < MIN_ATTEMPTED or matched[name] >= MISMATCHED_SHARE * textured[name]:
+        if textured[name] < MIN_ATTEMPTED:
             continue
-        shift = _consensus_shift(shifts[name])
-        if shift is not None:
+        if name in shifts:
             # Matches rare but in place: the frame is where it should be.
-            if math.hypot(*shift) > AGREEING_PX:
-                shifted[name] = shift
-        elif ambiguous[name] < AMBIGUOUS_SHARE * searched[name] or not searched[name]:
+            if math.hypot(*shifts[name]) > AGREEING_PX:
+                shifted[name] = shifts[name]
+        elif (
+            name in unmatched
+            and matched[name] < MISMATCHED_SHARE * textured[name]
+            and (ambiguous[name] < AMBIGUOUS_SHARE * searched[name] or not searched[name])
+        ):
             mismatched[name] = textured[name]
     return ContentCheck(shifted, mismatched)
+
+
+def _shifts_px(
+    suspicious: Collection[str],
+    others: Collection[str],
+    differences_px: Mapping[tuple[str, str], Array],
+) -> dict[str, tuple[float, float]]:
+    """How far frames lie off, frame by frame from those that lie in place.
+
+    Where none does, all lie off against the one that resembles its neighbours the most.
+
+    Args:
+        suspicious: frames to place.
+        others: frames in place.
+        differences_px: by pair, of matched positions, the first frame less the second, (n, 2).
+
+    Returns:
+        x right and y up, px, of the suspicious frames that are found.
+    """
+    placed = dict.fromkeys(others, (0.0, 0.0))
+    points = dict.fromkeys(sorted(suspicious), 0)
+    for pair, off in differences_px.items():
+        for name in set(pair) & points.keys():
+            points[name] += len(off)
+    if not placed and any(points.values()):
+        placed[max(points, key=lambda name: points[name])] = (0.0, 0.0)
+    # The frame with the most points next to placed ones comes first: it carries the others.
+    while True:
+        near: dict[str, list[Array]] = {}
+        for (a, b), off in differences_px.items():
+            if a in placed and b in points and b not in placed:
+                near.setdefault(b, []).extend(off + placed[a])
+            elif b in placed and a in points and a not in placed:
+                # The first frame lies where its neighbour shows the ground.
+                near.setdefault(a, []).extend(np.array(placed[b]) - off)
+        for name in sorted(near, key=lambda name: -len(near[name])):
+            shift = _consensus_shift(near[name])
+            if shift is not None:
+                placed[name] = shift
+                break
+        else:
+            return {name: shift for name, shift in placed.items() if name in points}
 
 
 def moved_placements(
@@ -192,12 +234,25 @@ def content_figures(check: ContentCheck) -> ContentFigures:
     )
 
 
-def _counts(tie_points: TiePoints) -> tuple[dict[str, int], dict[str, int]]:
-    """Positions tried and points matched, by sensor."""
+def _suspicious(attempted: Mapping[str, int], found: Mapping[str, int]) -> set[str]:
+    """Frames of whose positions hardly any was matched."""
+    return {
+        name
+        for name, count in attempted.items()
+        if count >= MIN_ATTEMPTED and found[name] < SUSPICIOUS_SHARE * count
+    }
+
+
+def _counts(
+    tie_points: TiePoints, among: Collection[str] | None = None
+) -> tuple[dict[str, int], dict[str, int]]:
+    """Positions tried and points matched, by sensor; of pairs `among` some sensors, if given."""
     attempted: dict[str, int] = {}
     found: dict[str, int] = {}
     counts = tie_points.counts()
     for pair, tried in zip(tie_points.pairs, tie_points.attempted, strict=True):
+        if among is not None and not set(pair) <= set(among):
+            continue
         for name in pair:
             attempted[name] = attempted.get(name, 0) + tried
             found[name] = found.get(name, 0) + counts[pair]

@@ -37,6 +37,8 @@ Array = NDArray[np.float64]
 
 ALPHA: Final = 1e-5
 """Probability of a finding in a healthy exposure: it changes the verdict."""
+REST_ALPHA: Final = 0.01
+"""The same of what one changed cone leaves: it widens the stated accuracy only."""
 ODDS_LIMIT: Final = 19.0
 QUANTITIES: Final = ("scale_ppm", "rotation_x_urad", "rotation_y_urad", "rotation_z_urad")
 
@@ -62,9 +64,10 @@ class LayerCheck:
 
     `statistic` is what one changed cone explains at most, chi-square with four degrees of freedom
     on a healthy rig. `common` (4,) is the change that all layers share, which is the master's with
-    the opposite sign. `causes` are the cones whose change explains the misfit, the master's name
-    for the common one; `alternatives` explain the first as well. Both are empty where the test is
-    passed.
+    the opposite sign. `several_likely` is true where one cone is changed and leaves what only one
+    healthy exposure in a hundred does. `causes` are the cones whose change explains the misfit, the
+    master's name for the common one; `alternatives` explain the first as well. Both are empty where
+    the test is passed.
     """
 
     master: str
@@ -75,6 +78,7 @@ class LayerCheck:
     common_sigmas: Array
     causes: tuple[str, ...]
     alternatives: tuple[str, ...]
+    several_likely: bool = False
 
     @property
     def changed(self) -> bool:
@@ -150,6 +154,8 @@ def check_layers(
         common_sigmas=np.asarray(np.sqrt(np.diag(cofactor))),
         causes=causes,
         alternatives=alternatives,
+        several_likely=bool(causes)
+        and min(left) > chi2.ppf(1.0 - REST_ALPHA, max(4 * count - 4, 1)),
     )
 
 

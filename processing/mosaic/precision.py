@@ -273,6 +273,20 @@ def datum_per_kelvin_px(rig: Rig, mosaic: Mosaic) -> Array:
     return np.asarray(fit @ moved / (mosaic.model.pitch_mm * 1e3))
 
 
+def datum_by_places(rig: Rig, mosaic: Mosaic) -> Array:
+    """How the datum moves with the places it rests on.
+
+    Args:
+        rig: the camera.
+        mosaic: what the image was made with.
+
+    Returns:
+        Shift x, y (px), scale and rotation (px per mm) for a pixel of x and y of each place,
+        (4, 2 m).
+    """
+    return _datum_fit(rig, mosaic)[2]
+
+
 def _datum_fit(rig: Rig, mosaic: Mosaic) -> tuple[list[Sensor], Array, Array]:
     """Sensors of the datum, places (m, 2) mm, and the fit (4, 2 m) of a similarity to them.
 

@@ -30,6 +30,7 @@ from processing.mosaic.precision import (
     PROBE_SIGMA_K,
     UNKNOWN_SIGMA_K,
     UncertaintyContribution,
+    datum_by_places,
     datum_design,
     datum_per_kelvin_px,
 )
@@ -43,6 +44,8 @@ SCALE_SIGMAS: Final = 2.0
 """A common change of scale within so many standard deviations of the calibration is no error."""
 SINGLE_SENSOR_SIGMAS: Final = 1.0
 """The same where the master cone has one sensor: nothing else shows a wrong scale of it."""
+OTHER_LENS_SIGMAS: Final = 4.0
+"""Of scale and of direction, beyond which a changed cone is that of another unit."""
 TURN_SIGMAS: Final = 2.0
 """A turn of a converging head within so many standard deviations of calibration is no error."""
 STALE_K_PER_S: Final = 0.02
@@ -114,7 +117,12 @@ def uncertainty_contribution_of(
     datum = np.zeros((4, 4))
     contributions = [*_rotated_heads(mosaic, platform, held), *_stale(rig, mosaic, stale_s)]
     contributions += _miscounted(rig, smear_px or {})
-    for part in (*_other_datums(rig, mosaic, validity), *warmed, *changed, *contributions):
+    places_off_px = _places_off_px(rig, mosaic, validity, checks.layers)
+    if places_off_px and _is_other_unit(validity, checks.layers):
+        datum += datum_by_places(rig, mosaic) @ datum_by_places(rig, mosaic).T * places_off_px**2
+    else:
+        contributions += _other_datums(rig, mosaic, validity)
+    for part in (*warmed, *changed, *contributions):
         datum += np.outer(part, part)
     frames: dict[str, Array] = {}
     for slip in slips:
@@ -122,7 +130,7 @@ def uncertainty_contribution_of(
         shift[np.abs(shift) < MIN_SLIP_PX] = 0.0
         for name in (slip.sensor, *slip.alternatives):
             frames[name] = frames.get(name, np.zeros(2)) + slip.share * shift**2
-    unplaced, apart = _unplaced(rig, mosaic, shifted_px, weak)
+    unplaced, apart = _unplaced(rig, mosaic, shifted_px, places_off_px, weak)
     parts = (*_held(rig, mosaic, platform, held, temperatures_c, stale_s), *apart)
     return UncertaintyContribution(
         datum + unplaced + _common_scale(mosaic, platform, held), frames, parts
@@ -186,21 +194,57 @@ def _common_scale(
     return datum
 
 
-def _unplaced(
-    rig: Rig, mosaic: Mosaic, shifted_px: float, weak: Collection[str]
-) -> tuple[Array, tuple[HeldPart, ...]]:
-    """Frames that lay elsewhere than calibrated, where tie points do not say where.
+def _is_other_unit(validity: Validity | None, layers: LayerCheck | None) -> bool:
+    """Whether both places of master sensors and several layers are not as calibrated."""
+    if validity is None or layers is None:
+        return False
+    return not validity.consistent and len(layers.causes) > 1
 
-    The calibration that holds them is off by as much, the datum's among it.
+
+def _places_off_px(
+    rig: Rig, mosaic: Mosaic, validity: Validity | None, layers: LayerCheck | None
+) -> float:
+    """How far places of the calibration are off where several sensors show it.
+
+    Squares of a coordinate of the master sensors after a best-fit similarity, which leaves 2 m - 4
+    of 2 m, and of the sensors of other cones about their mean, 2 (m - 1) of 2 m; from so few the
+    variance of the next place is f / (f - 2) times their mean (Student's t). Zero where at most one
+    sensor was displaced.
+    """
+    if validity is None or not (validity.several_displaced or _is_other_unit(validity, layers)):
+        return 0.0
+    held = {name.split(".")[0] for name in mosaic.undetermined}
+    found = [s for s in datum_candidates(rig) if s.name in mosaic.model.sensors.keys() - held]
+    freedom, squares = max(2 * len(found) - 4, 0), 0.0
+    if freedom:
+        design, moved = _places(found), _moved_px(mosaic, found)
+        left = moved - design @ np.linalg.lstsq(design, moved, rcond=None)[0]
+        squares = float(left @ left)
+    for cone in rig.pan_cones:
+        pairs = [pair for pair in validity.relative if pair.cone == cone.name]
+        if pairs:
+            sensors = len({name for pair in pairs for name in (pair.sensor_a, pair.sensor_b)})
+            squares += sum(pair.dx_px**2 + pair.dy_px**2 for pair in pairs) / sensors
+            freedom += 2 * (sensors - 1)
+    return math.sqrt(squares / (freedom - 2)) if freedom > 2 else math.sqrt(squares)
+
+
+def _unplaced(
+    rig: Rig, mosaic: Mosaic, shifted_px: float, places_off_px: float, weak: Collection[str]
+) -> tuple[Array, tuple[HeldPart, ...]]:
+    """Frames that tie points do not place, where the calibration that holds them does not hold.
+
+    Where frames lay elsewhere than calibrated, the datum's calibration is off by as much. Where
+    places of other sensors are off, those of these frames are; the datum has that already.
     """
     datum = np.zeros((4, 4))
     owners = {name.split(".")[0] for name in mosaic.undetermined}
     owners |= {*weak, *(rig.cone_of(name).name for name in weak)}
-    if not shifted_px or not owners:
+    sigma_px = max(shifted_px / RELATIVE_SHIFT, places_off_px)
+    if not sigma_px or not owners:
         return datum, ()
-    sigma_px = shifted_px / RELATIVE_SHIFT
     # A cone's place in the image is that of its mounting as well, which the master has none of.
-    of_datum = (sigma_px / 2.0) ** 2
+    of_datum = (shifted_px / RELATIVE_SHIFT / 2.0) ** 2
     half_mm = mosaic.model.half_size_mm
     datum = np.diag([1.0, 1.0, half_mm**-2, half_mm**-2]) * of_datum
     parts = []
@@ -306,6 +350,16 @@ def _wrong_temperature(
         yield datum_per_kelvin_px(rig, mosaic) * (combined[0] - float(np.mean(measured)))
 
 
+def _is_other_unit_of_one(layers: LayerCheck) -> bool:
+    """Whether one changed layer is not all: what it leaves, or both its scale and direction."""
+    changed = [layer for layer in layers.layers if layer.cone in layers.causes]
+    return layers.several_likely or any(
+        (np.abs(layer.values[:3]) > OTHER_LENS_SIGMAS * layer.sigmas[:3])[[0, i]].all()
+        for layer in changed
+        for i in (1, 2)
+    )
+
+
 def _changed_master(rig: Rig, mosaic: Mosaic, layers: LayerCheck | None) -> Iterator[Array]:
     """The change all other layers share is the master's own.
 
@@ -326,10 +380,17 @@ def _changed_master(rig: Rig, mosaic: Mosaic, layers: LayerCheck | None) -> Iter
         beyond = np.abs(layers.common) > SCALE_SIGMAS * layers.common_sigmas
         for quantity in np.diag(layers.common)[beyond]:
             yield moved(*quantity)
-    elif len(layers.causes) > 1:
+    elif len(layers.causes) > 1 or (is_single and _is_other_unit_of_one(layers)):
         changes = np.sqrt(np.mean([layer.values**2 for layer in layers.layers], axis=0))
+        # Pixels of colour are larger, and so is what a unit differs by in them.
+        pan = [v.values for v in layers.layers if rig.cone(v.cone).role == "pan"]
+        turns = np.array(pan or [v.values for v in layers.layers])[:, 1:3]
         # The master may have tilted about the axis about which the others did not.
-        changes[1:3] = np.sqrt(np.mean(changes[1:3] ** 2))
+        changes[1:3] = np.sqrt(np.mean(turns**2))
+        if is_single:
+            # A lens that stands elsewhere across its axis does so along it: the scales of all
+            # cones may be off by as much and agree by chance.
+            changes[0] = max(changes[0], changes[1])
         for quantity in np.diag(changes)[: 3 if is_single else 1]:
             yield moved(*quantity)
     elif not layers.changed:

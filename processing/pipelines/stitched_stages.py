@@ -201,8 +201,8 @@ def _explained_frames(corrected: CorrectedFrames, adjusted: AdjustedFrames) -> s
 def misplaced_px(rig: Rig, content: ContentCheck) -> float:
     """How far the farthest frame lies from where points are sought; zero where all are there.
 
-    Where others of the frames that lie elsewhere were not found, or most of the PAN frames were
-    not, they lie beyond the wide search: that far at least.
+    Where frames lie elsewhere and PAN frames were not found, or most of the PAN frames were not,
+    these lie beyond the wide search: that far at least.
 
     Args:
         rig: the camera.
@@ -214,7 +214,7 @@ def misplaced_px(rig: Rig, content: ContentCheck) -> float:
     farthest = max((math.hypot(*shift) for shift in content.shifted_px.values()), default=0.0)
     pan = {s.name for cone in rig.pan_cones for s in cone.sensors}
     lost = len(pan & content.mismatched.keys())
-    if (content.shifted_px and content.mismatched) or (lost > 2 and 2 * lost > len(pan)):
+    if (content.shifted_px and lost) or (lost > 2 and 2 * lost > len(pan)):
         return max(farthest, float(WIDE_SEARCH_PX))
     return farthest
 

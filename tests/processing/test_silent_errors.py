@@ -59,6 +59,18 @@ def test_a_rig_file_of_another_unit_is_flown_again_and_stated_no_better_than_it_
 
 
 @pytest.mark.trust
+@pytest.mark.timeout(300)
+def test_a_frame_that_green_alone_matches_is_sought_next_to_its_neighbours() -> None:
+    """SU11 lay 8 px off, beyond the search in PAN; it rested on calibration, 1 px off."""
+    cases = draw(150, 102, rigs=[X], kinds=["wrong-unit"])
+    outcome = run(next(case for case in cases if case.number == 11))
+    assert outcome.verdict != "good" and outcome.squares is not None
+    assert outcome.squares < 3.0 * outcome.rank
+    assert outcome.error_px is not None and outcome.stated_px is not None
+    assert 0.3 * outcome.error_px < outcome.stated_px < 3.0 * outcome.error_px
+
+
+@pytest.mark.trust
 def test_a_tenth_of_a_colour_pixel_under_a_cloud_is_no_slip() -> None:
     for number in (792, 798):
         row = clean_row(number, seed=4)

@@ -167,6 +167,25 @@ def test_two_changed_cones_are_both_named() -> None:
     assert not check.master_changed
 
 
+@pytest.mark.parametrize(
+    ("turned_urad", "chi_square", "likely"),
+    [(2000.0, 12.9, False), (2000.0, 13.6, True), (0.0, 13.6, False)],
+)
+def test_what_one_changed_cone_leaves_may_show_that_several_are(
+    turned_urad: float, chi_square: float, likely: bool
+) -> None:
+    """The 99th percentile of chi-square with four degrees of freedom is 13.28."""
+    rig, healthy = planted("ultracam-l-mini", {})
+    check = check_layers(rig, healthy, read(rig))
+    assert check is not None and not check.several_likely
+    sigma = next(layer for layer in check.layers if layer.cone == "1").sigmas[2]
+    turned = np.array([0.0, 0.0, sigma * np.sqrt(chi_square), 0.0])
+    changes = {"1": turned, "RGB": np.array([0.0, turned_urad, 0.0, 0.0])}
+    check = check_layers(*planted("ultracam-l-mini", changes), read(rig))
+    assert check is not None and check.changed == bool(turned_urad)
+    assert check.several_likely == likely
+
+
 def test_the_common_change_is_the_weighted_mean_of_all_layers() -> None:
     rig, mosaic = planted("ultracam-x-mini", {"1": np.array([10.0, 0.0, 0.0, 0.0])})
     check = check_layers(rig, mosaic, read(rig))
