@@ -199,9 +199,9 @@ def test_a_long_table_holds_the_rows_that_are_seen(cockpit: Cockpit) -> None:
 def test_gaps_and_labels_cost_no_elements_and_do_not_cover_each_other(cockpit: Cockpit) -> None:
     found = cockpit.browser.evaluate(
         """import('/map.js').then((map) => {
-          const at = (k) => [[47.07 + 1e-5 * k, -180], [47.07 + 1e-5 * k, -179.99]];
+          const at = (k) => [[47.07 + 1e-6 * k, -180], [47.07 + 1e-6 * k, -179.99]];
           const gap = (k) => ({ kind: 'hole', line: `L${k}`, at: at(k),
-            holes: [{ rings: [[...at(k), [47.08, -180]]] }] });
+            holes: [{ rings: [[...at(k), [47.074, -180]]] }] });
           const counts = [];
           for (const length of [1, 3000]) {
             map.drawGaps(Array.from({ length }, (_, k) => gap(k)));

@@ -11,6 +11,7 @@ const MARKS = { warning: "✖", caution: "▲", info: "ℹ" };
 const RANK = { warning: 0, caution: 1, info: 2 };
 const SHELVE_MINUTES = [5, 15, 60];
 const STORE = "shelved";
+const LINK = "page page.link";
 
 // Id of a shelved alarm, and until when, in ms of the wall clock. Kept over a reload of the page.
 const shelved = new Map(readShelved());
@@ -110,8 +111,9 @@ function shelfButtons(alarm, feed) {
     return [button(t("alarm.unshelve"), () => { shelve(alarm, 0); feed.refresh(); })];
   }
   if (!alarm.isActive) return [];
-  return SHELVE_MINUTES.map((minutes) => button(t("alarm.shelve", { minutes }), () => { shelve(alarm, minutes); feed.refresh(); },
-    { className: "shelve" }));
+  return [element("span", { className: "shelve-for" }, t("alarm.shelve_for"), ...SHELVE_MINUTES.map((minutes) =>
+    button(t("alarm.minutes", { minutes }), () => { shelve(alarm, minutes); feed.refresh(); },
+      { className: "shelve", ariaLabel: t("alarm.shelve", { minutes }) })))];
 }
 
 // Cause and action of the code, in the language of the page, and the code itself, as `syntopic explain` takes it.
@@ -155,19 +157,23 @@ function drawList(alarms, feed) {
 
 function drawBar(alarms, feed) {
   const bar = by("alarm-bar");
-  const due = alarms.filter((one) => !one.untilMs && (one.isActive || !one.isAcknowledged) && !(one.isPrevious && one.isAcknowledged));
+  // The lost link has a bar of its own; once it is acknowledged, this one has room for the other alarms.
+  const due = alarms.filter((one) => !one.untilMs && (one.isActive || !one.isAcknowledged) && !(one.isPrevious && one.isAcknowledged)
+    && !(one.id === LINK && one.isAcknowledged));
   const [first] = due;
   // After an orderly end the alarms are part of the summary.
   const hasEnded = !feed.isLinked && feed.flight.brief?.phase === "landed";
   bar.hidden = !first || hasEnded;
   if (bar.hidden) return;
   const isSounding = soundingOf(alarms).length > 0;
-  redraw(bar, JSON.stringify([first.id, first.severity, first.isActive, first.isAcknowledged, first.detail, due.length, isSounding]), () => {
+  const [active, cleared] = [true, false].map((wanted) => due.filter((one) => one !== first && one.isActive === wanted).length);
+  redraw(bar, JSON.stringify([first.id, first.severity, first.isActive, first.isAcknowledged, first.detail, active, cleared, isSounding]), () => {
     bar.className = first.isActive ? first.severity : "info";
     const what = button("", () => feed.showTab("alarms"), { className: "what" });
     what.append(element("strong", { textContent: `${labelOf(first)} · ${titleOf(first)}` }),
       element("span", { textContent: first.isActive ? first.detail : stateText(first) }));
-    const further = due.length > 1 ? button(t("alarm.further", { n: due.length - 1 }), () => feed.showTab("alarms"), { className: "further" }) : null;
+    const counts = [active && t("alarm.further", { n: active }), cleared && t("alarm.further_cleared", { n: cleared })].filter(Boolean);
+    const further = counts.length ? button(counts.join(" · "), () => feed.showTab("alarms"), { className: "further" }) : null;
     const silence = isSounding ? button(t("alarm.silence"), () => silenceAll(feed), { id: "silence" }) : null;
     const seen = first.isAcknowledged ? null
       : button(t("alarm.acknowledge"), () => acknowledge(first, feed), { className: "acknowledge" });

@@ -4,6 +4,7 @@ import { t } from "./i18n.js";
 import { element } from "./dom.js";
 import { followGuidance } from "./guidance_link.js";
 import { drawAge, drawBar, drawCells } from "./guidance_view.js";
+import { onWake } from "./wake.js";
 
 const AGE_MS = 250;
 const listeners = new Set();
@@ -29,7 +30,12 @@ export function start(root, feed) {
     drawAge(root, age, last);
     for (const listener of listeners) listener(last);
   };
-  setInterval(() => { if (root.firstChild) drawAge(root, age, last); }, AGE_MS);
+  const showAge = () => { if (root.firstChild) drawAge(root, age, last); };
+  setInterval(showAge, AGE_MS);
+  onWake((sleptMs) => {
+    if (last) last.receivedMs -= sleptMs;
+    showAge();
+  });
   feed.subscribe((record) => {
     root.hidden = feed.flight.brief.phase === "landed";
     if (!record && last) draw();

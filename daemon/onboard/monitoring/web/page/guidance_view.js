@@ -1,12 +1,13 @@
 // Guidance as values with labels, for the strip of the page and the view of the pilot.
 
 import { t } from "./i18n.js";
-import { angle, distance, duration, height, length, number, speed } from "./format.js";
+import { angle, distance, duration, height, length, number, span, speed } from "./format.js";
 import { element } from "./dom.js";
 import { ageOf } from "./guidance_link.js";
 
 export const STALE_S = 1.5;
 export const LOST_S = 5;
+const LONG_S = 100;
 const FAR_M = 2000;
 
 const way = (m) => Math.abs(m) >= FAR_M ? distance(m) : length(m);
@@ -81,7 +82,8 @@ export function drawAge(container, label, frame) {
   const state = ageState(ageS);
   container.classList.toggle("stale", state !== "fresh");
   container.classList.toggle("lost", state === "lost");
-  const text = frame ? t("guidance.age", { age: number(ageS, 1) }) : t("guidance.none");
+  // Tenths of a second say nothing of what is minutes old.
+  const text = !frame ? t("guidance.none") : ageS < LONG_S ? t("guidance.age", { age: number(ageS, 1) }) : t("guidance.age_long", { span: span(ageS) });
   if (label.textContent !== text) label.textContent = text;
   return state;
 }

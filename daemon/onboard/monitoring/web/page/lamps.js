@@ -46,7 +46,10 @@ export function presentPosition(flight) {
 function position(flight) {
   const known = flight.brief.status?.position;
   const present = presentPosition(flight);
-  if (!known) return { state: isUnavailable(devicesOf(flight, "navigator")[0] || {}) ? "warning" : "off", value: "–" };
+  if (!known) {
+    const isNeeded = flight.brief.phase === "flying" || flight.brief.phase === "armed";
+    return { state: isNeeded || isUnavailable(devicesOf(flight, "navigator")[0] || {}) ? "warning" : "off", value: "–" };
+  }
   if (!present) return { state: "warning", value: t("lamp.old", { s: number(known.age_s) }) };
   if (present.fix === "none") return { state: "caution", value: t("lamp.no_fix") };
   // A receiver that is lost is no longer good, although its last position is not old yet.

@@ -7,6 +7,7 @@ import { startLayers } from "./map_layers.js";
 import { OlderLayer } from "./map_older.js";
 import { PlanLayer } from "./map_plan.js";
 import { near } from "./longitudes.js";
+import { aircraftMark, trackOf } from "./aircraft_mark.js";
 import { isMeasuring, startMeasuring } from "./map_measure.js";
 import { startNoData } from "./map_no_data.js";
 
@@ -18,9 +19,17 @@ const label = (text) => document.createTextNode(text);
 
 const map = L.map("map", { zoomControl: true, attributionControl: false, zoomSnap: 0.25 });
 map.setView([0, 0], 2);
-L.control.scale({ imperial: false }).addTo(map);
+L.control.scale({ imperial: false, maxWidth: 140 }).addTo(map);
 const track = L.polyline([], { color: "#777", weight: 2 }).addTo(map);
-const marker = L.circleMarker([0, 0], { radius: 6, weight: 3 });
+const marker = aircraftMark();
+// What is farther from the plan is no part of the view: one wrong position would make the flight a dot.
+const AREA_DEG = 3;
+// Under the tools nothing is seen, and a low map has no room to spare.
+const TOOLS_PX = 62;
+const LOW_PX = 160;
+const PADDING_PX = 20;
+const GUIDED_MS = 1500;
+let guidedMs = -Infinity;
 const footprints = new Map();
 const follow = document.getElementById("map-follow");
 let isFollowing = true;
@@ -87,15 +96,19 @@ function updateLines() {
 // Draw gaps of the coverage, and the line segments to re-fly for them.
 export const drawGaps = (gaps) => plan.set({ gaps });
 
-function drawMap(choose) {
-  track.setLatLngs(flight.track.map((point) => point.at));
+// With each record: a position gets old without a new one. Guidance is newer while it comes.
+function showAircraft() {
+  if (performance.now() - guidedMs < GUIDED_MS) return;
   const position = flight.brief?.status?.position;
   if (position?.latitude_deg != null) {
-    marker.setLatLng([position.latitude_deg, position.longitude_deg]).addTo(map);
     // An old position is no longer where the aircraft is.
-    const isPresent = presentPosition(flight) !== null;
-    marker.setStyle({ color: colour(isPresent ? "--accent" : "--soft"), dashArray: isPresent ? null : "3 4" });
-  }
+    marker.show(map, [position.latitude_deg, position.longitude_deg], trackOf(position.velocity_ned_mps),
+      presentPosition(flight) ? "present" : "old");
+  } else if (map.hasLayer(marker)) marker.show(map, marker.getLatLng(), null, "old");
+}
+
+function drawMap(choose) {
+  track.setLatLngs(flight.track.map((point) => point.at));
   for (const one of flight.exposures.values()) {
     if (!one.footprint) continue;
     let drawn = footprints.get(one.number);
@@ -122,26 +135,44 @@ function drawMap(choose) {
   frame();
 }
 
-// Fit the map to the footprints or the plan, and to the camera position.
-function frame() {
-  if (!isFollowing) return;
+// The surroundings of the plan, or without one of the newest footprint; null if there is neither.
+function areaOf() {
+  const newest = flight.exposures.size ? footprints.get(Math.max(...footprints.keys())) : null;
+  const { lat, lng } = (planBounds ?? newest?.getBounds())?.getCenter() ?? {};
+  if (lat == null) return null;
+  const area = L.latLngBounds([[lat - AREA_DEG, lng - AREA_DEG], [lat + AREA_DEG, lng + AREA_DEG]]);
+  return planBounds ? area.extend(planBounds) : area;
+}
+
+// What the map shows while it follows the flight: footprints, or the plan, and the aircraft.
+function boundsOfFlight() {
   // Not by a group of layers: each of them would keep every group that it was in.
   const bounds = L.latLngBounds([]);
-  for (const one of footprints.values()) bounds.extend(one.getBounds());
+  const area = areaOf();
+  const isNear = (one) => !area || area.contains(one);
+  for (const one of footprints.values()) if (isNear(one.getBounds())) bounds.extend(one.getBounds());
   if (flight.older.bounds) {
     const [south, west, north, east] = flight.older.bounds;
-    bounds.extend([[south, west], [north, east]]);
+    if (isNear([[south, west], [north, east]])) bounds.extend([[south, west], [north, east]]);
   }
   if (planBounds && (!bounds.isValid() || !planBounds.intersects(bounds))) bounds.extend(planBounds);
+  if (bounds.isValid() && map.hasLayer(marker) && isNear(marker.getLatLng())) bounds.extend(marker.getLatLng());
+  return bounds;
+}
+
+// Fit the map to the flight.
+function frame() {
+  if (!isFollowing) return;
+  const bounds = boundsOfFlight();
   const isSomewhere = map.hasLayer(marker);
-  if (bounds.isValid() && isSomewhere) bounds.extend(marker.getLatLng());
   // Each fit draws every path again.
   const key = bounds.isValid() ? `${bounds.toBBoxString()} ${map.getSize()}` : "";
   if (key && key === framedKey) return;
   framedKey = key;
   isProgrammatic = true;
   if (bounds.isValid()) {
-    map.fitBounds(bounds, { padding: [20, 20], maxZoom: 17, animate: false });
+    const topPx = map.getSize().y < LOW_PX ? PADDING_PX : TOOLS_PX;
+    map.fitBounds(bounds, { paddingTopLeft: [PADDING_PX, topPx], paddingBottomRight: [PADDING_PX, PADDING_PX], maxZoom: 17, animate: false });
   } else if (isSomewhere) map.setView(marker.getLatLng(), 14, { animate: false });
   isProgrammatic = false;
 }
@@ -151,13 +182,14 @@ export function start(root, feed) {
   startMeasuring(map);
   startNoData(map, feed);
   onGuidance((frame) => {
-    if (frame.latitude_deg == null) return;
-    marker.setLatLng([frame.latitude_deg, near(frame.longitude_deg)]).addTo(map);
-    marker.setStyle({ color: colour(frame.is_deviating ? "--warning" : "--accent"), dashArray: null });
+    if (frame.latitude_deg == null || frame.longitude_deg == null) return;
+    guidedMs = frame.receivedMs;
+    marker.show(map, [frame.latitude_deg, near(frame.longitude_deg)], frame.track_deg, frame.is_deviating ? "deviating" : "present");
   });
   feed.subscribe((record, isFirstRecord) => {
     if (!record) plan.draw();
     updateLines();
+    showAircraft();
     if (isFirstRecord || !record || record.exposures || record.track) drawMap(feed.select);
   });
   // A click on an older footprint; those of the newest exposures take their own.

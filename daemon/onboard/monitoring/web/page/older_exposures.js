@@ -3,6 +3,8 @@
 const CORNERS = 4;
 // Grown by as much each time: arrays of twice the size would be half empty.
 const CAPACITY = 512;
+// Of the first corner; what is farther is a wrong position, and not good to centimetres.
+const NEAR_DEG = 4;
 const VERDICTS = [null, "good", "usable", "refly", "lost"];
 
 export class OlderExposures {
@@ -42,7 +44,9 @@ export class OlderExposures {
     this.origin ??= footprint[0];
     const [latitude0, longitude0] = this.origin;
     this.corners.set(footprint.flatMap(([latitude, longitude]) => [latitude - latitude0, longitude - longitude0]), 2 * CORNERS * at);
-    for (const [latitude, longitude] of footprint) this.extend(latitude, longitude);
+    for (const [latitude, longitude] of footprint) {
+      if (Math.abs(latitude - latitude0) <= NEAR_DEG && Math.abs(longitude - longitude0) <= NEAR_DEG) this.extend(latitude, longitude);
+    }
   }
 
   extend(latitude, longitude) {
@@ -70,8 +74,12 @@ export class OlderExposures {
 
   // The newest exposure whose footprint contains a place; null if there is none.
   numberAt(latitude, longitude) {
-    for (let at = this.size - 1; at >= 0; at -= 1) if (this.contains(at, latitude, longitude)) return this.numbers[at];
-    return null;
+    let newest = null;
+    // They come in any order: the past is loaded while new ones are added.
+    for (let at = 0; at < this.size; at += 1) {
+      if (this.numbers[at] > newest && this.contains(at, latitude, longitude)) newest = this.numbers[at];
+    }
+    return newest;
   }
 
   contains(at, latitude, longitude) {

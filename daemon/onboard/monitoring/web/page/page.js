@@ -62,8 +62,8 @@ function linkState(isLinked) {
   if (isLinked) return { label: "link.connected", style: "good" };
   if (!feed.flight.brief) return { label: "link.connecting", style: "caution" };
   return feed.flight.brief.phase === "landed"
-    ? { label: "link.ended", style: "", title: "link.landed_title", sentence: "link.landed", isEnded: true }
-    : { label: "link.disconnected", style: "warning", title: "link.lost_title", sentence: "link.lost", isEnded: false };
+    ? { label: "link.ended", style: "", sentence: "link.landed", isEnded: true }
+    : { label: "link.disconnected", style: "warning", sentence: "link.lost", isEnded: false };
 }
 
 function showLink(isLinked) {
@@ -82,7 +82,6 @@ function showLink(isLinked) {
   if (!isLinked && isLive) {
     by("connection-lost").textContent = t(state.sentence, { time: clock(timeOfDay()) });
     by("connection-lost").classList.toggle("ended", state.isEnded);
-    document.title = `${t(state.title)} · ${document.title}`;
   }
   by("connection-lost").hidden = isLinked || !(isLive || feed.flight.brief);
   isLive = isLinked;

@@ -54,7 +54,8 @@ export function start(_root, feed) {
     by("simulated").hidden = !brief.simulated;
     by("aircraft").textContent = by("aircraft").title = brief.mission.rig || "";
     const mark = /^[✖▲] /.exec(document.title)?.[0] ?? "";
-    document.title = `${mark}${brief.simulated ? `${t("page.simulated")} · ` : ""}${brief.mission.rig || ""} · Syntopic`;
+    const lost = feed.isLinked ? "" : `${t(brief.phase === "landed" ? "link.landed_title" : "link.lost_title")} · `;
+    document.title = `${mark}${lost}${brief.simulated ? `${t("page.simulated")} · ` : ""}${brief.mission.rig || ""} · Syntopic`;
     by("recovery").replaceChildren(...serverTexts(brief.mission, "recovery").map((one) =>
       element("li", { textContent: t("page.recovered", { what: one }) })));
     const shown = brief.phase === "ready" || brief.phase === "armed" ? missing : [];

@@ -4,6 +4,7 @@ import { fetchJson, isRefused } from "./http.js";
 import { near, nearPlaces } from "./longitudes.js";
 import { OlderExposures } from "./older_exposures.js";
 import { clearThumbnails } from "./thumbnails.js";
+import { onWake } from "./wake.js";
 
 export const flight = {
   brief: null,
@@ -29,16 +30,21 @@ export function onChange(listener) {
   listeners.add(listener);
 }
 
-function clear() {
+// What belongs to one mission. Devices and their settings outlive it.
+function clearMission() {
   flight.exposures.clear();
   flight.older.clear();
   flight.restoredNumber = null;
-  flight.devices.clear();
   flight.track.length = 0;
   flight.history.length = 0;
-  flight.settings = null;
   // Before any listener asks for those of the new state.
   clearThumbnails();
+}
+
+function clear() {
+  clearMission();
+  flight.devices.clear();
+  flight.settings = null;
 }
 
 // Drop every second item of the older half, so that the length stays bounded and the end detailed.
@@ -100,6 +106,8 @@ function merge(record, isFirstRecord) {
   const { exposures = [], devices = [], track = [], history = [], settings = [], ...brief } = record;
   const { position } = brief.status ?? {};
   if (position) position.longitude_deg = near(position.longitude_deg);
+  const isOther = isFirstRecord || flight.brief?.mission?.id !== brief.mission?.id;
+  if (isOther && !isFirstRecord) clearMission();
   flight.brief = brief;
   for (const one of exposures) addExposure(one);
   for (const one of devices) flight.devices.set(one.name, one);
@@ -112,8 +120,8 @@ function merge(record, isFirstRecord) {
   thin(flight.track, TRACK_MAX);
   thin(flight.history, HISTORY_MAX);
   prune();
-  for (const listener of listeners) listener(record, isFirstRecord);
-  if (isFirstRecord) loadOlder();
+  for (const listener of listeners) listener(record, isOther);
+  if (isOther) loadOlder();
 }
 
 // Receive telemetry and reconnect for ever. `onLinkChange(isLinked)` is called when the connection
@@ -122,6 +130,9 @@ export function connect(onLinkChange, requestToken) {
   const scheme = location.protocol === "https:" ? "wss" : "ws";
   let waitMs = 500;
   let silence = null;
+  let closeConnection = null;
+  // After a sleep the connection is dead, and until a time-out it would look alive.
+  onWake(() => closeConnection?.());
   const open = () => {
     let isFirstRecord = true;
     const token = sessionStorage.getItem("token");
@@ -143,12 +154,14 @@ export function connect(onLinkChange, requestToken) {
       setTimeout(open, waitMs);
       waitMs = Math.min(waitMs * 2, 8000);
     };
+    const close = () => {
+      socket.close();
+      end();
+    };
+    closeConnection = close;
     const restartTimeout = () => {
       clearTimeout(silence);
-      silence = setTimeout(() => {
-        socket.close();
-        end();
-      }, SILENCE_MS);
+      silence = setTimeout(close, SILENCE_MS);
     };
     // Also while it opens.
     restartTimeout();
@@ -160,8 +173,7 @@ export function connect(onLinkChange, requestToken) {
         record = JSON.parse(message.data);
       } catch {
         // Unreadable: the values shown would be frozen on a link that looks live.
-        socket.close();
-        end();
+        close();
         return;
       }
       waitMs = 500;

@@ -21,17 +21,17 @@ function drawVerdict() {
   const word = latest ? latest.verdict || "lost" : "waiting";
   const container = by("verdict");
   const which = latest ? t("verdict.exposure", { number: latest.number }) : "";
-  const key = `${which} ${word}`;
+  const lost = { verdict: "lost", message: latest?.message, sentence: latest?.sentence || t("verdict.lost_text") };
+  const findings = word === "lost" ? [lost] : latest?.findings || [];
+  const key = JSON.stringify([which, word, findings]);
   if (container.dataset.shown === key) return;
   container.dataset.shown = key;
   container.className = `verdict ${word}`;
   container.querySelector(".mark").textContent = MARKS[word] || "·";
   container.querySelector(".word").textContent = verdictText(word);
   container.querySelector(".which").textContent = which;
-  const lost = { verdict: "lost", message: latest?.message, sentence: latest?.sentence || t("verdict.lost_text") };
-  const findings = (word === "lost" ? [lost] : [...(latest?.findings || [])])
-    .sort((a, b) => SEVERITY_ORDER[a.verdict] - SEVERITY_ORDER[b.verdict]);
-  by("findings").replaceChildren(...findings.map((finding) =>
+  const sorted = [...findings].sort((a, b) => SEVERITY_ORDER[a.verdict] - SEVERITY_ORDER[b.verdict]);
+  by("findings").replaceChildren(...sorted.map((finding) =>
     element("li", { textContent: findingText(finding), className: finding.verdict })));
 }
 
