@@ -46,6 +46,7 @@ def triangulate_photographs(
     from daemon.postflight.adjustment.summary import print_report, report_of
     from daemon.postflight.calibration.rig_writer import rig_toml
     from daemon.postflight.triangulation.control_mistakes import control_mistakes, doubtful_control
+    from daemon.postflight.triangulation.displayed_pixels import as_stored
     from daemon.postflight.triangulation.ground_control import control_of
     from daemon.postflight.triangulation.held_interior import free_principal_point
     from daemon.postflight.triangulation.photograph_block import photograph_block_of
@@ -75,7 +76,7 @@ def triangulate_photographs(
             progress.update(task, description=what, completed=done, total=total)
 
         found = photograph_block_of(folder, crs=crs, compute=compute, progress=step)
-        control = control_of(found, points, measured)
+        control, converted = as_stored(found, control_of(found, points, measured))
         if mistakes := control_mistakes(found, control):
             raise TriangulationError(f"{points}: {'; '.join(mistakes)}")
 
@@ -112,7 +113,7 @@ def triangulate_photographs(
         )
         section = photographs_section(found, control, result, free)
         report["photographs"] = section
-        report["cautions"] += [*less, *photograph_cautions(section)]
+        report["cautions"] += [*converted, *less, *photograph_cautions(section)]
         write_triangulation(results, found.block, project, result, report)
         content = rig_toml(
             adjusted_rig(found.block.rig, result),

@@ -37,6 +37,8 @@ GPS_ALTITUDE_REF, GPS_ALTITUDE, GPS_TIME, GPS_DATE = 5, 6, 7, 29
 _SIZES: Final = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4}
 _LETTERS: Final = {1: "B", 3: "H", 4: "I", 6: "b", 8: "h", 9: "i", 11: "f", 12: "d", 13: "I"}
 _MM_PER_UNIT: Final = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}
+_BELOW: Final = ((1.0,), (3.0,), b"\x01", b"\x03", "1", "3")
+"""GPSAltitudeRef of heights below the sea (EXIF 2.32; in 3.0 the ellipsoid) and, 3, the sea."""
 _START_OF_FRAME: Final = frozenset({*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC})
 
 
@@ -91,7 +93,14 @@ def read_tags(path: Path) -> ImageTags:
             return _tiff(data, "tiff")
     except (struct.error, IndexError, ValueError, OverflowError) as error:
         raise TagsError(f"{path.name}: damaged tags ({error}); give the original file") from error
-    raise TagsError(f"{path.name}: neither JPEG nor TIFF")
+    if not data:
+        raise TagsError(
+            f"{path.name}: is empty; copy it from the camera's card again, or move it out of the "
+            "folder"
+        )
+    if data[:4] in (b"II+\0", b"MM\0+"):
+        raise TagsError(f"{path.name}: BigTIFF is not read; write it as TIFF")
+    raise TagsError(f"{path.name}: neither JPEG nor TIFF; move it out of the folder")
 
 
 def _jpeg(data: bytes) -> ImageTags:
@@ -195,7 +204,8 @@ def _value(raw: bytes, kind: int, n: int, order: str, code: int) -> Value:
 def position_of(tags: ImageTags) -> tuple[float, float, float] | None:
     """Latitude, longitude, deg, and height, m, as the camera's receiver gave them; else None.
 
-    A height below sea level (GPSAltitudeRef 1) is negative; of one that is not given it is NaN.
+    A height below its reference (GPSAltitudeRef 1, of EXIF 3.0 also 3) is negative; of one that is
+    not given it is NaN.
     Zero degrees on both axes is a receiver without a fix.
     """
     gps = tags.gps
@@ -204,7 +214,7 @@ def position_of(tags: ImageTags) -> tuple[float, float, float] | None:
         longitude = _degrees(gps[GPS_LONGITUDE]) * _sign(gps[GPS_LONGITUDE_REF], "E", "W")
     except (KeyError, TypeError, ValueError, IndexError):
         return None
-    height, below = gps.get(GPS_ALTITUDE), gps.get(GPS_ALTITUDE_REF) in ((1.0,), b"\x01")
+    height, below = gps.get(GPS_ALTITUDE), gps.get(GPS_ALTITUDE_REF) in _BELOW
     if not isinstance(height, tuple) or not height or not math.isfinite(height[0]):
         height = (math.nan,)
     place = (latitude, longitude, -height[0] if below else height[0])

@@ -11,9 +11,12 @@ import math
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
+
+import numpy as np
 
 from daemon.mission.canonical_json import sha256_hex
 from daemon.mission.exposure import Exposure, FrameRecord, exposure_bytes
@@ -23,6 +26,11 @@ from daemon.postflight.calibration.rig_writer import rig_toml
 from daemon.postflight.importers import exif_tags
 from daemon.postflight.importers.exif_tags import ImageTags, TagsError, read_tags
 from daemon.postflight.importers.multispectral_tags import ImagesError
+from daemon.postflight.importers.photograph_files import (
+    check_complete,
+    other_images,
+    photograph_paths,
+)
 from daemon.postflight.importers.xmp import XmpError, read_xmp
 from processing.rig import Cone, Lens, Rig, Sensor, load_rig
 
@@ -31,17 +39,20 @@ CONE: Final = "C"
 _CONES: Final = re.compile(r"C[1-9]?[0-9]?")
 _CAMERAS_MAX: Final = 20
 RIG_NAME: Final = "photographs"
-SUFFIXES: Final = (".jpg", ".jpeg", ".tif", ".tiff")
 POSITIONS_MIN: Final = 3
+_ABOVE_TAKEOFF: Final = "RelativeAltitude"
 NO_HEIGHT_M: Final = 0.0
 """Height of all photographs where none states one."""
 _NOMINAL_PITCH_MM: Final = 1e-3
-_FILES_MAX: Final = 100_000
 
 
 @dataclass(frozen=True)
 class Photograph:
-    """One file: camera, size, provisional focal length in pixels, place or None."""
+    """One file: camera, size, provisional focal length in pixels, place or None.
+
+    `above_takeoff_m` is RelativeAltitude of XMP, else NaN. `height_source` is the tag that the
+    height of the place comes from, empty where all heights are taken as zero.
+    """
 
     path: Path
     camera: str
@@ -55,6 +66,9 @@ class Photograph:
     taken: str
     exposure_time_us: float | None
     position: tuple[float, float, float] | None
+    above_takeoff_m: float = math.nan
+    height_source: str = "GPSAltitude"
+    orientation: int = 1
 
 
 @dataclass(frozen=True)
@@ -114,8 +128,10 @@ def import_photographs(
             _write_exposure(part, number, (one, head), written, sha256_hex(content))
             if progress is not None:
                 progress(number, len(photographs))
-    notes = (*_notes(photographs, heads), *copies)
-    return ImportedPhotographs(Mission.open(out), tuple(photographs), heads, notes)
+    notes = [*_notes(photographs, heads), *copies]
+    if others := other_images(folder):
+        notes.append(f"{others}.")
+    return ImportedPhotographs(Mission.open(out), tuple(photographs), heads, tuple(notes))
 
 
 def read_photographs(
@@ -128,17 +144,15 @@ def read_photographs(
     """
     if (focal_mm is None) != (pixel_um is None):
         raise ImagesError(["--focal-mm and --pixel-um go together; give both or neither"])
-    if not folder.is_dir():
-        raise ImagesError([f"{folder}: no such folder; give the one with the photographs"])
-    paths = sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES)
-    if len(paths) < 2 or len(paths) > _FILES_MAX:
-        raise ImagesError([f"{folder}: holds {len(paths)} JPEG or TIFF files; a block takes two"])
+    paths = photograph_paths(folder)
     given = None if focal_mm is None or pixel_um is None else (focal_mm, pixel_um)
     problems: list[str] = []
     found: list[Photograph] = []
     for path in paths:
         try:
-            found.append(_photograph(path, read_tags(path), given))
+            tags = read_tags(path)
+            check_complete(path, is_jpeg=tags.kind == "jpeg")
+            found.append(_photograph(path, tags, given))
         except TagsError as error:
             problems.append(str(error))
     kinds = Counter(map(_kind, found))
@@ -205,6 +219,7 @@ def _photograph(path: Path, tags: ImageTags, given: tuple[float, float] | None) 
         )
     camera = f"{tags.text(exif_tags.MAKE)} {tags.text(exif_tags.MODEL)}".strip() or "unknown camera"
     seconds = tags.number(exif_tags.EXPOSURE_TIME)
+    position, above_m = _with_height_of_xmp(path, tags)
     return Photograph(
         path=path,
         camera=camera[:80],
@@ -217,33 +232,52 @@ def _photograph(path: Path, tags: ImageTags, given: tuple[float, float] | None) 
         f_number=tags.number(exif_tags.F_NUMBER) or 5.6,
         taken=tags.text(exif_tags.DATE_TIME_ORIGINAL)[:40],
         exposure_time_us=None if seconds is None or seconds <= 0.0 else seconds * 1e6,
-        position=_position(path, tags),
+        position=position,
+        above_takeoff_m=above_m,
+        orientation=int(tags.number(exif_tags.ORIENTATION) or 1),
     )
 
 
-def _position(path: Path, tags: ImageTags) -> tuple[float, float, float] | None:
-    """Of EXIF; a height that is not there is that of XMP (drone-dji:AbsoluteAltitude), else NaN."""
-    place = exif_tags.position_of(tags)
+def _with_height_of_xmp(
+    path: Path, tags: ImageTags
+) -> tuple[tuple[float, float, float] | None, float]:
+    """Position and height above the takeoff point, m; heights that are not stated are NaN.
+
+    A height that EXIF has not is that of XMP (drone-dji:AbsoluteAltitude).
+    """
+    place, above = exif_tags.position_of(tags), math.nan
     if place is None or math.isfinite(place[2]) or tags.xmp is None:
-        return place
+        return place, above
     try:
-        return (*place[:2], read_xmp(tags.xmp, path.name).number("AbsoluteAltitude"))
+        xmp = read_xmp(tags.xmp, path.name)
     except XmpError:
-        return place
+        return place, above
+    with suppress(XmpError):
+        above = xmp.number("RelativeAltitude")
+    with suppress(XmpError):
+        place = (*place[:2], xmp.number("AbsoluteAltitude"))
+    return place, above
 
 
 def _with_heights(photographs: list[Photograph]) -> list[Photograph]:
-    """Positions without height are none where others have one; else all heights are zero."""
-    places = [one.position for one in photographs if one.position is not None]
-    if all(math.isfinite(place[2]) for place in places):
+    """Positions without height are none where others have one.
+
+    Without any, all heights are those above the takeoff point, and zero where one has none.
+    """
+    placed = [one for one in photographs if one.position is not None]
+    heights = np.array([one.position[2] for one in placed if one.position is not None])
+    if np.isfinite(heights).all():
         return photographs
-    is_any = any(math.isfinite(place[2]) for place in places)
+    is_any = bool(np.isfinite(heights).any())
+    is_above = all(math.isfinite(one.above_takeoff_m) for one in placed)
     found = []
     for one in photographs:
-        place = one.position
+        place, source = one.position, one.height_source
         if place is not None and not math.isfinite(place[2]):
-            place = None if is_any else (*place[:2], NO_HEIGHT_M)
-        found.append(replace(one, position=place))
+            height = one.above_takeoff_m if is_above else NO_HEIGHT_M
+            place = None if is_any else (*place[:2], height)
+            source = _ABOVE_TAKEOFF if is_above else ""
+        found.append(replace(one, position=place, height_source=source))
     return found
 
 
@@ -335,9 +369,13 @@ def _write_exposure(
     settings: dict[str, float | int | str] = {"Source": one.path.name}
     if one.taken:
         settings["DateTimeOriginal"] = one.taken
+    if one.orientation != 1:
+        settings["Orientation"] = one.orientation
     if one.position is not None:
         place = ("GpsLatitudeDeg", "GpsLongitudeDeg", "GpsAltitudeM")
         settings |= dict(zip(place, one.position, strict=True))
+        if one.height_source != "GPSAltitude":
+            settings["HeightSource"] = one.height_source or "none"
     frame = FrameRecord(
         sensor=head,
         head_serial=one.serial,
@@ -379,8 +417,14 @@ def _notes(photographs: Sequence[Photograph], heads: Sequence[str]) -> tuple[str
             f"{len(without)} photographs have no position: {', '.join(without[:5])}"
             f"{', ...' if len(without) > 5 else ''}."
         )
-    heights = {one.position[2] for one in photographs if one.position is not None}
-    if heights == {NO_HEIGHT_M}:
+    sources = {one.height_source for one in photographs if one.position is not None}
+    if _ABOVE_TAKEOFF in sources:
+        notes.append(
+            "EXIF has no GPSAltitude: heights are those above the takeoff point "
+            "(RelativeAltitude of XMP), and all heights of the block are, unless control places "
+            "it (--points)."
+        )
+    elif "" in sources:
         notes.append(
             "EXIF has no GPSAltitude: all heights are taken as 0 m, as of level flight. Heights of "
             "the block are below the flight, unless control places it (--points)."

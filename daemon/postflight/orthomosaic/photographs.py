@@ -1,6 +1,7 @@
 """Photographs as images of an orthomosaic: undistorted by the adjusted interior orientation.
 
-Values are those of the file, encoded as the camera encoded them, times 256. PAN is their luma.
+Values are those of the file, encoded as the camera encoded them: of 16 bits as they are, of 8 bits
+times 256. PAN is their luma.
 """
 
 from __future__ import annotations
@@ -96,7 +97,9 @@ def photograph_pixels(
     lattice = np.ascontiguousarray(_lattice(head)[first[0] : last[0] + 1, first[1] : last[1] + 1])
     planes = {}
     for k, band in enumerate(BANDS):
-        words = np.asarray(decoded[..., k].astype(np.uint16) * 256 + 128, np.uint16)
+        words = np.asarray(decoded[..., k], np.uint16)
+        if decoded.dtype == np.uint8:
+            words = words * 256 + 128
         whole = _resampled(words, lattice)
         r0, c0 = r - first[0] * _CELL_PX, c - first[1] * _CELL_PX
         planes[band] = whole[r0 : r0 + height, c0 : c0 + width]
@@ -107,7 +110,9 @@ def photograph_pixels(
 
 
 @lru_cache(maxsize=_DECODED_MAX)
-def _decoded(mission: Mission, number: int, head: Cone, _mtime_ns: int) -> NDArray[np.uint8]:
+def _decoded(
+    mission: Mission, number: int, head: Cone, _mtime_ns: int
+) -> NDArray[np.uint8] | NDArray[np.uint16]:
     exposure = sealed_exposure(mission, number)
     if exposure is None:
         raise RasterError(f"{mission.level0(number)}: it is not sealed")

@@ -96,6 +96,21 @@ def shift_to_control(found: PhotographBlock, control: GroundControl) -> Array:
     return np.median(away, axis=0) if len(away) else np.zeros(3)
 
 
+def contradiction_m(found: PhotographBlock, control: GroundControl) -> float:
+    """Sum of the deviations of control from the photographs after a common shift, m.
+
+    Args:
+        found: oriented photographs.
+        control: its points, measured in these photographs.
+
+    Returns:
+        Infinite where a measurement is outside its image.
+    """
+    if _outside(found, control):
+        return float("inf")
+    return _total(_deviations(found, control, control.xyz_m)[0])
+
+
 def unmeasured(control: GroundControl) -> list[str]:
     """Control points that no photograph of the block shows, one sentence."""
     seen = np.bincount(control.point, minlength=len(control.names))

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import re
+import unicodedata
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -85,7 +86,7 @@ def read_gcp_list(path: Path, images: Mapping[str, int], frame: LocalFrame) -> G
     rows: list[tuple[str, tuple[float, float, float], int, tuple[float, float]]] = []
     unused: list[str] = []
     for n, line in numbered[1:]:
-        parts = line.replace(",", " ").split()
+        parts = _parts(line, images)
         try:
             numbers = [float(part) for part in parts[:5]]
             image = parts[5]
@@ -198,9 +199,26 @@ def _geodetic(path: Path, system: str, xyz: Array) -> Array:
     return np.stack([latitude, longitude, height], axis=-1)
 
 
+def _parts(line: str, images: Mapping[str, int]) -> list[str]:
+    """Columns of a line; the name of an image may contain spaces, with or without tabs."""
+    if line.count("\t") >= 5:
+        return [part.strip() for part in line.split("\t")]
+    parts = line.replace(",", " ").split()
+    rest = re.split(r"[\s,]+", line, maxsplit=5)[5:]
+    if not rest or _image_of(parts[5], images) is not None:
+        return parts
+    ends = [match.start() for match in re.finditer(r"[\s,]+|$", rest[0])]
+    for end in reversed(ends):
+        own = rest[0][:end]
+        _, dot, suffix = own.rpartition(".")
+        if not (dot and " " in suffix) and _image_of(own, images) is not None:
+            return [*parts[:5], own, *rest[0][end:].replace(",", " ").split()]
+    return parts
+
+
 def _image_of(name: str, images: Mapping[str, int]) -> int | None:
     """Index of an image by its file's name, without its folder, or with another suffix."""
-    own = name.replace("\\", "/").rsplit("/", 1)[-1].lower()
+    own = _plain(name.replace("\\", "/").rsplit("/", 1)[-1])
     if own in images:
         return images[own]
     stem = own.rsplit(".", 1)[0]
@@ -226,9 +244,14 @@ def _named_utm(system: str) -> str | None:
 
 
 def image_index(names: Sequence[str], files: Mapping[str, str]) -> dict[str, int]:
-    """Index of every image by its name and by that of its file, in small letters."""
-    by_name = {name.lower(): k for k, name in enumerate(names)}
-    return by_name | {files[name].lower(): k for k, name in enumerate(names)}
+    """Index of every image by its name and by that of its file, as `_plain` writes them."""
+    by_name = {_plain(name): k for k, name in enumerate(names)}
+    return by_name | {_plain(files[name]): k for k, name in enumerate(names)}
+
+
+def _plain(name: str) -> str:
+    """In small letters and composed characters: macOS decomposes them in the names of files."""
+    return unicodedata.normalize("NFC", name).strip().lower()
 
 
 def control_of(

@@ -8,7 +8,7 @@ named with the reason.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Final
 
@@ -76,7 +76,8 @@ class PhotographBlock:
     first camera. `files` by image name. `cameras` have oriented images, `sizes` are their pixels,
     `camera_of` (n,) is the camera of each image. `left_out` has a sentence for each photograph
     without orientation, `wrong_positions` one for each position of EXIF that is not used.
-    `position_m` (n, 3) is NaN where EXIF has none that is used.
+    `position_m` (n, 3) is NaN where EXIF has none that is used. `orientation` (n,) is that of
+    EXIF, by which viewers turn a photograph; empty where none is known.
     """
 
     block: ImageBlock
@@ -89,6 +90,7 @@ class PhotographBlock:
     position_m: Array
     left_out: tuple[str, ...]
     wrong_positions: tuple[str, ...] = ()
+    orientation: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
 
     def image_mm(self, image: NDArray[np.int64], px: Array) -> Array:
         """Image coordinates (m, 2), mm, of pixels (m, 2) of images (m,)."""
@@ -164,7 +166,10 @@ def photograph_block_of(
     block = _assembled(
         mission, rig, exposures, frame, position, tracks, features, placed, crs, camera_of
     )
-    return replace(block, wrong_positions=wrong_position)
+    turned = np.array([_orientation(exposure) for exposure in exposures])
+    return replace(
+        block, wrong_positions=wrong_position, orientation=turned[np.flatnonzero(placed.oriented)]
+    )
 
 
 def _image_mm(sizes: Sequence[VirtualImage], camera: NDArray[np.int64], px: Array) -> Array:
@@ -214,6 +219,12 @@ def _position(exposure: Exposure) -> tuple[float, float, float]:
         return (np.nan, np.nan, np.nan)
     a, b, c = (float(value) for value in values if isinstance(value, int | float))
     return (a, b, c)
+
+
+def _orientation(exposure: Exposure) -> int:
+    settings = exposure.frames[0].settings if exposure.frames else {}
+    value = settings.get("Orientation", 1)
+    return int(value) if isinstance(value, int | float) and 1 <= value <= 8 else 1
 
 
 def _source(exposure: Exposure) -> str:

@@ -34,6 +34,10 @@ Pairs = dict[tuple[int, int], Indices]
 DETECTOR_NBYTES: Final = 1_000_000_000
 """Scales of an image of 2,400 px and of its doubled one, in 32 bits."""
 
+_RANGE_PERCENT: Final = (0.1, 99.9)
+"""Of the words of a 16-bit photograph that become black and white: few fill all their bits."""
+_SAMPLED: Final = 4
+
 
 @dataclass(frozen=True)
 class UnmatchedPhotograph:
@@ -87,7 +91,7 @@ class PhotographMatchingAction:
             pixels = original_pixels(
                 work.mission, task.payload.exposure, task.payload.image, grey=True
             )
-            store_features(work.folder, number, features_of(pixels))
+            store_features(work.folder, number, features_of(np.asarray(pixels, np.uint8)))
             return {}
         partners: Sequence[int] = task.payload
         features = [stored_features(work.folder, k) for k in (number, *partners)]
@@ -166,23 +170,33 @@ def stored_features(folder: Path, number: int) -> ImageFeatures:
 
 def original_pixels(
     mission: Mission, exposure: Exposure, image: VirtualImage, *, grey: bool
-) -> NDArray[np.uint8]:
+) -> NDArray[np.uint8] | NDArray[np.uint16]:
     """Pixels of a photograph as its sensor wrote them, (h, w) grey or (h, w, 3) red, green, blue.
+
+    Grey ones have 8 bits: of 16-bit files the range that is used. Colours have the file's bits.
 
     Raises:
         RasterError: no image, damaged, or of another size.
     """
     path = mission.level0(exposure.number) / exposure.frames[0].file
-    how = cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_COLOR_RGB
-    pixels = cv2.imread(str(path), how | cv2.IMREAD_IGNORE_ORIENTATION)
+    # Quirk: IMREAD_COLOR_RGB with IMREAD_ANYDEPTH disorders 16-bit samples.
+    # Upstream: no report known (2026-11-29); OpenCV 5.0, TIFF decoder.
+    how = cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_COLOR
+    pixels = cv2.imread(str(path), how | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
     if pixels is None:
         raise RasterError(f"{path}: no image that can be decoded; copy the original again")
+    if pixels.dtype not in (np.uint8, np.uint16):
+        raise RasterError(f"{path}: pixels of {pixels.dtype}; write it with 8 or 16 bits")
     if pixels.shape[:2] != (image.height_px, image.width_px):
         raise RasterError(
             f"{path}: {pixels.shape[1]} x {pixels.shape[0]} px; the camera has {image.width_px} x "
             f"{image.height_px} px"
         )
-    return np.ascontiguousarray(pixels, np.uint8)
+    if grey and pixels.dtype == np.uint16:
+        low, high = np.percentile(pixels[::_SAMPLED, ::_SAMPLED], _RANGE_PERCENT)
+        scale = 255.0 / max(float(high - low), 1.0)
+        pixels = np.clip((pixels - np.float32(low)) * np.float32(scale), 0, 255).astype(np.uint8)
+    return np.ascontiguousarray(pixels if grey else pixels[..., ::-1])
 
 
 def _refuse_failures(outcome: BatchOutcome) -> None:

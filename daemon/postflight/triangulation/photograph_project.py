@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from daemon.postflight.adjustment.project import CheckPoints, Project
 from daemon.postflight.adjustment.project_file import AdjustSection, CameraSection, ProjectFile
 from daemon.postflight.triangulation.control_mistakes import shift_to_control, unmeasured
-from daemon.postflight.triangulation.ground_control import GroundControl
+from daemon.postflight.triangulation.ground_control import GroundControl, no_control
 from daemon.postflight.triangulation.held_interior import (
     FreePrincipalPoint,
     with_principal_point,
@@ -43,6 +43,7 @@ from processing.bundle.network import (
 )
 from processing.bundle.normal_equations import reduced_equations
 from processing.bundle.rank_diagnosis import RankDefectError
+from processing.bundle.residual_weights import REJECT_BEYOND
 from processing.rig import Rig
 
 Array = NDArray[np.float64]
@@ -64,6 +65,7 @@ def photograph_project(
     *,
     position_sigma_m: tuple[float, float, float],
     reject_beyond: float,
+    tie_sigma_px: tuple[float, float] = (TIE_SIGMA_PX, TIE_SIGMA_PX),
 ) -> Project:
     """Everything as an adjustment project in the local frame.
 
@@ -72,6 +74,7 @@ def photograph_project(
         control: control and check points.
         position_sigma_m: of the positions of EXIF, east, north, up.
         reject_beyond: rejection limit in sigmas.
+        tie_sigma_px: of matched columns and rows.
     """
     shift_m = shift_to_control(found, control)
     has_shift = _places_block(control)
@@ -85,8 +88,10 @@ def photograph_project(
     sigma[tied.points :][is_control] = control.sigma_m[is_control]
     px = np.concatenate([tied.px, control.px])
     image = np.concatenate([tied.image, control.image])
-    spread = np.concatenate([np.full(len(tied.image), TIE_SIGMA_PX), control.sigma_px])
-    spread *= np.array([size.pitch_mm for size in found.sizes])[found.camera_of[image]]
+    spread = np.concatenate(
+        [np.tile(tie_sigma_px, (len(tied.image), 1)), np.tile(control.sigma_px, (2, 1)).T]
+    )
+    spread *= np.array([size.pitch_mm for size in found.sizes])[found.camera_of[image], None]
     cameras = _cameras(found)
     if _determines_principal_point(control):
         cameras = with_principal_point(
@@ -104,7 +109,7 @@ def photograph_project(
             image,
             np.concatenate([tied.point, control.point + tied.points]),
             found.image_mm(image, px),
-            np.stack([spread, spread], axis=1),
+            spread,
         ),
         gnss=Gnss(
             station=placed,
@@ -180,7 +185,13 @@ def adjusted_photographs(
         RankDefectError: directions without information.
     """
     project = photograph_project(
-        found, control, position_sigma_m=position_sigma_m, reject_beyond=reject_beyond
+        found,
+        control,
+        position_sigma_m=position_sigma_m,
+        reject_beyond=reject_beyond,
+        tie_sigma_px=residual_sigma_px(found, position_sigma_m, progress)
+        if len(control.image)
+        else (TIE_SIGMA_PX, TIE_SIGMA_PX),
     )
     trials = (
         (project, ""),
@@ -204,6 +215,36 @@ def adjusted_photographs(
             continue
         return trial, result, (sentence,) if sentence else ()
     raise AssertionError("the last trial returns or raises")
+
+
+def residual_sigma_px(
+    found: PhotographBlock,
+    position_sigma_m: tuple[float, float, float],
+    progress: Callable[[str, int, float], None] | None = None,
+) -> tuple[float, float]:
+    """Standard deviations of matched columns and rows, px, as their residuals show them.
+
+    The block is adjusted without control: measurements of control keep their own standard
+    deviation, and would otherwise be scaled with matched points that are many times better.
+
+    Args:
+        found: oriented photographs.
+        position_sigma_m: of the positions of EXIF, east, north, up.
+        progress: see `adjust`.
+
+    Returns:
+        Columns and rows; `TIE_SIGMA_PX` where the photographs do not determine them.
+    """
+    alone = photograph_project(
+        found, no_control(), position_sigma_m=position_sigma_m, reject_beyond=REJECT_BEYOND
+    )
+    settings = replace(alone.settings, reject_beyond=None)
+    try:
+        result = adjust(completed(alone.network), settings, progress=progress)
+    except (NetworkError, RankDefectError):
+        return TIE_SIGMA_PX, TIE_SIGMA_PX
+    x, y = (float(np.sqrt(result.factors.get(name, 1.0))) for name in ("image x", "image y"))
+    return TIE_SIGMA_PX * x, TIE_SIGMA_PX * y
 
 
 def _with_fixed_accuracies(project: Project) -> Project:
