@@ -5,7 +5,9 @@
   const HEARTBEAT_MS = 1000;
   const bytesOf = (text) => Uint8Array.from(atob(text), (one) => one.charCodeAt(0));
   const [thumbnail, quicklook] = [bytesOf(replay.thumbnail), bytesOf(replay.quicklook)];
+  // Of the gaps the replay holds bytes outside the heap of JavaScript, in which the page is measured.
   const segments = [];
+  const encoder = new TextEncoder();
   let [number, sequence, telemetry, latest] = [0, 0, null, {}];
 
   window.WebSocket = class {
@@ -25,7 +27,8 @@
     [/histogram\.json$/, () => json({ SU00: [0, 5, 9, 5], R: [0, 1, 2, 3] })],
     [/residuals\.json$/, () => json({ width_px: 900, height_px: 600, overlaps: [], vectors: [] })],
     [/\/plan$/, () => json({ ...replay.plan, retakes: [] })],
-    [/\/advice$/, () => json({ planned_m: 1e5, covered_m: 5e4, hole_m2: 1e3, notes: [], segments })],
+    [/\/advice$/, () => new Response(new Blob(['{"planned_m": 1e5, "covered_m": 5e4, "hole_m2": 1e3, "notes": [], "segments": [',
+      ...segments.flatMap((one, k) => k ? [",", one] : [one]), "]}"]))],
     [/\/advice\//, () => new Response("x".repeat(200 * segments.length))],
     [/\/maps$/, () => json([])],
     [/\/limits$/, () => json({})],
@@ -46,9 +49,9 @@
     const square = [[y - 3e-4, x - 0.0015], [y - 3e-4, x + 0.0015], [y + 3e-4, x + 0.0015], [y + 3e-4, x - 0.0015]];
     const verdict = number % 100 === 99 ? "refly" : number % 10 === 9 ? "usable" : "good";
     if (verdict === "refly") {
-      segments.push({ line: `A${line}`, strip: `S${line}`, kind: "hole", from_m: 66 * along, to_m: 66 * along + 66,
+      segments.push(encoder.encode(JSON.stringify({ line: `A${line}`, strip: `S${line}`, kind: "hole", from_m: 66 * along, to_m: 66 * along + 66,
         at: [[y, x], [y + 6e-4, x]], reasons: [`exposure ${number}: refly (SIGMA0)`],
-        holes: [{ area_m2: 5000, images: 1, needed: 2, bands: [], rings: [square] }] });
+        holes: [{ area_m2: 5000, images: 1, needed: 2, bands: [], rings: [square] }] })));
     }
     return { number, sequence, step: "processed", verdict, line: `A${line}`, frames: 13, mark_sigma_ns: 25, duration_s: 0.5,
       missing: [], footprint: square, place: { latitude_deg: y, longitude_deg: x, height_m: 1395, leap_seconds: 18 },

@@ -21,10 +21,11 @@ from tests.support.browser import Browser, chromium
 OLDER = """(async () => {{
   const {{ OlderExposures }} = await import('/older_exposures.js');
   const older = new OlderExposures();
-  const square = (k) => [[k, 0], [k, 1], [k + 1, 1], [k + 1, 0]];
-  for (let k = 0; k < 3000; k += 1) older.add(k + 1, k % 2 ? 'good' : 'refly', square(k));
+  const step = 2 ** -12;
+  const square = (k) => [[k * step, 0], [k * step, 1], [(k + 1) * step, 1], [(k + 1) * step, 0]];
+  for (let k = 0; k < 9000; k += 1) older.add(k + 1, k % 2 ? 'good' : 'refly', square(k));
   older.add(7, 'lost', square(6));
-  older.add(9000, 'good', null);
+  older.add(90000, 'good', null);
   return {};
 }})()"""
 
@@ -160,13 +161,14 @@ def test_a_page_opened_late_shows_the_newest_first_and_all_footprints(
 @pytest.mark.parametrize(
     ("expression", "expected"),
     [
-        ("older.size", 3000),
+        ("older.size", 9000),
         ("older.verdictAt(6)", "lost"),
         (
-            "[older.numberAt(0.5, 0.5), older.numberAt(2999.5, 0.5), older.numberAt(5, 2)]",
-            [1, 3000, None],
+            "[0.5, 8999.5].map((k) => older.numberAt(k * step, 0.5))"
+            ".concat(older.numberAt(5 * step, 2))",
+            [1, 9000, None],
         ),
-        ("older.bounds", [0, 0, 3000, 1]),
+        ("older.bounds", [0, 0, 9000 / 4096, 1]),
     ],
 )
 def test_numbers_of_older_exposures_are_packed(

@@ -35,7 +35,7 @@ function withUnit(value, unit, digits) {
 
 export const height = (m) => withUnit(m, units.height, 0);
 export const length = (m, digits = 0) => withUnit(m, units.height, digits);
-// A tenth of a kilometre says nothing of hundreds of them.
+// Hundreds of kilometres need no tenths.
 export const distance = (m, digits = Math.abs(m) < 1e5 ? 1 : 0) => withUnit(m, units.distance, digits);
 export const speed = (mps) => withUnit(mps, units.speed, units.speed === "m/s" ? 1 : 0);
 export const angle = (deg, digits = 0) => isKnown(deg) ? `${number(deg, digits)}°` : UNKNOWN;

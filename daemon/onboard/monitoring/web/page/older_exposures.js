@@ -1,8 +1,8 @@
 // Footprints and verdicts of exposures that the page no longer keeps whole: numbers in typed arrays, 37 bytes each.
 
 const CORNERS = 4;
-// Grown by as much each time: arrays of twice the size would be half empty.
-const CAPACITY = 512;
+// Room for a long flight from its begin, 300 kB; grown by as much if that does not do.
+const CAPACITY = 8192;
 // Of the first corner; what is farther is a wrong position, and not good to centimetres.
 const NEAR_DEG = 4;
 const VERDICTS = [null, "good", "usable", "refly", "lost"];
