@@ -12,7 +12,8 @@ import pytest
 
 from processing.rig import shipped_rigs
 from tests.daemon.onboard.monitoring import flight_events
-from tests.daemon.onboard.monitoring.cockpit import MEASURES, Cockpit, lines
+from tests.daemon.onboard.monitoring.cockpit import LINES, MEASURES, Cockpit, lines
+from tests.daemon.onboard.monitoring.guidance_frames import guidance_frame
 from tests.daemon.onboard.monitoring.page_service import WITHIN_S, Service
 from tests.support.browser import Browser, chromium
 
@@ -144,7 +145,7 @@ def test_what_was_shown_before_a_sleep_is_not_fresh_after_it(cockpit: Cockpit) -
     cockpit.status("flying", triggers=7)
     cockpit.guide(0.00005)
     found = cockpit.browser.evaluate(
-        """import('/wake.js').then(({ checkSleep }) => {
+        """import('/wake.js').then(async ({ checkSleep }) => {
           const real = Date.now;
           checkSleep();
           const isLostBefore = document.body.classList.contains('connection-lost');
@@ -152,8 +153,11 @@ def test_what_was_shown_before_a_sleep_is_not_fresh_after_it(cockpit: Cockpit) -
           checkSleep();
           Date.now = real;
           checkSleep();
-          return [isLostBefore, document.body.classList.contains('connection-lost'),
-            document.title, document.querySelector('#guidance .age').innerText,
+          const [isLost, title] = [document.body.classList.contains('connection-lost'),
+            document.title];
+          // Guidance shows its age four times a second, and connects again after half a second.
+          await new Promise((resolve) => setTimeout(resolve, 350));
+          return [isLostBefore, isLost, title, document.querySelector('#guidance .age').innerText,
             document.querySelector('#guidance').classList.contains('lost')];
         })"""
     )
@@ -216,3 +220,34 @@ def test_the_newest_of_older_footprints_is_found_in_whatever_order_they_came(
         })"""
     )
     assert found == [302, None, [47, 0, 48, 1]]
+
+
+def test_exposures_in_any_order_are_shown_by_their_number(cockpit: Cockpit) -> None:
+    for number in (4, 2, 5, 3):
+        cockpit.emit(*exposure_at(number))
+    strip = "[...document.querySelectorAll('#strip .thumb .t-mark')].map((one) => one.textContent)"
+    cockpit.until(f"{strip}.length === 5")
+    assert cockpit.browser.evaluate(strip) == [f"● {number}" for number in (5, 4, 3, 2, 1)]
+    assert cockpit.browser.text("#verdict .which") == "exposure 5"
+    assert cockpit.browser.evaluate("document.querySelector('#image-which').textContent") == "5"
+
+
+def test_a_pilot_sees_no_instruction_from_before_a_sleep(cockpit: Cockpit) -> None:
+    browser = cockpit.browser
+    browser.open(f"{cockpit.service.address}pilot")
+    cockpit.until("document.querySelector('#pilot-link')?.innerText === 'linked'")
+    cockpit.emit(guidance_frame(LINES, 0.4, east_deg=0.0005))
+    cockpit.until("document.querySelector('#pilot-alarm').innerText.includes('Steer')")
+    found = browser.evaluate(
+        """import('/wake.js').then(async ({ checkSleep }) => {
+          const real = Date.now;
+          checkSleep();
+          Date.now = () => real() + 600e3;
+          checkSleep();
+          Date.now = real;
+          checkSleep();
+          await new Promise((resolve) => setTimeout(resolve, 350));
+          return document.querySelector('#pilot-alarm').innerText;
+        })"""
+    )
+    assert "No guidance" in found and "Steer" not in found

@@ -4,7 +4,6 @@ import { t } from "./i18n.js";
 import { element } from "./dom.js";
 import { followGuidance } from "./guidance_link.js";
 import { drawAge, drawBar, drawCells } from "./guidance_view.js";
-import { onWake } from "./wake.js";
 
 const AGE_MS = 250;
 const listeners = new Set();
@@ -30,12 +29,7 @@ export function start(root, feed) {
     drawAge(root, age, last);
     for (const listener of listeners) listener(last);
   };
-  const showAge = () => { if (root.firstChild) drawAge(root, age, last); };
-  setInterval(showAge, AGE_MS);
-  onWake((sleptMs) => {
-    if (last) last.receivedMs -= sleptMs;
-    showAge();
-  });
+  setInterval(() => { if (root.firstChild) drawAge(root, age, last); }, AGE_MS);
   feed.subscribe((record) => {
     root.hidden = feed.flight.brief.phase === "landed";
     if (!record && last) draw();

@@ -1,6 +1,7 @@
 // Guidance frames of the service: one WebSocket, each frame answered, so that a slow link loses rate and not age.
 
 import { headers, isRefused } from "./http.js";
+import { onWake } from "./wake.js";
 
 const RETRY_MIN_MS = 500;
 const RETRY_MAX_MS = 8000;
@@ -11,10 +12,17 @@ const SILENCE_MS = 6000;
 export function followGuidance(onFrame, onLink = () => {}, requestToken = null) {
   const scheme = location.protocol === "https:" ? "wss" : "ws";
   let waitMs = RETRY_MIN_MS;
+  let last = null;
+  let present = null;
+  onWake((sleptMs) => {
+    if (last) last.receivedMs -= sleptMs;
+    present?.close();
+  });
   const open = () => {
     const token = (headers().Authorization || "").replace("Bearer ", "");
     const protocols = token ? ["syntopic.v1", `bearer.${token}`] : ["syntopic.v1"];
     const socket = new WebSocket(`${scheme}://${location.host}/api/v1/guidance`, protocols);
+    present = socket;
     let silence = null;
     let isAdmitted = false;
     const restart = () => {
@@ -31,6 +39,7 @@ export function followGuidance(onFrame, onLink = () => {}, requestToken = null) 
       const frame = JSON.parse(message.data);
       socket.send(String(frame.frame));
       frame.receivedMs = performance.now();
+      last = frame;
       onFrame(frame);
     };
     socket.onclose = async () => {
