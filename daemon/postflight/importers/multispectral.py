@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter, defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -56,6 +56,13 @@ _DUAL_BLUE: Final = ("B", "G", "R", "E", "E2")
 _ORDER: Final = ("B", "G", "R", "N", "E", "E2")
 _ONE_INSTANT_S: Final = 1.0
 """Files without a capture's name belong together within this time."""
+_ONE_NAME_S: Final = 2.0
+"""Files whose names make them a capture are not farther apart: clocks are of whole seconds."""
+_BAND_IN_NAME: Final = re.compile(
+    r"(.*[0-9].*?)(?:_MS)?_(?:[0-9]|GRE|RED|REG|NIR|BLU|B|G|R|RE|N)", re.IGNORECASE
+)
+_TIME_IN_NAME: Final = re.compile(r"(?<![0-9])[0-9]{14}_")
+"""DJI's, which may differ by a second between bands; a number follows it."""
 _BAND_OF: Final = dict(BANDS.values())
 
 
@@ -282,6 +289,8 @@ def _camera_of(
         )
     if any(image.black is None for image in first.values()):
         own.append(f"{name}: no BlackLevel is stated; it is taken as 0")
+    if unused := dict.fromkeys(tag for image in images for tag in image.unused):
+        own.append(f"{name}: tags that the files have and nothing uses: {', '.join(unused)}")
     if all(image.utc is None for image in images):
         own.append(
             f"{name}: its clock is not stated to be UTC (UTCAtExposure, OffsetTimeOriginal); "
@@ -320,13 +329,33 @@ def _captures(images: Sequence[BandImage], problems: list[str]) -> list[list[Ban
             "DateTimeOriginal; which bands belong together is not known"
         )
         timed = []
-    groups: list[list[BandImage]] = []
-    for image in sorted(timed, key=_instant):
+    groups: list[list[BandImage]] = list(_by_file_name(timed))
+    for image in sorted(timed if not groups else (), key=_instant):
         if not groups or not _belongs(image, groups[-1]):
             groups.append([])
         groups[-1].append(image)
     found = [*named.values(), *groups]
     return sorted(found, key=lambda capture: min(str(image.path) for image in capture))
+
+
+def _by_file_name(images: Sequence[BandImage]) -> Iterable[list[BandImage]]:
+    """Captures by names such as IMG_0012_3 or IMG_0012_NIR, where all files have such ones.
+
+    A capture without a band and the next one a second later would otherwise exchange bands. None
+    where names contradict bands or times.
+    """
+    found: dict[tuple[Path, str], list[BandImage]] = defaultdict(list)
+    for image in images:
+        parts = _BAND_IN_NAME.fullmatch(_TIME_IN_NAME.sub("", image.path.stem))
+        if parts is None:
+            return []
+        found[image.path.parent, parts[1]].append(image)
+    for group in found.values():
+        times = sorted(map(_instant, group))
+        is_doubled = len({image.sensor for image in group}) < len(group)
+        if is_doubled or (times[-1] - times[0]).total_seconds() > _ONE_NAME_S:
+            return []
+    return found.values()
 
 
 def _instant(image: BandImage) -> datetime:

@@ -60,6 +60,15 @@ _SAME_SCALE: Final = 0.01
 _CAPTURE: Final = ("CaptureId", "CaptureUUID", "ImageUniqueID")
 """Names of a capture: of MicaSense, of DJI and Parrot, of Sentera."""
 _COLONS_IN_DATE: Final = re.compile(r"^(\d{4}):(\d\d):(\d\d)")
+_SUN: Final = (
+    *("Irradiance", "IrradianceList", "DirectIrradiance", "HorizontalIrradiance"),
+    *("SpectralIrradiance", "SunSensor", "SunSensorExposureTime"),
+)
+_RESPONSE: Final = (
+    *("SensorModel", "SensorGain", "SensorGainAdjustment", "BandSensitivity"),
+    *("VignettingData", "VignettingPolynomial", "VignettingPolynomial2D"),
+)
+"""Tags of the sun sensor, and of the response of cameras other than MicaSense's."""
 _F_SHARE: Final = (0.2, 50.0)
 """Focal lengths that are possible, in longer sides of the image."""
 
@@ -83,7 +92,7 @@ class BandImage:
     `lens` and `calibration` are the head's; the rest is of this exposure. `black` is in words of
     16 bits, None where the file does not state it. `taken` is the camera's own clock, `utc` the
     same in UTC where this is known. `capture_id` is empty where the file has none. `ones` has each
-    bit that is set in any word.
+    bit that is set in any word. `unused` are radiometric tags that the file has and nothing uses.
     """
 
     path: Path
@@ -106,6 +115,7 @@ class BandImage:
     utc: datetime | None
     place: Mapping[str, float]
     ones: int
+    unused: tuple[str, ...] = ()
 
 
 def read_image(path: Path) -> tuple[BandImage, NDArray[np.uint16]]:
@@ -206,11 +216,12 @@ def _image(path: Path, tags: Mapping[int, Any], xmp: Xmp, pixels: NDArray[np.uin
         f_number=_ratio(exif["FNumber"]) if "FNumber" in exif else 5.6,
         exposure_time_s=time_s,
         gain=gain,
-        black=_black(path, tags),
+        black=_black(path, tags, xmp),
         taken=taken,
         utc=_utc(xmp, exif, taken, is_micasense=is_micasense),
         place=_place(tags.get(_GPS, {})),
         ones=int(np.bitwise_or.reduce(pixels, axis=None)),
+        unused=tuple(key for key in (*_SUN, *(() if is_micasense else _RESPONSE)) if key in xmp),
     )
 
 
@@ -368,12 +379,15 @@ def _serial(xmp: Xmp, exif: Mapping[str, Any]) -> str:
     return "unknown"
 
 
-def _black(path: Path, tags: Mapping[int, Any]) -> float | None:
+def _black(path: Path, tags: Mapping[int, Any], xmp: Xmp) -> float | None:
+    """BlackLevel of the image, else BlackCurrent of DJI's XMP."""
     if _BLACK_LEVEL not in tags:
-        return None
+        if "BlackCurrent" not in xmp:
+            return None
+        tags = {_BLACK_LEVEL: xmp.number("BlackCurrent")}
     black = np.atleast_1d(tags[_BLACK_LEVEL]).astype(np.float64)
     if not (black.size and black.min() >= 0.0 and black.max() < 65536.0):
-        raise ImagesError([f"{path.name}: BlackLevel is no word of 16 bits"])
+        raise ImagesError([f"{path.name}: BlackLevel or BlackCurrent is no word of 16 bits"])
     return float(black.mean())
 
 
@@ -420,6 +434,8 @@ def _place(gps: Any) -> dict[str, float]:
         latitude = _degrees(gps["GPSLatitude"]) * (-1 if gps["GPSLatitudeRef"] == "S" else 1)
         longitude = _degrees(gps["GPSLongitude"]) * (-1 if gps["GPSLongitudeRef"] == "W" else 1)
         height = _ratio(gps["GPSAltitude"])
+        below = np.atleast_1d(gps.get("GPSAltitudeRef", 0))[0]
+        height = -height if below in (1, 3, b"\x01", b"\x03") else height
     except (KeyError, IndexError, TypeError, ValueError, ZeroDivisionError):
         return {}
     if not all(math.isfinite(value) for value in (latitude, longitude, height)):

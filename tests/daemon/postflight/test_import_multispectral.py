@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import struct
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -400,6 +401,80 @@ def test_captures_without_a_name_are_grouped_by_time(scene, tmp_path) -> None:
         "DJI_0099.TIF: neither CaptureId, CaptureUUID, ImageUniqueID nor DateTimeOriginal"
         in sentence
     )
+
+
+@pytest.mark.parametrize(
+    "name", ["IMG_{0:04d}_{1}.TIF", "DJI_202405060708{2:02d}_{0:04d}_MS_{3}.TIF"]
+)
+def test_captures_a_second_apart_are_grouped_by_the_names_of_files(scene, tmp_path, name) -> None:
+    """The first lacks a band, which that of the second would stand in for by time alone."""
+    nameless = {"CaptureUUID": ""}
+    bands = (("Green", "G"), ("Red", "R"), ("RedEdge", "RE"), ("NIR", "NIR"))
+    for capture in (1, 2):
+        for number, (band, code) in enumerate(bands, 1):
+            if (capture, number) == (1, 1):
+                continue
+            # Clocks of whole seconds; the last band's is one further.
+            second = 7 + capture + (number == 4)
+            dji(
+                tmp_path / "in", scene, band, name.format(capture, number, second, code),
+                tags=nameless, taken=f"2024:05:06 07:08:{second:02d}", subsec=None,
+            )  # fmt: skip
+    (camera,) = imported(tmp_path / "in", tmp_path / "out")
+    assert (camera["exposures"], camera["frames"]) == (2, 7)
+    assert camera["missing"] == ["exposure 1 has no frame of G"]
+
+
+def test_names_that_contradict_times_do_not_make_captures(scene, tmp_path) -> None:
+    """A counter that began again in the same folder: ten seconds between files of one number."""
+    nameless = {"CaptureUUID": ""}
+    for number, (band, second) in enumerate(
+        (("Green", 8), ("Red", 8), ("RedEdge", 18), ("NIR", 18)), 1
+    ):
+        dji(
+            tmp_path / "in", scene, band, f"IMG_0001_{number}.TIF", tags=nameless,
+            taken=f"2024:05:06 07:08:{second:02d}",
+        )  # fmt: skip
+    (camera,) = imported(tmp_path / "in", tmp_path / "out")
+    assert camera["exposures"] == 2
+
+
+def test_radiometric_tags_that_nothing_uses_are_named(scene, tmp_path) -> None:
+    tags = {"Irradiance": "812.5", "SensorGain": "1.2", "VignettingData": "1,2,3,4,5,6"}
+    dji(tmp_path / "dji", scene, "Green", "a.tif", tags=tags)
+    (camera,) = imported(tmp_path / "dji", tmp_path / "one")
+    (note,) = [one for one in camera["notes"] if "nothing uses" in one]
+    assert note.endswith(": Irradiance, SensorGain, VignettingData")
+    tags = {"HorizontalIrradiance": "0.9", "VignettingPolynomial": "0,0,0,0,0,0"}
+    micasense(tmp_path / "mica", scene, "Green", "IMG_0000_2.tif", "RedEdge-M", "R1", tags=tags)
+    (camera,) = imported(tmp_path / "mica", tmp_path / "two")
+    (note,) = [one for one in camera["notes"] if "nothing uses" in one]
+    assert note.endswith(": HorizontalIrradiance")
+
+
+def test_the_black_level_of_dji_may_be_in_its_xmp(scene, tmp_path) -> None:
+    for band, changes in (("Green", {}), ("NIR", {"black": 4000})):
+        tags = {"BlackCurrent": "4096"}
+        dji(tmp_path / "in", scene, band, f"{band}.tif", tags=tags, **{"black": None, **changes})
+    (camera,) = imported(tmp_path / "in", tmp_path / "out")
+    rig = load_rig(tmp_path / "out/rig.toml")
+    assert (rig.sensor("G").black_dn, rig.sensor("N").black_dn) == (4096.0, 4000.0)
+    assert not any("BlackLevel" in note for note in camera["notes"])
+
+
+def test_a_place_below_the_sea_has_a_negative_height(scene, tmp_path) -> None:
+    dji(tmp_path / "in", scene, "Green", "a.tif", gps=(31.5, 35.5, 410.0))
+    path = tmp_path / "in/a.tif"
+    path.write_bytes(path.read_bytes().replace(entry_of_reference(0), entry_of_reference(1)))
+    imported(tmp_path / "in", tmp_path / "out")
+    record = json.loads((tmp_path / "out/L0/000001/exposure.json").read_text())
+    assert record["frames"][0]["settings"]["GpsAltitudeM"] == pytest.approx(-410.0)
+
+
+def entry_of_reference(value: int) -> bytes:
+    """GPSAltitudeRef as it is in the file, a byte."""
+    code, kind, count, raw = entry(5, "byte", bytes([value]))
+    return struct.pack("<HHI", code, kind, count) + raw.ljust(4, b"\0")
 
 
 def test_an_unknown_camera_is_refused_with_what_is_missing(scene, tmp_path) -> None:
