@@ -6,7 +6,7 @@ import json
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from pydantic import ValidationError
@@ -112,7 +112,7 @@ def process(
                 "method": method,
                 "interpolation": interpolation,
                 "baselines": baselines,
-                "thresholds": flown_thresholds(folder),
+                **flown_processing(folder),
             }
         )
         work = Level2Work(
@@ -238,14 +238,17 @@ def _print_dry_run(
     )
 
 
-def flown_thresholds(folder: Mission) -> dict[str, float]:
-    """Thresholds of the flown configuration, for the same verdicts as in flight."""
-    given = nested_value(folder.flown_configuration(), "processing", "thresholds") or {}
+def flown_processing(folder: Mission) -> dict[str, Any]:
+    """Thresholds and device of the flown configuration, for verdicts and pixels as in flight."""
+    flown = folder.flown_configuration()
+    values = {key: nested_value(flown, "processing", key) for key in ("thresholds", "device")}
+    given = {key: value for key, value in values.items() if value}
     try:
-        return ProcessingSection.model_validate({"thresholds": given}).thresholds
+        section = ProcessingSection.model_validate(given)
     except ValidationError as error:
         findings = [(("processing", *where), text) for where, text in findings_of(error)]
         raise ConfigurationError(sentences(findings, str(folder.service_path))) from error
+    return {"thresholds": section.thresholds, "device": section.device}
 
 
 def as_flown(

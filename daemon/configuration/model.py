@@ -26,6 +26,7 @@ from daemon import DaemonError
 from daemon.configuration.section import ConfigurationSection, FilePath, Several
 from daemon.configuration.watch_section import MavlinkCameraSection as MavlinkCameraSection
 from daemon.configuration.watch_section import WatchSection as WatchSection
+from processing.image.accelerator.devices import DEFAULT_DEVICE, Device
 from processing.image.kernels import DEFAULT_INTERPOLATION, Interpolation
 from processing.quality.report import Thresholds
 from processing.rig.problem_sentences import ProblemList
@@ -258,6 +259,9 @@ class ProcessingSection(ConfigurationSection):
     """Stitching by free image mosaicking, or by the fixed calibration."""
     interpolation: Interpolation = DEFAULT_INTERPOLATION
     """Kernel of the one resampling from raw pixels."""
+    device: Device = DEFAULT_DEVICE
+    """Device that corrects and resamples frames; `cuda-reference` computes the pixels of `cuda` on
+    the processor."""
     baselines: bool = False
     """Whether results of the fixed method are written for comparison."""
     geometry: bool = True

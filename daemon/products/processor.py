@@ -85,7 +85,8 @@ def processor_for(
         radiometry: folder of calibrations; sensors without one are taken as ideal.
 
     Raises:
-        CalibrationError, ValueError: a calibration that does not fit, or a rig of no known kind.
+        CalibrationError, ValueError: a calibration that does not fit, a rig of no known kind, or a
+            device that cannot be used.
     """
     own = radiance_folder(mission)
     return build_processor(rig, processing, radiometry, mission.plan_path, own_radiance=own)
@@ -107,12 +108,14 @@ def build_processor(
         own_radiance: folder of radiance calibrations where `radiometry` is None.
 
     Raises:
-        CalibrationError, ValueError: a calibration that does not fit, or a rig of no known kind.
+        CalibrationError, ValueError: a calibration that does not fit, a rig of no known kind, or a
+            device that cannot be used.
         PlanError: a plan that cannot be read.
     """
     given: dict[str, Any] = processing.thresholds
     common: dict[str, Any] = {
         "threads": processing.threads,
+        "device": processing.device,
         "thresholds": replace(Thresholds(), **given),
         "requirements": quality_requirements_of(plan_file),
     }

@@ -21,6 +21,7 @@ from processing.geometry.placement import (
     vip_mm_from_raw,
     vip_px_from_mm,
 )
+from processing.image.accelerator.pixel_kernels import Resample
 from processing.image.balance import Balance, balance_gains, node_means
 from processing.image.colour import ColourHead
 from processing.image.kernels import Interpolation
@@ -106,9 +107,15 @@ class PanComposer:
     """Level-1 frames of the PAN sensors and what is needed to make one image of them."""
 
     def __init__(
-        self, image: VirtualImage, sensors: Collection[Sensor], *, cell_px: int = PAN_CELL_PX
+        self,
+        image: VirtualImage,
+        sensors: Collection[Sensor],
+        *,
+        cell_px: int = PAN_CELL_PX,
+        resample: Resample = resample,
     ) -> None:
         self.image = image
+        self.resample = resample
         self.cell_px = cell_px
         self.sensors = tuple(sensors)
         self.names = tuple(sensor.name for sensor in self.sensors)
@@ -192,7 +199,7 @@ class PanComposer:
         offsets = np.array([balance.offsets.get(name, 0.0) for name in self.names], np.float32)
         labels = seam_labels(self._middles(placements), self._means, gains, feather_px)
         seam_weights(labels, feather_px, self._weights)
-        resample(
+        self.resample(
             self._frames,
             self._valid,
             self._lattices,
@@ -259,8 +266,11 @@ class PanComposer:
 class ColourComposer:
     """Level-1 frames of the colour sensors and the rasters of their bands."""
 
-    def __init__(self, image: VirtualImage, heads: Sequence[ColourHead]) -> None:
+    def __init__(
+        self, image: VirtualImage, heads: Sequence[ColourHead], *, resample: Resample = resample
+    ) -> None:
         self.image = image
+        self.resample = resample
         self.heads = tuple(heads)
         raster = colour_raster(image)
         rows, columns = lattice_shape(raster, COLOUR_CELL_PX)
@@ -359,7 +369,7 @@ class ColourComposer:
             self._lattice[0],
             source_from_target_mm=source_from_target_mm,
         )
-        resample(
+        self.resample(
             self._frames[band],
             np.array([_usable(placement)]),
             self._lattice,

@@ -24,6 +24,8 @@ from processing.geometry.conditions import (
     condition_figures,
     usable_temperatures,
 )
+from processing.image.accelerator.devices import DEFAULT_DEVICE, Device
+from processing.image.accelerator.pixel_kernels import PixelKernels, pixel_kernels
 from processing.quality.evaluation import evaluate
 from processing.quality.figures import FigureGroup, QualityFigures
 from processing.quality.figures.stitching import MethodFigures
@@ -38,9 +40,14 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True, kw_only=True)
 class StageSettings:
-    """How exposures are processed, whatever the rig."""
+    """How exposures are processed, whatever the rig.
+
+    `device` makes the pixels of stitched images and of separate heads; everything else is computed
+    by the processor.
+    """
 
     threads: int = 2
+    device: Device = DEFAULT_DEVICE
     thresholds: Thresholds = field(default_factory=Thresholds)
     requirements: QualityRequirements = field(default_factory=QualityRequirements)
 
@@ -80,6 +87,7 @@ class ExposureInput:
     conditions: Conditions
     temperatures: UsableTemperatures
     clock: Stopwatch = field(default_factory=Stopwatch)
+    kernels: PixelKernels = field(default_factory=lambda: pixel_kernels(DEFAULT_DEVICE))
 
     def correct(
         self,
@@ -115,6 +123,7 @@ class ExposureInput:
             out=out,
             measure_lines=measure_lines,
             unclean=unclean,
+            passes=self.kernels.passes,
         )
 
 
@@ -159,6 +168,7 @@ class ExposurePipeline(ABC, Generic[SettingsT, CorrectedT, AdjustedT, ImageT, Pr
     def __init__(self, rig: Rig, settings: SettingsT) -> None:
         self.rig = rig
         self.settings = settings
+        self.kernels = pixel_kernels(settings.device)
 
     def process(
         self,
@@ -206,7 +216,7 @@ class ExposurePipeline(ABC, Generic[SettingsT, CorrectedT, AdjustedT, ImageT, Pr
     def _read(self, frames: Mapping[str, Array], conditions: Conditions) -> ExposureInput:
         """What is known of the exposure."""
         temperatures = usable_temperatures(self.rig, conditions, self.settings.thresholds)
-        return ExposureInput(frames, conditions, temperatures)
+        return ExposureInput(frames, conditions, temperatures, kernels=self.kernels)
 
     @abstractmethod
     def _correct(self, exposure: ExposureInput) -> CorrectedT:

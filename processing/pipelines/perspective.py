@@ -28,7 +28,6 @@ from processing.image.resampling import (
     SATURATED_SOURCE,
     SUPPORT_MARGIN_PX,
     WEIGHT_UNIT,
-    resample,
 )
 from processing.pipelines.exposure_pipeline import (
     ExposureInput,
@@ -320,7 +319,7 @@ class HeadPipeline(
         value = np.empty((height, width), np.uint16)
         source = np.empty((height, width), np.uint8)
         edge = float(SUPPORT_MARGIN_PX)
-        resample(
+        self.kernels.resample(
             np.ascontiguousarray(plane)[None],
             np.array([[edge, width - 1 - edge - 1e-3, edge, height - 1 - edge - 1e-3]]),
             lattice[None],

@@ -121,8 +121,10 @@ class Pipeline(
         pan = [sensor for cone in rig.pan_cones for sensor in cone.sensors]
         self._heads = colour_heads(rig)
         self._grid = grid_of(rig.virtual_image.width_px, rig.virtual_image.height_px)
-        self._pan = PanComposer(rig.virtual_image, pan, cell_px=pan_cell_px(rig))
-        self._colour = ColourComposer(rig.virtual_image, self._heads)
+        resample = self.kernels.resample
+        cell_px = pan_cell_px(rig)
+        self._pan = PanComposer(rig.virtual_image, pan, cell_px=cell_px, resample=resample)
+        self._colour = ColourComposer(rig.virtual_image, self._heads, resample=resample)
         self._correctors = correctors_for(
             (*pan, *(head.sensor for head in self._heads)), radiometry or {}
         )
@@ -142,8 +144,10 @@ class Pipeline(
         Calibrations, the larger part of the memory, are shared.
         """
         other = copy.copy(self)
-        other._pan = PanComposer(self._pan.image, self._pan.sensors, cell_px=self._pan.cell_px)
-        other._colour = ColourComposer(self._colour.image, self._heads)
+        resample = self.kernels.resample
+        pan = self._pan
+        other._pan = PanComposer(pan.image, pan.sensors, cell_px=pan.cell_px, resample=resample)
+        other._colour = ColourComposer(self._colour.image, self._heads, resample=resample)
         return other
 
     def warm_up(self) -> None:

@@ -16,7 +16,7 @@ Source: docs/explanation/mathematics/radiometry.md#offset-and-gain, #tdi and #de
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any, Final
@@ -63,11 +63,22 @@ _DARK_STEP_DN_PER_S: Final = 0.5
 _BANDS: Final = 39
 """Parts of a frame that threads share."""
 _UNREAD_NOISES: Final = 10.0
-_UNREAD_STEP_PX: Final = 256
+UNREAD_STEP_PX: Final = 256
 """Of every line so many columns apart are compared with black; a lost packet is longer."""
 _MATHEMATICS: Final = {"contract", "nnan", "ninf", "nsz"}
 """No approximate reciprocals: compilers take them or not as loops happen to vectorise, and the same
 bytes must give the same pixels wherever the kernels were compiled."""
+
+
+@dataclass(frozen=True)
+class RadiometricPasses:
+    """The loops over the pixels of a frame, compiled for one device.
+
+    `flat` takes the arguments of `_flat_pass`, `maps` those of `_map_pass`.
+    """
+
+    flat: Callable[..., None]
+    maps: Callable[..., None]
 
 
 @dataclass(frozen=True)
@@ -205,6 +216,7 @@ def level1_from_level0(
     scale: float = 1.0,
     measure_lines: bool = False,
     unclean: Array | None = None,
+    passes: RadiometricPasses | None = None,
 ) -> FrameStatistics:
     """Fill `out` with the Level-1 words of a raw frame.
 
@@ -223,6 +235,7 @@ def level1_from_level0(
             range of words counts as saturated.
         measure_lines: whether the means of bundles along lines are wanted.
         unclean: marks as of `processing.radiometry.unclean_blocks.unknown_blocks`, overwritten.
+        passes: the compiled loops; None takes those of the processor. All have the same bits.
 
     Returns:
         What the pass saw of the frame.
@@ -272,8 +285,9 @@ def level1_from_level0(
     out[end:] = 0
     marks = np.zeros((0, 0), np.uint8) if unclean is None else unclean
     begin_marks(marks, sensor.height_px, exposed)
+    passes = passes or CPU_PASSES
     if corrector.bias is None or corrector.dark is None or corrector.response is None:
-        _flat_pass(
+        passes.flat(
             raw,
             np.float32(offset_dn),
             np.float32(by_gain * corrector.flat_gain),
@@ -287,7 +301,7 @@ def level1_from_level0(
             marks,
         )
     else:
-        _map_pass(
+        passes.maps(
             raw,
             corrector.bias,
             corrector.dark,
@@ -318,8 +332,8 @@ def level1_from_level0(
     pixels = max((end - first) * sensor.width_px, 1)
     total, saturated, unread = (int(value) for value in sums.sum(axis=0))
     for rows in (raw[:first], raw[end:]):
-        unread += int(np.count_nonzero(rows[:, ::_UNREAD_STEP_PX] < max(least, 0)))
-    compared = sensor.height_px * -(-sensor.width_px // _UNREAD_STEP_PX)
+        unread += int(np.count_nonzero(rows[:, ::UNREAD_STEP_PX] < max(least, 0)))
+    compared = sensor.height_px * -(-sensor.width_px // UNREAD_STEP_PX)
     return FrameStatistics(
         2.0 * total / counts / pixels,
         saturated / pixels,
@@ -375,7 +389,7 @@ def unread_fraction(sensor: Sensor, raw: Array) -> float | None:
     least = min_raw_value(sensor)
     if least <= 0:
         return None
-    seen = raw[:, ::_UNREAD_STEP_PX]
+    seen = raw[:, ::UNREAD_STEP_PX]
     return float(np.count_nonzero(seen < least)) / seen.size
 
 
@@ -528,6 +542,10 @@ def _map_pass(
 def _unread(line, least):
     """How many of the words compared are below the least one of a pixel that was read out."""
     count = 0
-    for k in range(0, len(line), _UNREAD_STEP_PX):
+    for k in range(0, len(line), UNREAD_STEP_PX):
         count += line[k] < least
     return count
+
+
+CPU_PASSES: Final = RadiometricPasses(_flat_pass, _map_pass)
+"""Those of the processor."""

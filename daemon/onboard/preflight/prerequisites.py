@@ -31,6 +31,7 @@ from daemon.onboard.preflight.check_results import CheckOutcome, CheckResult, fa
 from daemon.onboard.preflight.import_names import import_names
 from drivers.base import registry
 from drivers.base.extras import MissingExtraError, require
+from processing.image.accelerator.devices import why_unusable
 from processing.rig import Rig
 
 Check: TypeAlias = Callable[[Configuration, Rig], Iterator[CheckResult]]
@@ -76,6 +77,17 @@ def libraries(configuration: Configuration, rig: Rig) -> Iterator[CheckResult]:
             yield failed("library", extra, str(error), is_blocking=True)
         else:
             yield passed("library", extra)
+
+
+def accelerator(configuration: Configuration, _rig: Rig) -> Iterator[CheckResult]:
+    """The device that pixels are computed on, where it is not the processor."""
+    device = configuration.processing.device
+    if device == "cuda":
+        sentence = why_unusable(device)
+        if sentence is None:
+            yield passed("accelerator", device)
+        else:
+            yield failed("accelerator", device, sentence, is_blocking=True)
 
 
 def calibration(configuration: Configuration, rig: Rig) -> Iterator[CheckResult]:
@@ -245,6 +257,7 @@ def monitoring(configuration: Configuration, _rig: Rig) -> Iterator[CheckResult]
 CHECKS: Final[Sequence[Check]] = (
     import_names,
     libraries,
+    accelerator,
     calibration,
     storage,
     disk_health,

@@ -38,6 +38,7 @@ from daemon.products.exposure_products import (
     make_products,
 )
 from daemon.products.processor import Processor, processor_for
+from processing.image.accelerator.devices import with_same_pixels
 from processing.rig import Rig, load_rig
 
 
@@ -96,7 +97,9 @@ class Level2Work:
             )
         mission = Mission.open(self.mission, checks_subfolders=False)
         rig = load_rig(self.rig_file or mission.rig_path)
-        processing = self.processing.model_copy(update={"threads": self.threads})
+        device = with_same_pixels(self.processing.device)
+        updated = {"threads": self.threads, "device": device}
+        processing = self.processing.model_copy(update=updated)
         processor = processor_for(rig, mission, processing, self.radiometry)
         processor.warm_up()
         mount, _ = mount_of(mission)

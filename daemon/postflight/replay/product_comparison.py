@@ -34,6 +34,7 @@ from daemon.products.exposure_products import FlightGeometry, make_products
 from daemon.products.pipeline_pool import PipelinePool
 from daemon.products.processing_threads import configure_threads
 from daemon.products.processor import Processor, processor_for
+from processing.image.accelerator.devices import with_same_pixels
 from processing.quality.report import Flag
 from processing.rig import Rig
 
@@ -79,13 +80,16 @@ def compare_products(
     """The images of every exposure that has some, made again with so many exposures in work.
 
     Args:
-        processing, plan: as flown.
+        processing, plan: as flown. Pixels of an accelerator that is not here are computed by the
+            processor.
         out: records replayed before; takes in the comparison.
         radiometry: folder of radiometric calibrations; None takes those of the mission.
         parallel: exposures processed at a time.
         only: numbers of the exposures that are compared; empty takes all.
     """
     configure_threads()
+    device = with_same_pixels(processing.device)
+    processing = processing.model_copy(update={"device": device})
     processor = processor_for(rig, mission, processing, radiometry)
     processor.warm_up()
     mount, _ = mount_of(mission)

@@ -1,0 +1,1 @@
+"""The kernels that make pixels, on an accelerator that the configuration chooses."""
