@@ -19,7 +19,7 @@
   }
 
   function outside() {
-    const primary = seen("#phase-button, #phase-second, #open-commands, .lamp, #alarm-bar button, #tabs button, #verdict, #left div, #open-settings, .g-cell, .g-bar, #guidance .age, #map-tools > *, #map-legend, .leaflet-control");
+    const primary = seen("#phase, #simulated, #verdict-chip, #theme, #phase-button, #phase-second, #open-commands, .lamp, #alarm-bar button, #tabs button, #verdict, #left div, #open-settings, .g-cell, .g-bar, #guidance .age, #map-tools > *, #map-legend, .leaflet-control");
     return primary.filter((one) => {
       const { left, top, right, bottom } = box(one);
       return left < -0.5 || top < -0.5 || right > innerWidth + 0.5 || bottom > innerHeight + 0.5;
@@ -71,7 +71,7 @@
     const [a, b] = [luminance(rgb(getComputedStyle(one).color)), luminance(ground(one))].sort((x, y) => y - x);
     return (a + 0.05) / (b + 0.05);
   }
-  const contrasts = () => Object.fromEntries(seen(".verdict .word, .verdict .which, #alarm-bar .what *, .faults li *, .lamp .name, .lamp .value, .p-alarm, #aircraft li *, .g-label, .g-value, #guidance .age, #phase-button, #left dd, #left dt")
+  const contrasts = () => Object.fromEntries(seen(".verdict .word, .verdict .which, #verdict-chip, #alarm-bar .what *, .faults li *, .lamp .name, .lamp .value, .p-alarm, #aircraft li *, .g-label, .g-value, #guidance .age, #phase-button, #left dd, #left dt")
     .filter((one) => one.textContent.trim()).map((one) => [`${name(one)} ${one.textContent.slice(0, 20)}`, contrast(one)]).sort((a, b) => b[1] - a[1]));
 
   const scrolls = () => document.documentElement.scrollHeight > innerHeight || document.documentElement.scrollWidth > innerWidth || scrollY !== 0;

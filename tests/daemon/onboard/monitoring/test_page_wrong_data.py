@@ -132,6 +132,19 @@ def test_findings_that_come_later_are_shown_and_a_phone_shows_the_gravest(
     cockpit.resize(1280, 800)
 
 
+def test_a_phone_has_the_verdict_in_view_on_every_page(cockpit: Cockpit) -> None:
+    cockpit.resize(390, 844)
+    chip = "document.querySelector('#verdict-chip')"
+    for tab, is_seen in (("flight", True), ("alarms", True), ("map", False)):
+        cockpit.browser.click(f"#tab-{tab}")
+        assert cockpit.browser.evaluate(f"{chip}.checkVisibility()") is is_seen, tab
+    assert cockpit.browser.evaluate(f"{chip}.textContent") == "● 7 good"
+    assert "good" in cockpit.browser.evaluate(f"{chip}.className")
+    found = cockpit.browser.evaluate("measures()")
+    assert found["outside"] == [] and found["overlapping"] == []
+    cockpit.resize(1280, 800)
+
+
 def test_the_alarm_bar_counts_what_is_active_and_what_is_only_unseen(cockpit: Cockpit) -> None:
     cockpit.emit(*(flight_events.lost(f"SU{k:02d}") for k in range(5)))
     cockpit.emit(*(flight_events.recovered(f"SU{k:02d}") for k in range(2)))

@@ -6,6 +6,7 @@ import { lastWhere } from "./feed.js";
 import { VisibleRows } from "./visible_rows.js";
 
 export const MARKS = { good: "●", usable: "▲", refly: "■", lost: "✖" };
+const CHIP_CLASS = { good: "good", usable: "caution", refly: "warning", lost: "warning" };
 const SEVERITY_ORDER = { refly: 0, usable: 1, good: 2 };
 
 export const verdictText = (word) => knows(`verdict.${word}`) ? t(`verdict.${word}`) : knows(`step.${word}`) ? t(`step.${word}`) : word;
@@ -30,6 +31,11 @@ function drawVerdict() {
   container.querySelector(".mark").textContent = MARKS[word] || "·";
   container.querySelector(".word").textContent = verdictText(word);
   container.querySelector(".which").textContent = which;
+  // On a phone the other pages cover the verdict.
+  const chip = by("verdict-chip");
+  chip.hidden = !latest;
+  chip.className = `chip ${CHIP_CLASS[word] || ""}`;
+  chip.replaceChildren(`${MARKS[word] || "·"} ${latest?.number ?? ""}`, element("span", { className: "unseen", textContent: ` ${verdictText(word)}` }));
   const sorted = [...findings].sort((a, b) => SEVERITY_ORDER[a.verdict] - SEVERITY_ORDER[b.verdict]);
   by("findings").replaceChildren(...sorted.map((finding) =>
     element("li", { textContent: findingText(finding), className: finding.verdict })));
