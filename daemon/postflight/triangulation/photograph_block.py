@@ -77,7 +77,9 @@ class PhotographBlock:
     `camera_of` (n,) is the camera of each image. `left_out` has a sentence for each photograph
     without orientation, `wrong_positions` one for each position of EXIF that is not used.
     `position_m` (n, 3) is NaN where EXIF has none that is used. `orientation` (n,) is that of
-    EXIF, by which viewers turn a photograph; empty where none is known.
+    EXIF, by which viewers turn a photograph; empty where none is known. `height_source` is empty
+    where positions have heights, "RelativeAltitude" where these are above the takeoff point, and
+    "none" where they are taken as zero.
     """
 
     block: ImageBlock
@@ -91,6 +93,7 @@ class PhotographBlock:
     left_out: tuple[str, ...]
     wrong_positions: tuple[str, ...] = ()
     orientation: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    height_source: str = ""
 
     def image_mm(self, image: NDArray[np.int64], px: Array) -> Array:
         """Image coordinates (m, 2), mm, of pixels (m, 2) of images (m,)."""
@@ -167,8 +170,12 @@ def photograph_block_of(
         mission, rig, exposures, frame, position, tracks, features, placed, crs, camera_of
     )
     turned = np.array([_orientation(exposure) for exposure in exposures])
+    sources = {str(settings.get("HeightSource", "")) for settings in map(_settings, exposures)}
     return replace(
-        block, wrong_positions=wrong_position, orientation=turned[np.flatnonzero(placed.oriented)]
+        block,
+        wrong_positions=wrong_position,
+        orientation=turned[np.flatnonzero(placed.oriented)],
+        height_source=max(sources & {"none", "RelativeAltitude"}, default=""),
     )
 
 
@@ -212,7 +219,7 @@ def candidate_pairs(position_m: Array) -> list[tuple[int, int]]:
 
 
 def _position(exposure: Exposure) -> tuple[float, float, float]:
-    settings = exposure.frames[0].settings if exposure.frames else {}
+    settings = _settings(exposure)
     keys = ("GpsLatitudeDeg", "GpsLongitudeDeg", "GpsAltitudeM")
     values = [settings.get(key) for key in keys]
     if not all(isinstance(value, int | float) for value in values):
@@ -221,9 +228,12 @@ def _position(exposure: Exposure) -> tuple[float, float, float]:
     return (a, b, c)
 
 
+def _settings(exposure: Exposure) -> Mapping[str, float | int | str]:
+    return exposure.frames[0].settings if exposure.frames else {}
+
+
 def _orientation(exposure: Exposure) -> int:
-    settings = exposure.frames[0].settings if exposure.frames else {}
-    value = settings.get("Orientation", 1)
+    value = _settings(exposure).get("Orientation", 1)
     return int(value) if isinstance(value, int | float) and 1 <= value <= 8 else 1
 
 

@@ -8,6 +8,16 @@ from typing import Any, Final
 from daemon.postflight.triangulation.photograph_project import OWN_INTERIOR_MIN
 
 _ROLL_MAX_DEG: Final = 1.0
+_HEIGHTS: Final = {
+    "none": (
+        "EXIF has no heights: positions are taken at 0 m, so that all heights are below the flight "
+        "and lines of different height tilt the block. Give control points (--points)"
+    ),
+    "RelativeAltitude": (
+        "heights are above the takeoff point (RelativeAltitude of XMP), not above the ellipsoid. "
+        "Control points place them (--points)"
+    ),
+}
 
 
 def photograph_cautions(section: Mapping[str, Any]) -> list[str]:
@@ -21,6 +31,8 @@ def photograph_cautions(section: Mapping[str, Any]) -> list[str]:
     """
     found = [*section["left_out"], *section["wrong_positions"]]
     found += section["control_not_measured"]
+    if section["position_shift_m"] is None and section["height_source"] in _HEIGHTS:
+        found.append(_HEIGHTS[section["height_source"]])
     unused = section["unused_control"]
     if unused:
         found.append(

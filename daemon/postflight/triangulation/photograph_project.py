@@ -334,6 +334,7 @@ def photographs_section(
         "left_out": list(found.left_out),
         "wrong_positions": list(found.wrong_positions),
         "unused_control": list(control.unused),
+        "height_source": found.height_source,
         **cameras[0],
         "cameras": cameras,
         "height_above_ground_m": height_m,

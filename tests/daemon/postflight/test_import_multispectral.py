@@ -407,7 +407,7 @@ def test_captures_without_a_name_are_grouped_by_time(scene, tmp_path) -> None:
     "name", ["IMG_{0:04d}_{1}.TIF", "DJI_202405060708{2:02d}_{0:04d}_MS_{3}.TIF"]
 )
 def test_captures_a_second_apart_are_grouped_by_the_names_of_files(scene, tmp_path, name) -> None:
-    """The first lacks a band, which that of the second would stand in for by time alone."""
+    """The first has no green band, which that of the second would stand in for by time alone."""
     nameless = {"CaptureUUID": ""}
     bands = (("Green", "G"), ("Red", "R"), ("RedEdge", "RE"), ("NIR", "NIR"))
     for capture in (1, 2):

@@ -10,12 +10,20 @@ import pytest
 from daemon.orientation.local_frame import LocalFrame
 from daemon.postflight.triangulation.control_mistakes import contradiction_m
 from daemon.postflight.triangulation.displayed_pixels import as_stored, stored_px
-from daemon.postflight.triangulation.ground_control import image_index, read_gcp_list
+from daemon.postflight.triangulation.ground_control import (
+    image_index,
+    no_control,
+    read_gcp_list,
+)
+from daemon.postflight.triangulation.photograph_cautions import photograph_cautions
 from daemon.postflight.triangulation.photograph_project import (
     adjusted_photographs,
+    photograph_project,
     photographs_section,
     residual_sigma_px,
 )
+from processing.bundle.adjust import adjust
+from processing.bundle.initial_values import completed
 from tests.daemon.postflight.photograph_scene import SIZE, measured_control, scene, turned
 
 POSITIONS_M = (3.0, 3.0, 5.0)
@@ -45,6 +53,23 @@ def test_residuals_of_columns_and_rows_have_a_standard_deviation_each() -> None:
     noisy = replace(found, tied=replace(found.tied, px=px))
     x, y = residual_sigma_px(noisy, POSITIONS_M)
     assert x == pytest.approx(0.41, rel=0.15) and y == pytest.approx(0.1, rel=0.3)
+
+
+@pytest.mark.parametrize(
+    ("source", "words"),
+    [("", ""), ("none", "taken at 0 m"), ("RelativeAltitude", "above the takeoff point")],
+)
+def test_heights_of_another_reference_are_a_caution_without_control(source, words) -> None:
+    found, station, rotation = scene()
+    found = replace(found, height_source=source)
+    for control in (no_control(), measured_control(station, rotation)):
+        project = photograph_project(
+            found, control, position_sigma_m=POSITIONS_M, reject_beyond=4.0
+        )
+        result = adjust(completed(project.network), project.settings)
+        cautions = photograph_cautions(photographs_section(found, control, result))
+        named = [one for one in cautions if words and words in one]
+        assert len(named) == (1 if words and not control.names else 0)
 
 
 def displayed(orientation: int, column: float, row: float) -> tuple[float, float]:
