@@ -17,6 +17,8 @@ from benchmarks.records import FOLDER, read_record
 
 RECORD: Final = FOLDER / "performance-gate.json"
 TOLERANCE: Final = 0.10
+RUNS: Final = 5
+"""Runs of the pipeline, a copy and a remap in turn whose medians are compared, at least."""
 COMMAND: Final = "python -m benchmarks.mini --accept"
 SLOWER, NOT_COMPARED = 1, 3
 """Exit status where a ratio is above its record, and where there is no record of it."""
@@ -43,6 +45,20 @@ def processor_name(cpuinfo: Path = Path("/proc/cpuinfo")) -> str:
     parts += [f"{name[4:]} {known[name]}" for name in ("cpu family",) if name in known]
     parts += [f"{name} {known[name]}" for name in ("model",) if name in known]
     return ", ".join(parts)
+
+
+def cpu_ratios(timed: Mapping[str, Mapping[str, float]]) -> dict[str, float]:
+    """CPU time of the pipeline over that of the tasks that ran in turn with it.
+
+    Args:
+        timed: by task as of `daemon.cli.benchmark.measurement.interleaved`; the pipeline is
+            "process".
+
+    Returns:
+        Ratios of the medians by the name of the other task.
+    """
+    own = timed["process"]["median_cpu_s"]
+    return {name: own / timed[name]["median_cpu_s"] for name in ("copy", "remap")}
 
 
 def compared(
@@ -114,7 +130,7 @@ def accept(
         "date": sorted({row[_DATE] for row in rows}),
         "command": COMMAND,
         "machine": "each row's",
-        "conditions": "CPU seconds, median of runs in turn",
+        "conditions": f"CPU seconds, medians of {RUNS} runs in turn or more",
         "figures": [{"table": {"columns": _COLUMNS, "rows": sorted(rows)}}],
     }
     record.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")

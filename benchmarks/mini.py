@@ -49,10 +49,12 @@ Frames = Mapping[str, NDArray[np.uint16]]
 
 def main() -> int:
     line = argparse.ArgumentParser(prog="python -m benchmarks.mini", description=__doc__)
-    line.add_argument("--runs", type=int, default=7)
+    line.add_argument("--runs", type=int, default=gate.RUNS, help=f"{gate.RUNS} or more")
     line.add_argument("--json", action="store_true", help="print one JSON object")
     line.add_argument("--accept", action="store_true", help="write the ratios to the record")
     options = line.parse_args()
+    if options.runs < gate.RUNS:
+        line.error(f"--runs is {options.runs}; the gate compares medians of {gate.RUNS} or more")
     with tempfile.TemporaryDirectory(prefix="syntopic-bench-") as folder:
         mission, radiometry = _fly(Path(folder))
         result: dict[str, Any] = {
@@ -137,10 +139,7 @@ def _time_pipeline(mission_path: Path, radiometry: Path, runs: int) -> dict[str,
         "megapixels_per_s": pixels / 1e6 / seconds,
         "ratio_to_copy": seconds / timed["copy"]["median_s"],
         "ratio_to_remap": seconds / timed["remap"]["median_s"],
-        "cpu_ratios": {
-            name: timed["process"]["median_cpu_s"] / timed[name]["median_cpu_s"]
-            for name in ("copy", "remap")
-        },
+        "cpu_ratios": gate.cpu_ratios(timed),
         "realtime_factor": rig.frame_interval_s / seconds,
     }
 

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import re
+import sys
+import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from benchmarks import gate
+from benchmarks import gate, mini
 from benchmarks.records import read_record
+from daemon.cli.benchmark.measurement import interleaved
 
 PROCESSOR = "Some Processor"
 
@@ -85,3 +90,75 @@ def test_generations_of_one_name_are_different_processors(tmp_path: Path) -> Non
     info.write_text("processor\t: 0\nCPU part\t: 0xd0c\n\nprocessor\t: 1\nCPU part\t: 0xd0d\n")
     assert gate.processor_name(info) == "0xd0c"
     assert gate.processor_name()
+
+
+def test_pipeline_copy_and_remap_run_in_turn_five_times() -> None:
+    order: list[str] = []
+    timed = interleaved(
+        gate.RUNS,
+        process=lambda: order.append("process"),
+        copy=lambda: order.append("copy"),
+        remap=lambda: order.append("remap"),
+    )
+    assert order == ["process", "copy", "remap"] * 5
+    assert set(timed) == {"process", "copy", "remap"}
+
+
+def test_ratios_are_of_medians_of_cpu_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One run that was disturbed changes nothing, nor does waiting."""
+    spent = {"process": [9.0, 9.0, 900.0, 9.5, 8.0], "copy": [0.1, 0.1, 0.1, 5.0, 0.1]}
+    spent["remap"] = [2.0, 3.0, 3.0, 3.0, 50.0]
+    clock = {"cpu": 0.0, "wall": 0.0}
+
+    def task(name: str) -> Any:
+        left = iter(spent[name])
+
+        def run() -> None:
+            clock["cpu"] += next(left)
+            clock["wall"] += 1000.0
+
+        return run
+
+    monkeypatch.setattr(time, "process_time", lambda: clock["cpu"])
+    monkeypatch.setattr(time, "perf_counter", lambda: clock["wall"])
+    timed = interleaved(gate.RUNS, **{name: task(name) for name in spent})
+    assert gate.cpu_ratios(timed) == pytest.approx({"copy": 90.0, "remap": 3.0})
+
+
+@pytest.mark.parametrize(
+    ("factor", "known", "status", "sentence"),
+    [
+        (1.0, True, 0, "record 10.00 (+0%)"),
+        (1.09, True, 0, "record 10.00 (+9%)"),
+        (1.11, True, 1, "That is slower by more than 10%"),
+        (1.0, False, 3, "the record has no figure for"),
+    ],
+)
+def test_make_bench_exits_by_what_it_found(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    factor: float,
+    known: bool,
+    status: int,
+    sentence: str,
+) -> None:
+    ratios = {"copy": 10.0 * factor, "remap": 2.0}
+    rows = [(PROCESSOR, mini.GROUND, name, v) for name, v in (("copy", "10.0"), ("remap", "2.0"))]
+    monkeypatch.setattr(gate, "_rows", lambda _record: rows if known else [])
+    monkeypatch.setattr(gate, "processor_name", lambda: PROCESSOR)
+    monkeypatch.setattr(mini, "_fly", lambda _folder: (None, None))
+    monkeypatch.setattr(mini, "_in_own_process", lambda *_: {"cpu_ratios": ratios})
+    monkeypatch.setattr(mini, "_time_writer", lambda *_: {})
+    monkeypatch.setattr(sys, "argv", ["mini", "--json"])
+    assert mini.main() == status
+    assert sentence in " ".join(json.loads(capsys.readouterr().out)["gate"]["sentences"])
+
+
+def test_fewer_runs_than_five_are_refused(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["mini", "--runs", "4"])
+    with pytest.raises(SystemExit) as stopped:
+        mini.main()
+    assert stopped.value.code == 2
+    assert "--runs is 4; the gate compares medians of 5 or more" in capsys.readouterr().err
