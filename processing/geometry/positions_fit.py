@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Final
 
 import numpy as np
@@ -16,6 +18,11 @@ WIDTH_MIN: Final = 0.02
 """Spread of positions across their main direction, over that along it."""
 _ROUNDS: Final = 4
 _OUTLIER: Final = 4.0
+_MUCH_BETTER: Final = 0.5
+"""Median residual without a minority, over that with all, below which the minority is wrong."""
+_MAJORITY_FROM: Final = 5
+_TRIPLES: Final = 300
+_TRIPLE_WIDTH: Final = 0.1
 
 
 class NotPlacedError(ProcessingError, ValueError):
@@ -47,6 +54,9 @@ class PositionsFit:
 def fit_positions(model: Array, known: Array) -> PositionsFit:
     """Least squares of a similarity without the positions that contradict the others.
 
+    If the majority of the positions fit much better without the others, as where some are of
+    another day or place, these are left out from the beginning.
+
     Args:
         model: positions without scale, shape (n, 3).
         known: the same in metres, shape (n, 3).
@@ -57,7 +67,7 @@ def fit_positions(model: Array, known: Array) -> PositionsFit:
     Raises:
         NotPlacedError: fewer than three positions, or all on one line.
 
-    Source: Umeyama (1991).
+    Source: Umeyama (1991); Rousseeuw (1984), least median of squares.
 
     Example:
         >>> model = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
@@ -66,7 +76,22 @@ def fit_positions(model: Array, known: Array) -> PositionsFit:
     """
     if len(model) < 3:
         raise NotPlacedError(f"{len(model)} images with a position; three are needed")
-    used = np.ones(len(model), bool)
+    fit = _without_outliers(model, known, np.ones(len(model), bool))
+    majority = _majority(model, known)
+    if majority is None:
+        return fit
+    try:
+        other = _without_outliers(model, known, majority)
+    except NotPlacedError:
+        return fit
+    return other if _typical(other) < _MUCH_BETTER * _typical(fit) else fit
+
+
+def _typical(fit: PositionsFit) -> float:
+    return float(np.median(np.linalg.norm(fit.residual_m, axis=1)))
+
+
+def _without_outliers(model: Array, known: Array, used: NDArray[np.bool_]) -> PositionsFit:
     for _ in range(_ROUNDS):
         spread = np.linalg.svd(known[used] - known[used].mean(axis=0), compute_uv=False)
         if spread[1] < WIDTH_MIN * spread[0]:
@@ -80,6 +105,33 @@ def fit_positions(model: Array, known: Array) -> PositionsFit:
             break
         used = inside
     return fit
+
+
+def _majority(model: Array, known: Array) -> NDArray[np.bool_] | None:
+    """The half of the positions that one similarity of three of them fits best.
+
+    None of fewer than five positions, or where all triples are on lines.
+    """
+    n = len(model)
+    if n < _MAJORITY_FROM:
+        return None
+    if math.comb(n, 3) <= _TRIPLES:
+        triples = [list(triple) for triple in combinations(range(n), 3)]
+    else:
+        random = np.random.default_rng(n)
+        triples = [random.choice(n, 3, replace=False).tolist() for _ in range(_TRIPLES)]
+    best, found = math.inf, None
+    for triple in triples:
+        spread = np.linalg.svd(known[triple] - known[triple].mean(axis=0), compute_uv=False)
+        if spread[1] < _TRIPLE_WIDTH * spread[0]:
+            continue
+        used = np.zeros(n, bool)
+        used[triple] = True
+        size = np.linalg.norm(_similarity(model, known, used).residual_m, axis=1)
+        half = np.partition(size, n // 2)[n // 2]
+        if half < best:
+            best, found = float(half), size <= half
+    return found
 
 
 def _similarity(model: Array, known: Array, used: NDArray[np.bool_]) -> PositionsFit:

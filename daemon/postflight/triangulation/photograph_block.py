@@ -276,7 +276,7 @@ def _placed(found: OrientedBlock, position: Array) -> tuple[OrientedBlock, NDArr
         xyz=fit.applied(found.xyz),
     )
     away = np.linalg.norm(fit.residual_m, axis=1)
-    extent = float(np.linalg.norm(position[own].std(axis=0)))
+    extent = float(np.linalg.norm(position[own][fit.used].std(axis=0)))
     typical = float(np.median(away))
     if typical > _CONTRADICTING_SHARE * extent:
         raise TriangulationError(

@@ -49,6 +49,18 @@ def test_one_wrong_position_is_not_used() -> None:
     assert np.abs(placed.station[7] - truth).max() < 5.0
 
 
+@pytest.mark.parametrize("count", [2, 4])
+def test_positions_of_another_day_are_not_used_and_named(count) -> None:
+    """A third of them two kilometres away, all by the same shift."""
+    own, position = flown()
+    truth = position.copy()
+    away = np.arange(12)[1::3][:count]
+    position[away] += [1500.0, 1100.0, 0.0]
+    placed, wrong = _placed(own, position)
+    assert np.flatnonzero(wrong).tolist() == away.tolist()
+    assert np.abs(placed.station - truth).max() < 5.0
+
+
 def test_photographs_without_a_position_are_placed_with_the_others() -> None:
     own, position = flown()
     truth = position[[2, 5]].copy()
