@@ -75,7 +75,9 @@ def triangulate_photographs(
             progress.start()  # not before processes have shown their own
             progress.update(task, description=what, completed=done, total=total)
 
-        found = photograph_block_of(folder, crs=crs, compute=compute, progress=step)
+        found = photograph_block_of(
+            folder, crs=crs, has_control=points is not None, compute=compute, progress=step
+        )
         control, converted = as_stored(found, control_of(found, points, measured))
         if mistakes := control_mistakes(found, control):
             raise TriangulationError(f"{points}: {'; '.join(mistakes)}")

@@ -34,7 +34,7 @@ from processing.bundle.incremental_orientation import (
 )
 from processing.bundle.network import CameraModel
 from processing.geometry.orientation import grid_from_enu
-from processing.geometry.positions_fit import NotPlacedError, fit_positions
+from processing.geometry.positions_fit import NotPlacedError, PositionsFit, fit_positions
 from processing.matching.block_matching import BlockTiePoints, image_mm
 from processing.matching.photograph_tracks import (
     MATCHES_MIN,
@@ -104,6 +104,7 @@ def photograph_block_of(
     mission: Mission,
     *,
     crs: str | None = None,
+    has_control: bool = False,
     compute: StepCompute = lambda _step: in_this_process,
     progress: Progress = lambda _w, _d, _n: None,
 ) -> PhotographBlock:
@@ -112,6 +113,7 @@ def photograph_block_of(
     Args:
         mission: of the photographs.
         crs: such as EPSG:25833; None is the UTM zone of their middle.
+        has_control: control will determine the roll of a single line of photographs.
         compute: where the steps "features" and "matching" are computed.
         progress: called with what is done, how much of it, and of how many.
 
@@ -158,7 +160,7 @@ def photograph_block_of(
     names = [_source(exposure) for exposure in exposures]
     if found is None or found.oriented.sum() < _ORIENTED_MIN:
         raise TriangulationError(_unconnected(mission, names, features, len(pairs)))
-    placed, wrong = _placed(found, position)
+    placed, wrong = _placed(found, position, has_control=has_control)
     away = np.linalg.norm(placed.station - position, axis=1)
     wrong_position = tuple(
         f"{names[k]}: its position of EXIF is {away[k]:.0f} m from where the other photographs "
@@ -255,7 +257,9 @@ def _unconnected(
     )
 
 
-def _placed(found: OrientedBlock, position: Array) -> tuple[OrientedBlock, NDArray[np.bool_]]:
+def _placed(
+    found: OrientedBlock, position: Array, *, has_control: bool = False
+) -> tuple[OrientedBlock, NDArray[np.bool_]]:
     """The block brought to the known positions by a similarity, and the positions (n,) that
     contradict it.
 
@@ -266,9 +270,12 @@ def _placed(found: OrientedBlock, position: Array) -> tuple[OrientedBlock, NDArr
     try:
         fit = fit_positions(found.station[own], position[own])
     except NotPlacedError as error:
-        raise TriangulationError(
-            f"the positions of EXIF do not place the block: {error}"
-        ) from error
+        if not has_control or own.sum() < _ORIENTED_MIN:
+            raise TriangulationError(
+                f"the positions of EXIF do not place the block: {error}, or give control points "
+                "on both sides of it (--points)"
+            ) from error
+        fit = _fit_of_line(found, own, position)
     placed = replace(
         found,
         station=fit.applied(found.station),
@@ -293,6 +300,20 @@ def _placed(found: OrientedBlock, position: Array) -> tuple[OrientedBlock, NDArr
     wrong = np.zeros(len(position), bool)
     wrong[np.flatnonzero(own)[away > max(_WRONG_POSITION_M, _WRONG_POSITION * typical)]] = True
     return placed, wrong
+
+
+def _fit_of_line(found: OrientedBlock, own: NDArray[np.bool_], position: Array) -> PositionsFit:
+    """The similarity of positions on one line, with the roll by which photographs look down."""
+    model, known = found.station[own], position[own]
+    extent = float(np.linalg.norm(known.std(axis=0)))
+    view = -found.rotation[own][:, :, 2].mean(axis=0)
+    below = view / np.linalg.norm(view) * float(np.linalg.norm(model.std(axis=0)))
+    fit = fit_positions(
+        np.concatenate([model, model + below]),
+        np.concatenate([known, known - np.array([0.0, 0.0, extent])]),
+    )
+    n = len(model)
+    return replace(fit, residual_m=fit.residual_m[:n], used=fit.used[:n])
 
 
 def _why_upward(position: Array) -> str:

@@ -89,6 +89,21 @@ def test_positions_of_other_photographs_are_refused() -> None:
         _placed(own, np.random.default_rng(3).permutation(position))
 
 
+def test_a_single_line_is_placed_where_control_will_determine_its_roll() -> None:
+    """By photographs that look down within a few degrees; without control it is refused."""
+    own, _ = flown()
+    line = replace(own, station=own.station[:6], rotation=own.rotation[:6])
+    straight = np.array([[30.0 * k, 0.0, 280.0] for k in range(6)])
+    known = straight + np.random.default_rng(2).normal(0.0, 0.05, (6, 3))
+    with pytest.raises(TriangulationError, match=r"second line, or give control points .*--points"):
+        _placed(line, known)
+    tilted = np.array([rotation_matrix(0.06, 0.02 * (-1) ** k, 0.0) for k in range(6)])
+    line = replace(line, rotation=line.rotation @ tilted)
+    placed, wrong = _placed(line, known, has_control=True)
+    assert np.abs(placed.station - known).max() < 0.5 and not wrong.any()
+    assert placed.rotation[:, 2, 2].min() > np.cos(np.radians(6.0))
+
+
 def test_photographs_that_would_look_upward_are_refused() -> None:
     """Mirrored by exchanged coordinates or a wrong sign; nearly on a line, the roll is open."""
     own, position = flown()
