@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import shutil
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -91,8 +92,21 @@ def test_the_newest_footprint_lies_below_the_tools_of_the_map(cockpit: Cockpit) 
     assert top_px > bottom_px
 
 
+def test_the_map_is_fitted_again_when_guidance_takes_its_room(cockpit: Cockpit) -> None:
+    cockpit.guide(0.00005)
+    cockpit.until(
+        "import('/map.js').then((map) => map.footprintLayers()"
+        ".map((one) => one.getElement().getBoundingClientRect()).filter((one) => one.height > 1)"
+        ".every((one) => one.bottom < document.querySelector('#map')"
+        ".getBoundingClientRect().bottom - 15))"
+    )
+
+
 def test_the_mark_of_the_aircraft_shows_its_track_and_whether_it_is_old(cockpit: Cockpit) -> None:
     position = flight_events.status()["position"] | {"age_s": 0.1, "fix": "3d", "satellites": 9}
+    # Guidance is newer than the status while it comes; then the service repeats its last frame.
+    cockpit.until("document.querySelector('#guidance').classList.contains('stale')")
+    time.sleep(1.6)
     for velocity, turned in (([0.0, 55.0, 0.0], "rotate(90)"), ([-40.0, 0.0, 1.0], "rotate(180)")):
         cockpit.status("flying", triggers=6, position=position | {"velocity_ned_mps": velocity})
         cockpit.until(f"{MARK}.querySelector('path').getAttribute('transform') === '{turned}'")
@@ -158,27 +172,43 @@ def test_what_was_shown_before_a_sleep_is_not_fresh_after_it(cockpit: Cockpit) -
     cockpit.status("flying", triggers=7)
     cockpit.guide(0.00005)
     found = cockpit.browser.evaluate(
-        """import('/wake.js').then(async ({ checkSleep }) => {
-          const real = Date.now;
+        """Promise.all(['/wake.js', '/time_of_day.js'].map((one) => import(one)))
+          .then(async ([{ checkSleep }, { timeOfDay }]) => {
+          const [real, Plain] = [Date.now, window.WebSocket];
+          const isLost = () => document.body.classList.contains('connection-lost');
+          // No connection opens until all of it was read.
+          window.WebSocket = class { close() {} send() {} };
           checkSleep();
-          const isLostBefore = document.body.classList.contains('connection-lost');
+          const wasLost = isLost();
           Date.now = () => real() + 3723e3;
           checkSleep();
           Date.now = real;
           checkSleep();
-          const [isLost, title] = [document.body.classList.contains('connection-lost'),
-            document.title];
-          // Guidance shows its age four times a second, and connects again after half a second.
-          await new Promise((resolve) => setTimeout(resolve, 350));
-          return [isLostBefore, isLost, title, document.querySelector('#guidance .age').innerText,
-            document.querySelector('#guidance').classList.contains('lost')];
+          const sinceS = ['#connection-lost', '[data-fault="page page.link"]'].map((one) => {
+            const [h, m, s] = /\\d+:\\d\\d:\\d\\d/.exec(document.querySelector(one).textContent)[0]
+              .split(':').map(Number);
+            return (timeOfDay() / 1000 - (3600 * h + 60 * m + s)) % 86400;
+          });
+          // Guidance shows its age four times a second.
+          await new Promise((resolve) => setTimeout(resolve, 700));
+          const guidance = document.querySelector('#guidance');
+          const found = [sinceS, document.querySelector('.aircraft-mark svg').getAttribute('class'),
+            wasLost, isLost(), document.title, guidance.querySelector('.age').innerText,
+            guidance.classList.contains('lost')];
+          window.WebSocket = Plain;
+          return found;
         })"""
     )
-    was_lost, is_lost, title, age, is_guidance_lost = found
+    since_s, mark, was_lost, is_lost, title, age, is_guidance_lost = found
+    assert mark == "old"
+    # What was shown is of the last record, not of the wake-up.
+    assert since_s[0] == since_s[1] and -1 <= since_s[0] < 10
     assert (was_lost, is_lost, is_guidance_lost) == (False, True, True)
     assert "CONNECTION LOST" in title and age == "1 h 02 old"
     cockpit.until("!document.body.classList.contains('connection-lost')")
     cockpit.until("!document.title.includes('CONNECTION LOST')")
+    # Guidance connects again too, although its second connection never opened.
+    cockpit.guide(0.00005)
 
 
 def test_a_lost_link_that_was_acknowledged_gives_its_bar_to_the_next_alarm(
@@ -253,13 +283,15 @@ def test_a_pilot_sees_no_instruction_from_before_a_sleep(cockpit: Cockpit) -> No
     cockpit.until("document.querySelector('#pilot-alarm').innerText.includes('Steer')")
     found = browser.evaluate(
         """import('/wake.js').then(async ({ checkSleep }) => {
-          const real = Date.now;
+          const [real, Plain] = [Date.now, window.WebSocket];
+          window.WebSocket = class { close() {} send() {} };
           checkSleep();
           Date.now = () => real() + 600e3;
           checkSleep();
           Date.now = real;
           checkSleep();
-          await new Promise((resolve) => setTimeout(resolve, 350));
+          await new Promise((resolve) => setTimeout(resolve, 700));
+          window.WebSocket = Plain;
           return document.querySelector('#pilot-alarm').innerText;
         })"""
     )

@@ -13,37 +13,24 @@ export function followGuidance(onFrame, onLink = () => {}, requestToken = null) 
   const scheme = location.protocol === "https:" ? "wss" : "ws";
   let waitMs = RETRY_MIN_MS;
   let last = null;
-  let present = null;
+  let endPresent = null;
   onWake((sleptMs) => {
     if (last) last.receivedMs -= sleptMs;
-    present?.close();
+    endPresent?.();
   });
   const open = () => {
     const token = (headers().Authorization || "").replace("Bearer ", "");
     const protocols = token ? ["syntopic.v1", `bearer.${token}`] : ["syntopic.v1"];
     const socket = new WebSocket(`${scheme}://${location.host}/api/v1/guidance`, protocols);
-    present = socket;
     let silence = null;
     let isAdmitted = false;
-    const restart = () => {
+    let hasEnded = false;
+    // Also called if the service is silent: a browser may wait long for the end of a dead connection.
+    const end = async () => {
+      if (hasEnded) return;
+      hasEnded = true;
       clearTimeout(silence);
-      silence = setTimeout(() => socket.close(), SILENCE_MS);
-    };
-    socket.onopen = () => {
-      isAdmitted = true;
-      onLink(true);
-    };
-    socket.onmessage = (message) => {
-      waitMs = RETRY_MIN_MS;
-      restart();
-      const frame = JSON.parse(message.data);
-      socket.send(String(frame.frame));
-      frame.receivedMs = performance.now();
-      last = frame;
-      onFrame(frame);
-    };
-    socket.onclose = async () => {
-      clearTimeout(silence);
+      socket.close();
       onLink(false);
       if (requestToken && !isAdmitted && await isRefused()) {
         await requestToken();
@@ -52,6 +39,29 @@ export function followGuidance(onFrame, onLink = () => {}, requestToken = null) 
       setTimeout(open, waitMs);
       waitMs = Math.min(waitMs * 2, RETRY_MAX_MS);
     };
+    endPresent = end;
+    const restart = () => {
+      clearTimeout(silence);
+      silence = setTimeout(end, SILENCE_MS);
+    };
+    // Also while it opens.
+    restart();
+    socket.onopen = () => {
+      if (hasEnded) return;
+      isAdmitted = true;
+      onLink(true);
+    };
+    socket.onmessage = (message) => {
+      if (hasEnded) return;
+      waitMs = RETRY_MIN_MS;
+      restart();
+      const frame = JSON.parse(message.data);
+      socket.send(String(frame.frame));
+      frame.receivedMs = performance.now();
+      last = frame;
+      onFrame(frame);
+    };
+    socket.onclose = end;
   };
   open();
 }

@@ -8,6 +8,8 @@ import { OlderLayer } from "./map_older.js";
 import { PlanLayer } from "./map_plan.js";
 import { near } from "./longitudes.js";
 import { aircraftMark, trackOf } from "./aircraft_mark.js";
+import { ageOf } from "./guidance_link.js";
+import { STALE_S } from "./guidance_view.js";
 import { isMeasuring, startMeasuring } from "./map_measure.js";
 import { startNoData } from "./map_no_data.js";
 
@@ -28,7 +30,7 @@ const AREA_DEG = 3;
 const TOOLS_PX = 62;
 const LOW_PX = 160;
 const PADDING_PX = 20;
-const GUIDED_MS = 1500;
+const GUIDED_MS = 1000 * STALE_S;
 let guidedMs = -Infinity;
 const footprints = new Map();
 const follow = document.getElementById("map-follow");
@@ -97,13 +99,14 @@ function updateLines() {
 export const drawGaps = (gaps) => plan.set({ gaps });
 
 // With each record: a position gets old without a new one. Guidance is newer while it comes.
-function showAircraft() {
-  if (performance.now() - guidedMs < GUIDED_MS) return;
+function showAircraft({ isLinked }) {
+  const isLive = isLinked && flight.brief?.phase !== "landed";
+  if (isLive && performance.now() - guidedMs < GUIDED_MS) return;
   const position = flight.brief?.status?.position;
   if (position?.latitude_deg != null) {
     // An old position is no longer where the aircraft is.
     marker.show(map, [position.latitude_deg, position.longitude_deg], trackOf(position.velocity_ned_mps),
-      presentPosition(flight) ? "present" : "old");
+      isLinked && presentPosition(flight) ? "present" : "old");
   } else if (map.hasLayer(marker)) marker.show(map, marker.getLatLng(), null, "old");
 }
 
@@ -177,19 +180,21 @@ function frame() {
   isProgrammatic = false;
 }
 
-export function start(root, feed) {
+export function start(_root, feed) {
   startLayers(map, feed);
   startMeasuring(map);
   startNoData(map, feed);
   onGuidance((frame) => {
     if (frame.latitude_deg == null || frame.longitude_deg == null) return;
-    guidedMs = frame.receivedMs;
+    // Without a newer one the service sends the last frame again.
+    if (!feed.isLinked || ageOf(frame) > STALE_S) return;
+    guidedMs = performance.now();
     marker.show(map, [frame.latitude_deg, near(frame.longitude_deg)], frame.track_deg, frame.is_deviating ? "deviating" : "present");
   });
   feed.subscribe((record, isFirstRecord) => {
     if (!record) plan.draw();
     updateLines();
-    showAircraft();
+    showAircraft(feed);
     if (isFirstRecord || !record || record.exposures || record.track) drawMap(feed.select);
   });
   // A click on an older footprint; those of the newest exposures take their own.
@@ -198,8 +203,9 @@ export function start(root, feed) {
     if (number != null && await restore(number)) feed.select(number);
   });
   feed.key("f", "map.follow", () => follow.click());
+  // The map, not its panel: guidance above it comes and goes.
   new ResizeObserver(() => {
     map.invalidateSize();
     frame();
-  }).observe(root);
+  }).observe(map.getContainer());
 }

@@ -56,6 +56,8 @@ const CLOCK_MS = 1000;
 setInterval(() => { by("clock").textContent = `${clock(timeOfDay())} UTC`; }, CLOCK_MS);
 
 let isLive = false;
+let receivedMs = Date.now();
+feed.subscribe((record) => { if (record) receivedMs = Date.now(); });
 
 // State of the connection. A service that ended after landing is no fault.
 function linkState(isLinked) {
@@ -69,6 +71,8 @@ function linkState(isLinked) {
 function showLink(isLinked) {
   feed.isLinked = isLinked;
   const state = linkState(isLinked);
+  // Of the last record: the loss is noticed later, after a sleep by hours.
+  const time = clock(timeOfDay(receivedMs));
   if (isLinked || isLive || !feed.flight.brief) {
     by("link").textContent = t(state.label);
     by("link").className = `chip ${state.style}`;
@@ -77,10 +81,10 @@ function showLink(isLinked) {
   document.body.classList.toggle("flight-ended", !isLinked && Boolean(state.isEnded));
   if (isLinked) feed.clearAlarm("page.link");
   else if (isLive && !state.isEnded) {
-    feed.raiseAlarm({ code: "page.link", severity: "warning", params: { time: clock(timeOfDay()) } });
+    feed.raiseAlarm({ code: "page.link", severity: "warning", params: { time } });
   }
   if (!isLinked && isLive) {
-    by("connection-lost").textContent = t(state.sentence, { time: clock(timeOfDay()) });
+    by("connection-lost").textContent = t(state.sentence, { time });
     by("connection-lost").classList.toggle("ended", state.isEnded);
   }
   by("connection-lost").hidden = isLinked || !(isLive || feed.flight.brief);
