@@ -102,6 +102,12 @@ def read_gcp_list(path: Path, images: Mapping[str, int], frame: LocalFrame) -> G
             continue
         east, north, height, column, row = numbers
         rows.append((name, (east, north, height), at, (column, row)))
+    if unused and not rows and not problems:
+        problems.append(
+            f"{path.name}: no line names a photograph of the block; the first one names "
+            f"{unused[0].split(':')[0]!r}. A line is: east north height column row image [name], "
+            "with decimal points. Correct the names, or leave the file out"
+        )
     places: dict[str, tuple[float, float, float]] = {}
     for name, place, _, _ in rows:
         if places.setdefault(name, place) != place:
@@ -200,9 +206,14 @@ def _geodetic(path: Path, system: str, xyz: Array) -> Array:
 
 
 def _parts(line: str, images: Mapping[str, int]) -> list[str]:
-    """Columns of a line; the name of an image may contain spaces, with or without tabs."""
-    if line.count("\t") >= 5:
-        return [part.strip() for part in line.split("\t")]
+    """Columns of a line; the name of an image may contain spaces.
+
+    Between tabs or semicolons, as spreadsheets write them, numbers may have decimal commas.
+    """
+    for separator in ("\t", ";"):
+        if line.count(separator) >= 5:
+            cells = [cell.strip() for cell in line.split(separator)]
+            return [*(cell.replace(",", ".") for cell in cells[:5]), *cells[5:]]
     parts = line.replace(",", " ").split()
     rest = re.split(r"[\s,]+", line, maxsplit=5)[5:]
     if not rest or _image_of(parts[5], images) is not None:

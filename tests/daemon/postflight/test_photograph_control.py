@@ -22,6 +22,7 @@ from daemon.postflight.triangulation.photograph_project import (
     photographs_section,
     residual_sigma_px,
 )
+from daemon.postflight.triangulation.triangulation import TriangulationError
 from processing.bundle.adjust import adjust
 from processing.bundle.initial_values import completed
 from tests.daemon.postflight.photograph_scene import SIZE, measured_control, scene, turned
@@ -132,3 +133,35 @@ def test_names_of_photographs_may_have_spaces_and_accents(tmp_path, written, for
     found = read_gcp_list(path, images, LocalFrame(47.05, 11.4))
     assert found.names == ("p1",) and found.image.tolist() == [0] and found.unused == ()
     assert found.px.tolist() == [[10.0, 20.0]]
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "682000,5;5213000,25;600,5;10,5;20;img_1.jpg;p1",
+        "682000.5;5213000.25;600.5;10.5;20;IMG_1.JPG;p1",
+    ],
+)
+def test_cells_of_a_spreadsheet_are_read(tmp_path, line) -> None:
+    path = tmp_path / "gcp_list.txt"
+    frame = LocalFrame(47.05, 11.4)
+    path.write_text("EPSG:32632\n682000.5 5213000.25 600.5 10.5 20 img_1.jpg p1\n")
+    expected = read_gcp_list(path, {"img_1.jpg": 0}, frame)
+    path.write_text(f"EPSG:32632\n{line}\n")
+    found = read_gcp_list(path, {"img_1.jpg": 0}, frame)
+    assert (found.xyz_m == expected.xyz_m).all() and found.px.tolist() == [[10.5, 20.0]]
+
+
+@pytest.mark.parametrize(
+    ("line", "named"),
+    [
+        ("682000,5 5213000,25 600,5 10 20 img_1.jpg p1", "'5'"),
+        ("682000.5 5213000.25 600.5 10 20 img_9.jpg p1", "'img_9.jpg'"),
+    ],
+)
+def test_control_of_other_photographs_only_is_refused(tmp_path, line, named) -> None:
+    """Such as decimal commas between spaces, which make other columns."""
+    path = tmp_path / "gcp_list.txt"
+    path.write_text(f"EPSG:32632\n{line}\n")
+    with pytest.raises(TriangulationError, match=f"the first one names {named}.*decimal points"):
+        read_gcp_list(path, {"img_1.jpg": 0}, LocalFrame(47.05, 11.4))
