@@ -116,6 +116,11 @@ class RejoiningDisk:
         return 0 if self.resync is None else self.resync.waiting
 
     @property
+    def has_ended(self) -> bool:
+        """Whether it was stopped, and its thread has ended."""
+        return self._ended.is_set() and not self._thread.is_alive()
+
+    @property
     def target(self) -> Mission:
         """The mission on this disk."""
         return Mission(self.disk.root / self._mission_id, self._mission_id)
@@ -143,10 +148,12 @@ class RejoiningDisk:
                 try:
                     self._bring_up_to_date()
                 except (OSError, DaemonError) as error:
+                    self.ready_at = None
                     self.problem = f"disk {self.disk} is not in use: {_error_text(error)}"
                     pause_s = min(2 * pause_s, self._settings.retry_max_s)
-            self.ready_at = None
+            # Stopped, it has what it had: the disk may join as soon as the thread has ended.
             if not self._ended.is_set():
+                self.ready_at = None
                 self._wake.wait(pause_s)
 
     def _bring_up_to_date(self) -> None:

@@ -212,6 +212,9 @@ class MirroredStorage:
         for inactive in list(self._inactive.values()):
             if inactive.ready_at == self._changes:
                 self._join(inactive)
+            elif inactive.has_ended:
+                # An exposure was stored before its thread had ended.
+                self._start_rejoin(inactive.disk, 0.0)
 
     def release(self, label: str, reason: str) -> None:
         """Release a disk, so that it can be unmounted.
