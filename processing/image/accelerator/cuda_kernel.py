@@ -1,10 +1,11 @@
 """The decorators of kernels for CUDA devices, and floating-point steps that are never fused.
 
 numba compiles for CUDA with fused multiply-adds wherever a product is added to something. Each step
-here is one instruction that rounds once, so a kernel rounds exactly where its source says.
+here is one instruction that rounds once, so a kernel rounds exactly where its source states.
 
 Quirk: `numba.cuda.jit` has no option against contraction; the functions `*_rn` of libdevice are
-exempt from it. Upstream: libdevice user's guide, 3.1, and PTX ISA, 9.7.3, "mul.rn ... never fused".
+exempt from it. Upstream: PTX ISA, 9.7.3, mul: "an explicit rounding modifier is treated
+conservatively by the code optimizer".
 """
 
 from __future__ import annotations

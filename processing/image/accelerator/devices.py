@@ -51,7 +51,7 @@ def require_device(device: Device) -> None:
         device: as configured.
 
     Raises:
-        AcceleratorError: it cannot be used; the message says why.
+        AcceleratorError: it cannot be used; the message states why.
 
     Example:
         >>> require_device("cuda-reference")
@@ -96,6 +96,6 @@ def _cuda_fault() -> str | None:
 
 
 def _first_line(reason: object) -> str:
-    """The first line of a reason that says something, without its full stop."""
+    """The first line of a reason that is not empty, without its full stop."""
     lines = [line.strip().rstrip(".:") for line in str(reason).splitlines()]
     return next((line for line in lines if line), "no reason given")

@@ -57,7 +57,7 @@ def pixel_kernels(device: Device) -> PixelKernels:
         Correction and resampling on it.
 
     Raises:
-        AcceleratorError: the device cannot be used; the message says why.
+        AcceleratorError: the device cannot be used; the message states why.
 
     Example:
         >>> pixel_kernels("cpu").resample is resample

@@ -26,7 +26,13 @@ from processing.image.accelerator.fixed_resampling import (
     resample_fixed,
 )
 from processing.image.accelerator.pixel_kernels import pixel_kernels
-from processing.image.kernels import INTERPOLATIONS, KERNELS, MARGIN, Interpolation
+from processing.image.kernels import (
+    INTERPOLATIONS,
+    KERNELS,
+    MARGIN,
+    Interpolation,
+    phase_corrected_weights,
+)
 from processing.image.resampling import SATURATED_SOURCE, resample
 from processing.pipelines.stitched import Conditions, Pipeline, PipelineSettings
 from processing.quality.report import as_json
@@ -180,6 +186,32 @@ def test_integers_and_floating_point_fetch_the_same_pixels(interpolation: Interp
     off = np.abs(fixed["words"].astype(int) - floating["words"])
     assert off.max() <= (8 if interpolation == "phase-corrected" else 1)
     assert off.mean() < 0.3
+
+
+def test_integers_are_within_one_count_of_the_exact_value_at_joints_of_taps_too() -> None:
+    row, column = np.mgrid[0:61, 0:75]
+    scene = 9000.0 + 3000.0 * np.sin(row / 2.0) * np.cos(column / 3.0)
+    given = one_frame(scene.astype(np.uint16))
+    shape, cell = (45, 51), given["cell_px"]
+    given["gains"] = np.array([1.25], np.float32)
+    given["valid"] = np.array([[2.0, 40.0, 2.0, 35.0]])
+    found = resampled(resample_fixed, shape, interpolation="phase-corrected", **given)
+    # Lattices of `resampling_arguments` are affine: their formula serves every pixel.
+    y, x = np.mgrid[0 : shape[0], 0 : shape[1]].astype(np.float64)
+    c, r = 1.003 * x + 0.004 * y - 1.3, 0.998 * y - 0.003 * x + 2.4
+    inside = (c >= 2.0) & (c <= 40.0) & (r >= 2.0) & (r <= 35.0)
+    left, top = np.floor(c).astype(int).clip(2, 71), np.floor(r).astype(int).clip(2, 57)
+    along = phase_corrected_weights((c - left).ravel()).reshape(*shape, 6)
+    down = phase_corrected_weights((r - top).ravel()).reshape(*shape, 6)
+    taps = np.arange(-2, 4)
+    words = given["frames"][0][
+        top[..., None, None] + taps[:, None], left[..., None, None] + taps
+    ].astype(np.float64)
+    exact = 1.25 * np.einsum("yxi,yxj,yxij->yx", down, along, words)
+    assert cell == 16 and inside.mean() > 0.5
+    assert np.array_equal(found["words"] > 0, inside)
+    assert np.abs(found["words"] - exact)[inside].max() < 1.0
+    assert abs(np.mean((found["words"] - exact)[inside])) < 0.02
 
 
 def test_frames_that_share_pixels_are_blended_as_in_floating_point() -> None:
