@@ -16,7 +16,7 @@ function shape(name, attributes) {
   return created;
 }
 
-// A marker with `show(place, trackDeg, state)`; the state is "present", "old" or "deviating".
+// A marker with `show(map, place, trackDeg, state)` and `setState(state)`; the state is "present", "old" or "deviating".
 export function aircraftMark() {
   const drawing = shape("svg", { viewBox: "-17 -17 34 34", width: SIZE_PX, height: SIZE_PX, "aria-hidden": "true" });
   const arrow = shape("path", { d: "M0,-14L10,12L0,6L-10,12Z" });
@@ -30,7 +30,8 @@ export function aircraftMark() {
     arrow.style.display = hasTrack ? "" : "none";
     circle.style.display = hasTrack ? "none" : "";
     if (hasTrack) arrow.setAttribute("transform", `rotate(${trackDeg})`);
-    drawing.setAttribute("class", state);
+    marker.setState(state);
   };
+  marker.setState = (state) => drawing.setAttribute("class", state);
   return marker;
 }

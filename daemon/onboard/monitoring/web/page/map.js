@@ -100,14 +100,19 @@ export const drawGaps = (gaps) => plan.set({ gaps });
 
 // With each record: a position gets old without a new one. Guidance is newer while it comes.
 function showAircraft({ isLinked }) {
-  const isLive = isLinked && flight.brief?.phase !== "landed";
+  // Without a link it stays where it was last, which guidance knew better than the status.
+  if (!isLinked) {
+    marker.setState("old");
+    return;
+  }
+  const isLive = flight.brief?.phase !== "landed";
   if (isLive && performance.now() - guidedMs < GUIDED_MS) return;
   const position = flight.brief?.status?.position;
   if (position?.latitude_deg != null) {
     // An old position is no longer where the aircraft is.
     marker.show(map, [position.latitude_deg, position.longitude_deg], trackOf(position.velocity_ned_mps),
-      isLinked && presentPosition(flight) ? "present" : "old");
-  } else if (map.hasLayer(marker)) marker.show(map, marker.getLatLng(), null, "old");
+      presentPosition(flight) ? "present" : "old");
+  } else marker.setState("old");
 }
 
 function drawMap(choose) {
