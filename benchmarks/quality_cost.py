@@ -53,6 +53,7 @@ STEPS: Final = (
     "unread_figures",
     "word_format_figures",
     "repeated_line_figures",
+    "line_order_figures",
     "clipping_figures",
     "heads_by_pattern",
     "filled_gaps",

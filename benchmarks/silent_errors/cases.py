@@ -25,6 +25,7 @@ from processing.quality.figures.image import (
     ContentFigures,
     DefectLineFigures,
     IdentityFigures,
+    LineOrderFigures,
     LocalBlurFigures,
     OtherGroundFigures,
     RelativeSharpnessFigures,
@@ -220,6 +221,8 @@ def named_causes(report: QualityReport) -> dict[str, frozenset[str]]:
         "slip": _names(slip.slip_sensors, slip.slip_alternatives),
         "ground": _names(other_ground),
         "words": _names(figures.of(WordFormatFigures).word_format_sensors),
+        "bits": _names(figures.of(WordFormatFigures).constant_bits_sensors),
+        "order": _names(_one(figures.of(LineOrderFigures).line_order_sensor)),
         "temperature": _names(figures.of(EstimatedDcFigures).dc_disagreement),
         "misread": _names(_one(misread.misread_probe)),
     }

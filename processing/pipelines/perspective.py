@@ -41,6 +41,7 @@ from processing.quality.defect_lines import defect_line_figures, defect_lines
 from processing.quality.figures import FigureGroup
 from processing.quality.frame_identity import FixedPatterns, heads_by_pattern, pattern_figures
 from processing.quality.frame_signal import signal_figures
+from processing.quality.line_order import line_order_figures
 from processing.quality.readout import blank_unread, unread_figures
 from processing.quality.repeated_lines import repeated_line_figures
 from processing.quality.report import QualityReport
@@ -240,6 +241,7 @@ class HeadPipeline(
             unread_figures(unread_fraction),
             word_format_figures(self.rig, frames),
             repeated_line_figures(self.rig, frames),
+            line_order_figures(self.rig, frames),
             pattern_figures(heads_by_pattern(self.rig, frames, self._patterns, {})),
         )
         return _CorrectedHeads(level1, statistics, planes, figures)

@@ -69,6 +69,7 @@ from processing.pipelines.stitched_stages import (
 from processing.pipelines.synthetic_frames import synthetic_frames
 from processing.quality.clipping import clipping_figures
 from processing.quality.frame_identity import FixedPatterns, heads_by_pattern
+from processing.quality.line_order import line_order_figures
 from processing.quality.readout import blank_unread, unread_figures
 from processing.quality.repeated_lines import repeated_line_figures
 from processing.quality.report import QualityReport
@@ -183,6 +184,7 @@ class Pipeline(
                 unread_figures({n: seen.unread_fraction for n, seen in statistics.items()}),
                 word_format_figures(rig, frames),
                 repeated_line_figures(rig, frames),
+                line_order_figures(rig, frames),
                 clipping_figures(rig, frames),
             )
             tdi_shifts = {name: placement.tdi_shifts for name, placement in start.items()}

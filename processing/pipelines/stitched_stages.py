@@ -39,7 +39,7 @@ from processing.quality.confirmed_ground import confirmed_ground_figures
 from processing.quality.defect_lines import defect_line_figures, defect_lines
 from processing.quality.figures import FigureGroup
 from processing.quality.figures.circumstances import ParallaxFigures
-from processing.quality.figures.image import ValidFigures
+from processing.quality.figures.image import LineOrderFigures, ValidFigures, WordFormatFigures
 from processing.quality.figures.stitching import SaturatedOverlapFigures, SupportFigures
 from processing.quality.frame_blocks import block_edges, block_figures, edge_limits
 from processing.quality.frame_identity import identity_figures
@@ -163,7 +163,8 @@ def figures_of(
         )
     )
     yield confirmed_ground_figures(rig, level1, tie_points, image.registrations)
-    yield relative_sharpness_figures(rig, start, level1)
+    odd = _odd_frames(corrected)
+    yield relative_sharpness_figures(rig, start, {n: level1[n] for n in level1 if n not in odd})
     yield step_figures(steps)
     # The defects of another head are not those that were filled.
     own = [sensor for sensor in rig.sensors if sensor.name not in corrected.by_pattern]
@@ -196,6 +197,17 @@ def _explained_frames(corrected: CorrectedFrames, adjusted: AdjustedFrames) -> s
     content = adjusted.content
     slipped = {slip.sensor for slip in adjusted.stitching.slips}
     return {*content.mismatched, *content.shifted_px, *slipped, *corrected.by_pattern}
+
+
+def _odd_frames(corrected: CorrectedFrames) -> set[str]:
+    """Frames whose words or lines are not the sensor's: healthy neighbours seem blurred by them."""
+    found: set[str] = set()
+    for group in corrected.figures:
+        if isinstance(group, WordFormatFigures):
+            found |= {*group.word_format_sensors, *group.constant_bits_sensors}
+        if isinstance(group, LineOrderFigures) and group.line_order_sensor is not None:
+            found.add(group.line_order_sensor)
+    return found
 
 
 def misplaced_px(rig: Rig, content: ContentCheck) -> float:

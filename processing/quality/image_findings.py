@@ -17,6 +17,7 @@ from processing.quality.figures.image import (
     ContentFigures,
     DefectLineFigures,
     IdentityFigures,
+    LineOrderFigures,
     LocalBlurFigures,
     OtherGroundFigures,
     RelativeSharpnessFigures,
@@ -117,27 +118,52 @@ def identity_findings(figures: QualityFigures) -> list[Finding]:
 
 
 def word_format_findings(figures: QualityFigures) -> list[Finding]:
-    """Words in another format than the rig file states.
+    """Words in another format than the rig file states, and lines in another order.
 
     Args:
         figures: of one exposure.
 
     Returns:
-        One finding or none.
+        Findings, none where all words are as stated.
     """
-    words = figures.of(WordFormatFigures)
-    if not words.word_format:
-        return []
-    sensors, word_format = ", ".join(words.word_format_sensors), ", ".join(words.word_format)
-    return [
-        Finding(
-            Flag.FRAME_CORRUPT,
-            Verdict.REFLY,
-            f"The words of {sensors} are {word_format}, not as in the rig file: set the pixel "
-            "format of the head, or `bits` and `justified` in the rig file. The pixels stored are "
-            "good; process them again with the right rig file.",
+    words, found = figures.of(WordFormatFigures), []
+    if words.word_format:
+        sensors, word_format = ", ".join(words.word_format_sensors), ", ".join(words.word_format)
+        found.append(
+            Finding(
+                Flag.FRAME_CORRUPT,
+                Verdict.REFLY,
+                f"The words of {sensors} are {word_format}, not as in the rig file: set the pixel "
+                "format of the head, or `bits` and `justified` in the rig file. The pixels stored "
+                "are good; process them again with the right rig file.",
+            )
         )
-    ]
+    if words.constant_bits:
+        sensors, bits = ", ".join(words.constant_bits_sensors), ", ".join(words.constant_bits)
+        found.append(
+            Finding(
+                Flag.FRAME_CORRUPT,
+                Verdict.REFLY,
+                f"Of the values of {sensors} these bits never change: {bits}. A line of the "
+                "read-out is stuck, or the head gives fewer bits than the rig file states. Check "
+                "the head and its pixel format, and fly again.",
+            )
+        )
+    order = figures.of(LineOrderFigures)
+    if order.line_order is not None:
+        found.append(
+            Finding(
+                Flag.FRAME_CORRUPT,
+                Verdict.REFLY,
+                f"Neighbouring {order.line_order_axis} of {order.line_order_sensor} do not follow "
+                f"from each other: they differ {order.line_order:.1f} times as much as their place "
+                "explains. Lines are exchanged, of two exposures or of two gains, or the colour "
+                "filter array is not that of the rig file. Check the head and the rig file, and "
+                "fly again.",
+                order.line_order,
+            )
+        )
+    return found
 
 
 def signal_findings(figures: QualityFigures, thresholds: Thresholds) -> list[Finding]:

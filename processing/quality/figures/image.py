@@ -191,6 +191,17 @@ class BlockFigures(FigureGroup):
 
 
 @dataclass(frozen=True)
+class LineOrderFigures(FigureGroup):
+    """Lines of a raw frame that do not follow from their neighbours."""
+
+    line_order: Annotated[
+        float | None, "how much more neighbouring lines of a frame differ than their place explains"
+    ] = None
+    line_order_sensor: Annotated[str | None, "the frame it is in"] = None
+    line_order_axis: Annotated[str | None, "rows or columns"] = None
+
+
+@dataclass(frozen=True)
 class WordFormatFigures(FigureGroup):
     """Words in another format than the rig file states."""
 
@@ -200,6 +211,10 @@ class WordFormatFigures(FigureGroup):
         "sensor's bits",
     ] = ()
     word_format_sensors: Annotated[Names, "the frames it is wrong in, comma separated"] = ()
+    constant_bits: Annotated[
+        Names, "bits of values that never change although the values do, 0 is the lowest"
+    ] = ()
+    constant_bits_sensors: Annotated[Names, "the frames they are in, comma separated"] = ()
 
 
 @dataclass(frozen=True)

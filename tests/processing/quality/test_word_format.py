@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from processing.quality.figures.image import WordFormatFigures
-from processing.quality.word_format import word_format_figures, wrong_format
+from processing.quality.word_format import constant_bits, word_format_figures, wrong_format
 from processing.rig import find_rig
 
 MINI = find_rig("ultracam-x-mini")
@@ -85,3 +85,39 @@ def test_figures_name_formats_and_sensors() -> None:
     assert word_format_figures(MINI, raw) == WordFormatFigures(
         ("byte-swapped", "left-justified"), ("SU00", "SU02", "SU03")
     )
+
+
+def noise(mean: float, sigma: float) -> NDArray[np.uint16]:
+    values = np.random.default_rng(3).normal(mean, sigma, (832, 1248))
+    return np.asarray(np.clip(np.rint(values), 1, FULL - 1), np.uint16)
+
+
+@pytest.mark.parametrize(
+    ("mask_or", "mask_and", "bits"),
+    [(0, 0xFFFF, ()), (0x80, 0xFFFF, (7,)), (0, 0xFFF0, (0, 1, 2, 3)), (1, 0xFFFF, (0,))],
+)
+def test_bits_that_never_change_are_named(
+    mask_or: int, mask_and: int, bits: tuple[int, ...]
+) -> None:
+    raw = (noise(1200.0, 250.0) | np.uint16(mask_or)) & np.uint16(mask_and)
+    assert constant_bits(RIGHT, raw) == bits
+    assert constant_bits(LEFT, raw << 4) == bits
+    # Lines that were not read out or are saturated have all bits alike.
+    raw[:100], raw[100:200] = 0, FULL
+    assert constant_bits(RIGHT, raw) == bits
+
+
+def test_values_that_hardly_differ_show_no_constant_bit() -> None:
+    assert constant_bits(RIGHT, noise(64.0, 1.0)) == ()
+    # Calm water and sand: bits between both levels are the same in all values.
+    two = np.where(np.arange(1248) < 600, noise(484.0, 1.0), noise(1004.0, 1.0))
+    assert constant_bits(RIGHT, two) == ()
+    assert constant_bits(RIGHT, np.zeros((832, 1248), np.uint16)) == ()
+
+
+def test_a_frame_of_one_value_has_no_bit_that_changes() -> None:
+    frames = {"SU00": np.full((832, 1248), 1200, np.uint16), "SU10": noise(1200.0, 250.0)}
+    found = word_format_figures(MINI, frames)
+    assert found is not None and found.constant_bits_sensors == ("SU00",)
+    assert found.constant_bits == tuple(str(bit) for bit in range(12))
+    assert not found.word_format and not found.word_format_sensors

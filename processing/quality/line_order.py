@@ -1,0 +1,104 @@
+"""Lines of a raw frame that do not follow from their neighbours: exchanged, or of two exposures.
+
+Ground differs the more, the farther lines lie apart. Where the next line differs more than the one
+after it, or pairs of lines differ in turn, the read-out made it. Of a Bayer pattern the green
+pixels are compared, which lie in every line: another pattern than the rig file's shows, too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from processing.quality.figures.image import LineOrderFigures
+from processing.radiometry.demosaic import is_bayer
+from processing.rig import Rig, Sensor
+
+Array = NDArray[Any]
+
+BLOCKS: Final = 8
+LINES: Final = 16
+WORDS: Final = 200
+"""Blocks of lines over a frame, lines of a block and words of a line, about, that are compared."""
+MAX_RATIO: Final = 1.35
+"""Of differences: 1.04 at most in healthy frames, 1.5 and more where lines are exchanged."""
+MIN_DIFFERENCE: Final = 1.0
+"""DN, of single words: less is no ground."""
+
+
+def line_order_figures(rig: Rig, frames: Mapping[str, Array]) -> LineOrderFigures | None:
+    """The frame whose lines follow least from their neighbours.
+
+    Args:
+        rig: the camera.
+        frames: Level-0 frames by sensor name, (h, w) uint16, words as stored.
+
+    Returns:
+        None where the lines of all frames follow from each other.
+    """
+    found = [
+        (disorder(s, frames[s.name], axis), s.name, name)
+        for s in rig.sensors
+        if s.name in frames
+        for axis, name in enumerate(("rows", "columns"))
+    ]
+    worst = max(found, default=(0.0, "", ""))
+    if worst[0] <= MAX_RATIO:
+        return None
+    return LineOrderFigures(*worst)
+
+
+def disorder(sensor: Sensor, frame: Array, axis: int) -> float:
+    """How much more lines differ than their place explains.
+
+    Args:
+        sensor: gives the colour filter array.
+        frame: Level-0, (h, w) uint16.
+        axis: 0 compares rows, 1 columns.
+
+    Returns:
+        The larger of two ratios of mean absolute differences over blocks of lines: of lines at odd
+        distances over those at even ones, and of pairs of lines in turn, the larger over the
+        smaller. Zero without ground.
+    """
+    lines = frame if axis == 0 else frame.T
+    green = _green(sensor, axis)
+    size = len(lines) - len(lines) % 2
+    if size < 2 * LINES:
+        return 0.0
+    # Green lies in every second word.
+    step = 2 * max(1, lines.shape[1] // (2 * WORDS))
+    count = (lines.shape[1] - 1) // step
+    firsts = np.linspace(0, size - LINES, BLOCKS).astype(int) // 2 * 2
+    nearest, distances, turns = [], [], []
+    for first in firsts.tolist():
+        block = lines[first : first + LINES]
+        words = np.empty((LINES, count), np.float32)
+        for odd in (0, 1):
+            words[odd::2] = block[odd::2, green[odd] :: step][:, :count]
+        apart = [np.abs(words[k:] - words[:-k]).mean(axis=1) for k in (1, 2, 3, 4)]
+        means = [float(of_lines.mean()) for of_lines in apart]
+        nearest.append(means[0])
+        if min(means) > 0.0:
+            # Rows of plants may be as narrow as the pattern of a few lines, but not of all.
+            distances.append(min(means[0], means[2]) / max(means[1], means[3]))
+            inside, between = float(apart[0][0::2].mean()), float(apart[0][1::2].mean())
+            turns.append(inside / (inside + between))
+    unit = MIN_DIFFERENCE * sensor.raw_units_per_dn
+    if len(turns) <= BLOCKS // 2 or float(np.median(nearest)) < unit:
+        return 0.0
+    inside = float(np.median(turns))
+    return max(float(np.median(distances)), inside / (1.0 - inside), (1.0 - inside) / inside)
+
+
+def _green(sensor: Sensor, axis: int) -> tuple[int, int]:
+    """The first green word of even and of odd lines; of a sensor without a pattern the first."""
+    if not is_bayer(sensor):
+        return 0, 0
+    pattern = np.array(list(sensor.colour_filter_array)).reshape(2, 2)
+    pattern = pattern if axis == 0 else pattern.T
+    even, odd = (int(np.flatnonzero(line == "G")[0]) for line in pattern)
+    return even, odd
