@@ -104,13 +104,10 @@ def adjust(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
+    from daemon.postflight.adjustment.contradictions import SUSPICIOUS_SIGMA0
     from daemon.postflight.adjustment.covariance_file import write_covariances
     from daemon.postflight.adjustment.csv_tables import ProjectError
-    from daemon.postflight.adjustment.likely_mistakes import (
-        SUSPICIOUS_SIGMA0,
-        control_sentences,
-        likely_mistakes,
-    )
+    from daemon.postflight.adjustment.likely_mistakes import control_sentences, likely_mistakes
     from daemon.postflight.adjustment.project import read_project
     from daemon.postflight.adjustment.project_writer import write_results
     from daemon.postflight.adjustment.protocol import write_protocol
@@ -119,7 +116,7 @@ def adjust(
     from processing.bundle.network import NetworkError
     from processing.bundle.point_joining import joined_points, named_points
     from processing.bundle.rank_diagnosis import RankDefectError
-    from processing.bundle.starting_values import starting_values
+    from processing.bundle.staged_adjustment import adjust_in_stages
 
     _refuse_unknown_choices(weight_function, test, free_datum)
     if free_datum is not None and free_network is False:
@@ -161,7 +158,7 @@ def adjust(
             def show(what: str, number: int, squares: float) -> None:
                 progress.update(task, description=f"{what} {number}: {squares:.6g}")
 
-            result = adjusted(starting_values(given.network), settings, progress=show)
+            result = adjust_in_stages(given.network, settings, progress=show)
             joined = 0
             if join:
                 network, joined = joined_points(

@@ -41,6 +41,12 @@ _DATUM_MOTIONS: Final = (
 )
 
 
+_COMBINED: Final = (
+    "a rotation of the whole block about a line through its control cannot be determined: control "
+    "points (of a tilt: their heights) or GNSS positions away from that line would fix it"
+)
+
+
 @dataclass(frozen=True)
 class RankDefect:
     """One undetermined direction: a sentence, and the unknowns in it with their shares."""
@@ -87,19 +93,36 @@ def rank_defects(
         return ()
     found: list[RankDefect] = []
     named: list[Array] = []
+    motions: list[Array] = []
     for (what, hint), motion in zip(_DATUM_MOTIONS, motion_columns(layout, state)[0], strict=True):
         scaled = motion * reduced.scale
         length = float(np.linalg.norm(scaled))
         if length == 0.0:
             continue
+        motions.append(scaled / length)
         inside = none.T @ scaled / length
         if 1.0 - float(inside @ inside) < _SAME:
             found.append(RankDefect(f"{what} of the whole block cannot be determined: {hint}", ()))
             named.append(inside)
     if named:
         none = none @ linalg.null_space(np.array(named))
+    if motions and none.shape[1]:
+        none, combined = _combined(none, np.array(motions).T)
+        found += [
+            RankDefect(_COMBINED, _sentence(direction, layout.unknowns).shares)
+            for direction in combined.T
+        ]
     found += [_sentence(direction, layout.unknowns) for direction in _separated(none).T]
     return tuple(found)
+
+
+def _combined(none: Array, motions: Array) -> tuple[Array, Array]:
+    """Directions that are no motion of the whole block, and those that are a combined one."""
+    span = linalg.orth(motions)
+    _, share, turned = np.linalg.svd(span.T @ none)
+    inside = np.zeros(none.shape[1], bool)
+    inside[: len(share)] = 1.0 - share**2 < _SAME
+    return none @ turned.T[:, ~inside], none @ turned.T[:, inside]
 
 
 def _separated(basis: Array) -> Array:

@@ -50,14 +50,25 @@ def starting_values(network: Network) -> Network:
     try:
         return completed(network)
     except NetworkError:
-        oriented = _oriented(network)
+        oriented = relatively_oriented(network)
         if oriented is None:
             raise
         return completed(oriented)
 
 
-def _oriented(network: Network) -> Network | None:
-    """The network with orientations of the images that hang together; None without any."""
+def relatively_oriented(network: Network) -> Network | None:
+    """Orient the images relative to each other and bring them to known places.
+
+    Args:
+        network: observations without orientation of an image that has image points.
+
+    Returns:
+        The network with orientations of the images that hang together; None where images have
+        orientations or heads, or where no two images have enough points in common.
+
+    Raises:
+        NetworkError: known places that do not fit the block.
+    """
     table, images = network.image_points, network.images
     placed = np.isfinite(network.stations.position_m[images.station]).all(axis=1)
     turned = np.isfinite(network.attitudes.rotation[images.attitude]).all(axis=(1, 2))

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.bundle.network import Network
-from processing.geometry.rotation import rotation_matrix
+from processing.geometry.rotation import omega_phi_kappa, rotation_matrix
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -26,6 +26,10 @@ _TURNS: Final = (
     ("turned by 180 degrees about the camera's y axis (it looks away)", (0.0, np.pi, 0.0)),
 )
 _INVERSE: Final = "those of the object in the camera; camera to object is right"
+_UNITS: Final = (
+    ("in radians; degrees are right", 180.0 / np.pi),
+    ("in gons; degrees are right", 180.0 / 200.0),
+)
 _BETTER: Final = 0.2
 """Share of the distance as given below which a turn explains it."""
 
@@ -35,9 +39,39 @@ _BEHIND: Final = 10.0
 _MISPLACED: Final = 5.0
 """Distance from the image points over that of half of the control points."""
 
+_HIGH: Final = 500.0
 _MIN_POINTS: Final = 3
 _MIN_CONTROL: Final = 4
 _MAX_NAMED: Final = 5
+
+
+def degrees_for_metres(network: Network) -> list[str]:
+    """Name coordinates whose X and Y are geographic degrees.
+
+    Args:
+        network: as given.
+
+    Returns:
+        A sentence for control points or exposures that are 500 times as high as they are wide, and
+        within 360 and 90.
+    """
+    points, found = network.points, []
+    control = (np.nan_to_num(points.sigma_m, nan=-1.0) >= 0.0).all(axis=1) & ~points.at_infinity
+    placed = np.isfinite(network.stations.position_m).all(axis=1)
+    for what, place in (
+        ("control points", points.xyz_m[control]),
+        ("exposures", network.stations.position_m[placed]),
+    ):
+        if len(place) < _MIN_POINTS:
+            continue
+        wide, high = np.ptp(place[:, :2], axis=0).max(), np.abs(place[:, 2]).max()
+        geographic = (np.abs(place[:, :2]) <= (360.0, 90.0)).all()
+        if geographic and 0.0 < wide < 1.0 and high > _HIGH * wide:
+            found.append(
+                f"X and Y of the {what} extend over {wide:.3g} and heights reach {high:.4g}: they "
+                "are degrees of longitude and latitude; bring them to a map grid in metres"
+            )
+    return found
 
 
 def turned_attitudes(network: Network) -> list[str]:
@@ -57,6 +91,10 @@ def turned_attitudes(network: Network) -> list[str]:
     trials = [rotation @ rotation_matrix(*angles) for _, angles in _TURNS]
     trials.append(np.swapaxes(rotation, 1, 2))
     names = [*(name for name, _ in _TURNS), _INVERSE]
+    angles = omega_phi_kappa(np.where(np.isfinite(rotation), rotation, np.eye(3)))
+    for name, factor in _UNITS:
+        trials += [_turned_by(factor * angles), _turned_by(factor * (angles % (2.0 * np.pi)))]
+        names += [name, name]
     given = _distances(network, own, rotation)
     turned = [_distances(network, own, trial) for trial in trials]
     whole = [float(np.median(distance)) for distance in turned]
@@ -82,6 +120,11 @@ def turned_attitudes(network: Network) -> list[str]:
         + f" is {name}: correct it, or leave its angles empty"
         for name, who in found.items()
     ]
+
+
+def _turned_by(angles: Array) -> Array:
+    """Rotations of omega, phi and kappa, shape (n, 3), rad."""
+    return np.array([rotation_matrix(*own) for own in angles]).reshape(-1, 3, 3)
 
 
 def principal_distance_ratio(network: Network) -> float:

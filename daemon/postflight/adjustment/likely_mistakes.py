@@ -11,26 +11,24 @@ from typing import Final
 
 import numpy as np
 
+from daemon.postflight.adjustment.contradictions import (
+    contradicting_control,
+    contradicting_orientations,
+    explaining,
+    planted_blunders,
+)
 from daemon.postflight.adjustment.given_projections import (
+    degrees_for_metres,
     misplaced_control,
     principal_distance_ratio,
     turned_attitudes,
 )
 from daemon.postflight.adjustment.separate_blocks import unplaced_blocks
-from processing import ProcessingError
-from processing.bundle.adjust import Adjustment, AdjustmentSettings, adjust
 from processing.bundle.camera_model import principal_distance_mm
 from processing.bundle.initial_values import completed
 from processing.bundle.network import Network, NetworkError, no_distances, no_gnss
 from processing.bundle.rank_diagnosis import RankDefect
 
-SUSPICIOUS_SIGMA0: Final = 20.0
-"""Sigma0 beyond which mirrored coordinates are tried."""
-
-_BETTER: Final = 0.2
-"""Share of the sigma0 as given below which they explain it."""
-
-_MAX_ITERATIONS: Final = 15
 _OTHER_DISTANCE: Final = 1.2
 """Ratio of principal distances from which another one is tried."""
 
@@ -46,6 +44,9 @@ _UNITS: Final = (
 _UNIT_WITHIN: Final = 0.1
 _SCALE_BEYOND: Final = 1.5
 _MIN_CONTROL: Final = 3
+_MIN_BASE: Final = 0.02
+"""Extent of the exposures over the distance of the control."""
+
 _MAX_PAIRS_OF: Final = 60
 
 
@@ -62,14 +63,20 @@ def likely_mistakes(network: Network, sigma0: float | None) -> list[str]:
     Returns:
         A sentence for what explains the observations; otherwise empty.
     """
+    found = degrees_for_metres(network) or turned_attitudes(network)
+    if found or _is_at_one_place(network):
+        # Rays from one place intersect anywhere, whatever is changed.
+        return found
     return (
-        turned_attitudes(network)
-        or _mirrored(network, sigma0)
+        _mirrored(network, sigma0)
+        or contradicting_orientations(network, sigma0)
         or _another_principal_distance(network, sigma0)
         or _control_of_another_unit(network)
         or misplaced_control(network)
         or _contradicting_distances(network, sigma0)
         or _contradicting_positions(network, sigma0)
+        or contradicting_control(network, sigma0)
+        or planted_blunders(network, sigma0)
     )
 
 
@@ -107,6 +114,17 @@ def control_sentences(network: Network, defects: Sequence[RankDefect]) -> tuple[
 
 def _is_direction(network: Network, point: int) -> bool:
     return bool(network.points.at_infinity[point])
+
+
+def _is_at_one_place(network: Network) -> bool:
+    """Whether all exposures are given at one place, against the distance of known points."""
+    points, images = network.points, network.images
+    known = points.xyz_m[np.isfinite(points.xyz_m).all(axis=1) & ~points.at_infinity]
+    station = network.stations.position_m[np.unique(images.station[network.image_points.image])]
+    if not len(known) or len(station) < 2 or not np.isfinite(station).all():
+        return False
+    depth = float(np.median(np.linalg.norm(known - station.mean(axis=0), axis=1)))
+    return float(np.ptp(station, axis=0).max()) < _MIN_BASE * depth
 
 
 def _control_of_another_unit(network: Network) -> list[str]:
@@ -151,17 +169,6 @@ def _control_of_another_unit(network: Network) -> list[str]:
     ]
 
 
-def _explaining(network: Network, sigma0: float | None) -> Adjustment | None:
-    """The adjustment of a changed network if its sigma0 is better by far than that as given."""
-    limit = SUSPICIOUS_SIGMA0 if sigma0 is None else _BETTER * sigma0
-    try:
-        settings = AdjustmentSettings(max_iterations=_MAX_ITERATIONS)
-        result = adjust(completed(network), settings)
-    except (ProcessingError, ValueError, ArithmeticError, np.linalg.LinAlgError):
-        return None
-    return result if result.redundancy > 0 and result.sigma0 < limit else None
-
-
 def _another_principal_distance(network: Network, sigma0: float | None) -> list[str]:
     """Free principal distances, from that which the given orientations and coordinates have."""
     ratio = principal_distance_ratio(network)
@@ -171,7 +178,7 @@ def _another_principal_distance(network: Network, sigma0: float | None) -> list[
         replace(camera, f_mm=camera.f_mm * ratio, free=camera.free | {"df"})
         for camera in network.cameras
     )
-    result = _explaining(replace(network, cameras=cameras), sigma0)
+    result = explaining(replace(network, cameras=cameras), sigma0)
     if result is None:
         return []
     found = [
@@ -189,7 +196,7 @@ def _contradicting_distances(network: Network, sigma0: float | None) -> list[str
     given = network.distances
     if not len(given.point_a):
         return []
-    result = _explaining(replace(network, distances=no_distances()), sigma0)
+    result = explaining(replace(network, distances=no_distances()), sigma0)
     if result is None:
         return []
     xyz, names = result.state.points, network.points.names
@@ -207,7 +214,7 @@ def _contradicting_positions(network: Network, sigma0: float | None) -> list[str
     given = network.gnss
     if not len(given.station):
         return []
-    result = _explaining(replace(network, gnss=no_gnss()), sigma0)
+    result = explaining(replace(network, gnss=no_gnss()), sigma0)
     if result is None:
         return []
     rotation = result.state.attitude[given.attitude]
@@ -230,7 +237,7 @@ def _contradicting_positions(network: Network, sigma0: float | None) -> list[str
 def _mirrored(network: Network, sigma0: float | None) -> list[str]:
     table = network.image_points
     mirrored = replace(table, xy_mm=table.xy_mm * np.array([1.0, -1.0]))
-    result = _explaining(replace(network, image_points=mirrored), sigma0)
+    result = explaining(replace(network, image_points=mirrored), sigma0)
     if result is None:
         return []
     return [

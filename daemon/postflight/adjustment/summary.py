@@ -8,13 +8,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
+from daemon.postflight.adjustment.cautions import cautions_of, global_test
 from daemon.postflight.adjustment.head_time_report import print_times, times_of
-from daemon.postflight.adjustment.likely_mistakes import SUSPICIOUS_SIGMA0
 from daemon.postflight.adjustment.project import CheckPoints
 from daemon.postflight.adjustment.reliability_report import reliability_summary, unit_of
-from daemon.postflight.adjustment.separate_blocks import separate_blocks
 from daemon.terminal.console import Console, light_table
 from processing.bundle.adjust import Adjustment
 from processing.bundle.adjustment_results import (
@@ -34,7 +32,6 @@ from processing.bundle.self_calibration import parameter_count
 Array = NDArray[np.float64]
 
 _GRADS_PER_RAD = 200.0 / math.pi
-_LEFT_OUT_SHARE = 0.25
 _MAX_LISTED = 20
 
 
@@ -46,12 +43,13 @@ def report_of(
     table = network.image_points
     against = check_point_differences(result, checks.names, checks.xyz_m, checks.sigma_m)
     control = control_residuals(result)
+    limits, passed = global_test(result)
     content: dict[str, Any] = _plain(
         {
             "name": name,
             "sigma0": result.sigma0,
-            "global_test": _global_test(result),
-            "cautions": _cautions(result),
+            "global_test": {"limits": limits, "passed": passed},
+            "cautions": cautions_of(result, against),
             "redundancy": result.redundancy,
             "observations": result.observations,
             "unknowns": result.unknowns,
@@ -372,64 +370,6 @@ def _agreement(found: PointDifferences) -> dict[str, Any]:
         "predicted_m": predicted,
         "squares": found.squares,
     }
-
-
-def _global_test(result: Adjustment) -> dict[str, Any]:
-    """Limits of sigma0 (99 %) if the a priori sigmas are right, and whether it is inside."""
-    if result.redundancy <= 0:
-        return {"limits": [], "passed": None}
-    low, high = np.sqrt(stats.chi2.ppf([0.005, 0.995], result.redundancy) / result.redundancy)
-    return {"limits": [low, high], "passed": bool(low <= result.sigma0 <= high)}
-
-
-def _cautions(result: Adjustment) -> list[str]:
-    """What a reader would see at once in the tables."""
-    found = []
-    if result.redundancy == 0:
-        found.append(
-            "redundancy is 0: no observation is controlled by the others, and sigma0 and standard "
-            "deviations are not known"
-        )
-    elif result.settings.is_snooping and not math.isfinite(result.reject_limit or math.nan):
-        found.append(
-            f"data snooping with redundancy {result.redundancy} cannot test any observation; the "
-            "test pope needs 2"
-        )
-    settings = result.settings
-    if settings.free_datum != "unknowns" and not result.rank_defects:
-        found.append(
-            f"free_datum = {settings.free_datum} has no effect: the observations determine the "
-            "position, orientation and scale of the block"
-        )
-    if result.sigma0 > SUSPICIOUS_SIGMA0:
-        found.append(
-            f"sigma0 is {result.sigma0:.5g}: image coordinates may be of another unit, y may point "
-            "down, a sigma may be of another unit, or blunders are in the observations (--reject)"
-        )
-    groups = separate_blocks(result.network)
-    if len(groups) > 1:
-        counts = ", ".join(str(len(group)) for group in groups[:5])
-        found.append(
-            f"the images form {len(groups)} blocks that no object point connects ({counts} "
-            "images): each rests on its own control"
-        )
-    points, seen = result.network.points, result.network.image_points.point
-    several = np.bincount(seen, minlength=len(points.names)) >= 2
-    lost = int((several & result.left_out).sum())
-    if result.sigma0 <= SUSPICIOUS_SIGMA0 and lost > _LEFT_OUT_SHARE * several.sum():
-        found.append(
-            f"{lost} of {int(several.sum())} object points in two or more images are left out, for "
-            "their rays do not fix them: are images, or their starting positions, at one place?"
-        )
-    control = np.flatnonzero((np.nan_to_num(points.sigma_m, nan=-1.0) >= 0.0).any(axis=1))
-    tied = np.concatenate([result.network.distances.point_a, result.network.distances.point_b])
-    used = np.union1d(seen, tied)
-    unseen = [points.names[k] for k in np.setdiff1d(control, used)]
-    if unseen:
-        found.append(
-            f"{len(unseen)} control points have no image point: {', '.join(unseen[:_MAX_LISTED])}"
-        )
-    return found
 
 
 def _number(value: float | None, digits: int) -> str:

@@ -61,9 +61,9 @@ def test_one_height_control_point_too_few_leaves_one_tilt() -> None:
         adjust(network)
     assert len(caught.value.rank_defects) == 1
     shares = dict(caught.value.rank_defects[0].shares)
-    # A turn about the line through both points: no axis of its own, named by its unknowns.
     assert any("station" in phrase for phrase in shares)
-    assert "cannot be separated" in caught.value.rank_defects[0].sentence
+    sentence = caught.value.rank_defects[0].sentence
+    assert "of the whole block about a line through its control cannot be determined" in sentence
 
 
 def test_principal_distance_and_height_over_flat_ground_are_named_together() -> None:
