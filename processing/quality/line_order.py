@@ -21,7 +21,7 @@ Array = NDArray[Any]
 
 BLOCKS: Final = 8
 LINES: Final = 16
-WORDS: Final = 200
+WORDS: Final = 100
 """Blocks of lines over a frame, lines of a block and words of a line, about, that are compared."""
 MAX_RATIO: Final = 1.35
 """Of differences: 1.04 at most in healthy frames, 1.5 and more where lines are exchanged."""
@@ -73,24 +73,22 @@ def disorder(sensor: Sensor, frame: Array, axis: int) -> float:
     step = 2 * max(1, lines.shape[1] // (2 * WORDS))
     count = (lines.shape[1] - 1) // step
     firsts = np.linspace(0, size - LINES, BLOCKS).astype(int) // 2 * 2
-    nearest, distances, turns = [], [], []
-    for first in firsts.tolist():
-        block = lines[first : first + LINES]
-        words = np.empty((LINES, count), np.float32)
-        for odd in (0, 1):
-            words[odd::2] = block[odd::2, green[odd] :: step][:, :count]
-        apart = [np.abs(words[k:] - words[:-k]).mean(axis=1) for k in (1, 2, 3, 4)]
-        means = [float(of_lines.mean()) for of_lines in apart]
-        nearest.append(means[0])
-        if min(means) > 0.0:
-            # Rows of plants may be as narrow as the pattern of a few lines, but not of all.
-            distances.append(min(means[0], means[2]) / max(means[1], means[3]))
-            inside, between = float(apart[0][0::2].mean()), float(apart[0][1::2].mean())
-            turns.append(inside / (inside + between))
+    at = (firsts[:, None] + np.arange(LINES)).reshape(-1, 1)
+    words = np.empty((BLOCKS * LINES, count), np.float32)
+    for odd in (0, 1):
+        words[odd::2] = lines[at[odd::2], green[odd] + step * np.arange(count)]
+    words = words.reshape(BLOCKS, LINES, count)
+    apart = [np.abs(words[:, k:] - words[:, :-k]).mean(axis=2) for k in (1, 2, 3, 4)]
+    means = np.array([of_lines.mean(axis=1) for of_lines in apart])
     unit = MIN_DIFFERENCE * sensor.raw_units_per_dn
-    if len(turns) <= BLOCKS // 2 or float(np.median(nearest)) < unit:
+    blocks = np.flatnonzero((means > 0.0).all(axis=0))
+    if len(blocks) <= BLOCKS // 2 or float(np.median(means[0])) < unit:
         return 0.0
-    inside = float(np.median(turns))
+    first, second, third, fourth = means[:, blocks]
+    # Rows of plants may be as narrow as the pattern of a few lines, but not of all.
+    distances = np.minimum(first, third) / np.maximum(second, fourth)
+    within = apart[0][blocks, 0::2].mean(axis=1)
+    inside = float(np.median(within / (within + apart[0][blocks, 1::2].mean(axis=1))))
     return max(float(np.median(distances)), inside / (1.0 - inside), (1.0 - inside) / inside)
 
 
