@@ -19,6 +19,7 @@ from processing.rig.problem_sentences import ProblemList
 UNUSED = "unused"
 """In place of a standard deviation: the observation takes no part."""
 
+_SEPARATORS = {";": "semicolons", "\t": "tabulators"}
 _MAX_BYTES = 2_000_000_000
 _MAX_PROBLEMS = 30
 
@@ -111,7 +112,7 @@ def read_table(path: Path, needed: Sequence[str], known: Sequence[str]) -> CsvTa
     except ForeignFileError as error:
         raise ProjectError([str(error)]) from error
     except UnicodeDecodeError as error:
-        raise ProjectError([f"{path}: cannot be read ({error})"]) from error
+        raise ProjectError([f"{path}: cannot be read ({error}); save it as UTF-8"]) from error
     columns: tuple[str, ...] = ()
     rows: list[list[str]] = []
     lines: list[int] = []
@@ -132,6 +133,13 @@ def read_table(path: Path, needed: Sequence[str], known: Sequence[str]) -> CsvTa
         cells = [cell.strip() for cell in next(csv.reader([bare]))]
         if not columns:
             columns, header = tuple(cells), number
+            if found := next((own for own in _SEPARATORS if len(bare.split(own)) > len(cells)), ""):
+                raise ProjectError(
+                    [
+                        f"{path.name}:{number}: cells are separated by {_SEPARATORS[found]}; write "
+                        "commas, and decimals with points"
+                    ]
+                )
             missing = [c for c in needed if c not in columns]
             foreign = [c for c in columns if c not in needed and c not in known]
             if missing:
@@ -144,8 +152,10 @@ def read_table(path: Path, needed: Sequence[str], known: Sequence[str]) -> CsvTa
             continue
         if len(cells) != len(columns):
             if len(problems) < _MAX_PROBLEMS:
+                hint = "; write decimals with points" if len(cells) > len(columns) else ""
+                hint = "; separate cells by commas" if ";" in bare or "\t" in bare else hint
                 problems.append(
-                    f"{path.name}:{number}: {len(cells)} cells for {len(columns)} columns"
+                    f"{path.name}:{number}: {len(cells)} cells for {len(columns)} columns{hint}"
                 )
             continue
         rows.append(cells)

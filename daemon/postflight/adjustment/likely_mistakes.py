@@ -47,6 +47,8 @@ _MIN_CONTROL: Final = 3
 _MIN_BASE: Final = 0.02
 """Extent of the exposures over the distance of the control."""
 
+_DATUM_DEFECTS: Final = 7
+_MAX_LISTED: Final = 5
 _MAX_PAIRS_OF: Final = 60
 
 
@@ -93,11 +95,20 @@ def control_sentences(network: Network, defects: Sequence[RankDefect]) -> tuple[
     """
     if unplaced := unplaced_blocks(network):
         return tuple(unplaced)
+    if few := _images_of_few_points(network):
+        return tuple(few)
     seen = np.unique(network.image_points.point)
     known = np.asarray((np.nan_to_num(network.points.sigma_m, nan=-1.0) >= 0.0).all(axis=1))
     control = [network.points.names[k] for k in seen if known[k] and not _is_direction(network, k)]
     about = {1: 4, 2: 1}.get(len(control))
     sentences = tuple(defect.sentence for defect in defects)
+    given = int(known.sum())
+    if given and not control and len(defects) == _DATUM_DEFECTS:
+        first = network.points.names[int(np.flatnonzero(known)[0])]
+        return (
+            f"none of the {given} control points ({first}, ...) has an image point: measure them, "
+            "or give their names in image_points.csv as in points.csv",
+        )
     others = len(network.gnss.station) or len(network.distances.point_a)
     held = network.stations.fixed.any() or network.attitudes.fixed.any()
     attitudes = len(network.measured_attitudes.attitude)
@@ -110,6 +121,24 @@ def control_sentences(network: Network, defects: Sequence[RankDefect]) -> tuple[
         + ": three control points that are not on one line, GNSS positions, or --free-network "
         "are needed",
     )
+
+
+def _images_of_few_points(network: Network) -> list[str]:
+    """Images that too few object points orient: an orientation has six unknowns."""
+    images, gnss, bearings = network.images, network.gnss, network.measured_attitudes
+    count = np.bincount(network.image_points.image, minlength=len(images.names))
+    alone = np.bincount(images.station, minlength=len(network.stations.names)) == 1
+    observed = np.isin(images.station, gnss.station) | np.isin(images.attitude, bearings.attitude)
+    held = network.stations.fixed[images.station] | network.attitudes.fixed[images.attitude]
+    few = (count > 0) & (count < _MIN_CONTROL) & alone[images.station] & ~observed & ~held
+    names = [images.names[k] for k in np.flatnonzero(few)]
+    if not names:
+        return []
+    more = ", ..." if len(names) > _MAX_LISTED else ""
+    return [
+        f"{len(names)} images have less than three image points ({', '.join(names[:_MAX_LISTED])}"
+        f"{more}), which do not orient them: measure more points in them, or leave them out"
+    ]
 
 
 def _is_direction(network: Network, point: int) -> bool:

@@ -156,7 +156,8 @@ def read_project_file(path: Path) -> ProjectFile:
     """
     try:
         data = read_regular_file(path, PROJECT_FILE_MAX_BYTES)
-        content = parse_toml(data)
+        # Editors of Windows begin a file with a byte order mark, which TOML has not.
+        content = parse_toml(data.removeprefix(b"\xef\xbb\xbf"))
     except ForeignFileError as error:
         raise ProjectError([f"{error}; give the path of a project.toml"]) from error
     except TomlError as error:

@@ -99,6 +99,17 @@ MISTAKES = {
     "to itself": ("distances.csv", _cell(0, "point_b", lambda _: "p10"), "from p10 to itself"),
     "no distance": ("distances.csv", _cell(0, "distance_m", lambda _: "0"), "distance_m is 0;"),
     "identical": ("points.csv", _copied, "has the coordinates of "),
+    "semicolons": (
+        "points.csv",
+        lambda text: text.replace(",", ";"),
+        "separated by semicolons; write commas",
+    ),
+    "tabulators": ("points.csv", lambda text: text.replace(",", "\t"), "separated by tabulators"),
+    "decimal comma": (
+        "points.csv",
+        _cell(0, "x_m", lambda v: v.replace(".", ",")),
+        "write decimals with points",
+    ),
     "remark": ("image_points.csv", _cell(3, "image", lambda v: f"#{v}"), "looks like a name"),
 }
 
@@ -120,7 +131,7 @@ def test_a_mistake_is_one_sentence_with_file_and_line(mistake, written, tmp_path
 def test_a_byte_order_mark_changes_nothing(written, tmp_path) -> None:
     folder = shutil.copytree(written, tmp_path / "block")
     plain = CliRunner().invoke(app, ["adjust", str(folder), "--json"])
-    for path in folder.glob("*.csv"):
+    for path in folder.iterdir():
         path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
     outcome = CliRunner().invoke(app, ["adjust", str(folder), "--json"])
     assert json.loads(outcome.stdout)["sigma0"] == json.loads(plain.stdout)["sigma0"]

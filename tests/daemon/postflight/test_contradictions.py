@@ -15,10 +15,10 @@ from daemon.postflight.adjustment.contradictions import (
     planted_blunders,
 )
 from daemon.postflight.adjustment.given_projections import degrees_for_metres, turned_attitudes
-from daemon.postflight.adjustment.likely_mistakes import likely_mistakes
+from daemon.postflight.adjustment.likely_mistakes import control_sentences, likely_mistakes
 from processing.bundle.adjust import AdjustmentSettings, adjust
 from processing.bundle.adjustment_results import PointDifferences, check_point_differences
-from processing.bundle.network import Network
+from processing.bundle.network import ImagePoints, Network
 from processing.bundle.rank_diagnosis import RankDefectError
 from tests.processing.bundle.plain_block import axes, plain_block
 
@@ -188,6 +188,31 @@ def test_control_on_one_line_is_named_and_nearly_so_a_caution(block) -> None:
     nothing = PointDifferences((), np.zeros((0, 3)), np.zeros((0, 3)), np.nan)
     found = cautions_of(result, nothing)
     assert any("of 8 images are hardly determined" in one for one in found)
+
+
+def test_control_without_image_points_is_one_sentence(block) -> None:
+    known = np.isin(block.image_points.point, _control(block))
+    table = block.image_points
+    left = ImagePoints(
+        table.image[~known], table.point[~known], table.xy_mm[~known], table.sigma_mm[~known]
+    )
+    network = replace(block, image_points=left)
+    with pytest.raises(RankDefectError) as error:
+        adjust(network)
+    (sentence,) = control_sentences(network, error.value.rank_defects)
+    assert sentence.startswith("none of the 7 control points (p")
+
+
+def test_an_image_of_two_points_is_named(block) -> None:
+    table = block.image_points
+    rows = np.flatnonzero(table.image == 3)
+    left = np.setdiff1d(np.arange(len(table.image)), rows[2:])
+    few = ImagePoints(table.image[left], table.point[left], table.xy_mm[left], table.sigma_mm[left])
+    network = replace(block, image_points=few)
+    with pytest.raises(RankDefectError) as error:
+        adjust(network)
+    (sentence,) = control_sentences(network, error.value.rank_defects)
+    assert sentence.startswith("1 images have less than three image points (i3), ")
 
 
 def test_the_page_of_formats_lists_what_is_named() -> None:
