@@ -53,7 +53,9 @@ def is_inside(px: Array) -> NDArray[np.bool_]:
     return np.asarray(np.all((px > 2.0) & (px < np.array(SIZE) - 3.0), axis=1))
 
 
-def scene(*, tie_sigma_px: float = 0.1, seed: int = 3) -> tuple[PhotographBlock, Array, Array]:
+def scene(
+    *, tie_sigma_px: float = 0.1, seed: int = 3, stated_f_px: float = F_PX
+) -> tuple[PhotographBlock, Array, Array]:
     """The block as matching and orientation give it, and the true stations and attitudes."""
     random = np.random.default_rng(seed)
     plan = np.array([[22.0 * (k % 4) - 33.0, 36.0 * (k // 4) - 18.0] for k in range(8)])
@@ -74,11 +76,10 @@ def scene(*, tie_sigma_px: float = 0.1, seed: int = 3) -> tuple[PhotographBlock,
     image = np.array([k for k, _ in rows], np.int64)
     px = np.array([seen[k][p] for k, p in rows]) + random.normal(0, tie_sigma_px, (len(rows), 2))
     position = station + random.normal(0.0, 1.0, (8, 3)) * [1.5, 1.5, 2.5]
-    return (
-        _block(image, point.astype(np.int64), px, xyz[used], station, rotation, position),
-        (station),
-        rotation,
+    found = _block(
+        image, point.astype(np.int64), px, xyz[used], station, rotation, position, stated_f_px
     )
+    return found, station, rotation
 
 
 def _block(
@@ -89,8 +90,9 @@ def _block(
     station: Array,
     rotation: Array,
     position: Array,
+    stated_f_px: float,
 ) -> PhotographBlock:
-    rig = rig_of({"C": photograph()})
+    rig = rig_of({"C": photograph(stated_f_px)})
     size = perspective_of(rig.cones[0])
     frame = LocalFrame(47.05, 11.4)
     oriented = OrientedBlock(
@@ -121,7 +123,7 @@ def _block(
     )
 
 
-def photograph() -> Photograph:
+def photograph(focal_px: float = F_PX) -> Photograph:
     """What the importer finds in a file of this scene."""
     return Photograph(
         path=Path("IMG_1.jpg"),
@@ -129,7 +131,7 @@ def photograph() -> Photograph:
         serial="1",
         width_px=SIZE[0],
         height_px=SIZE[1],
-        focal_px=F_PX,
+        focal_px=focal_px,
         focal_source="FocalLength",
         pitch_mm=0.01,
         f_number=4.0,

@@ -15,6 +15,7 @@ from daemon.postflight.triangulation.ground_control import (
     no_control,
     read_gcp_list,
 )
+from daemon.postflight.triangulation.held_interior import free_principal_point
 from daemon.postflight.triangulation.photograph_cautions import photograph_cautions
 from daemon.postflight.triangulation.photograph_project import (
     adjusted_photographs,
@@ -25,7 +26,7 @@ from daemon.postflight.triangulation.photograph_project import (
 from daemon.postflight.triangulation.triangulation import TriangulationError
 from processing.bundle.adjust import adjust
 from processing.bundle.initial_values import completed
-from tests.daemon.postflight.photograph_scene import SIZE, measured_control, scene, turned
+from tests.daemon.postflight.photograph_scene import F_PX, SIZE, measured_control, scene, turned
 
 POSITIONS_M = (3.0, 3.0, 5.0)
 
@@ -46,6 +47,27 @@ def test_control_keeps_its_accuracy_where_features_match_many_times_better() -> 
     sigma = result.sigma0 * np.sqrt(np.diag(result.cofactor))[columns]
     assert np.abs((result.state.station - station) / sigma).max() < 4.0
     assert sigma.max() < 1.0
+
+
+@pytest.mark.parametrize("share", [0.85, 1.0, 1.2])
+def test_f_is_found_where_exif_is_wrong_by_a_fifth(share) -> None:
+    """Also the principal point, 12 columns and -9 rows from the middle."""
+    off = np.array([12.0, -9.0])
+    found, station, rotation = scene(stated_f_px=share * F_PX)
+    found = replace(found, tied=replace(found.tied, px=found.tied.px + off))
+    control = measured_control(station, rotation)
+    control = replace(control, px=control.px + off)
+    _, result, _ = adjusted_photographs(
+        found, control, position_sigma_m=POSITIONS_M, reject_beyond=4.0
+    )
+    (free,) = free_principal_point(result, longer_side_px=[SIZE[0]]) or ()
+    section = photographs_section(found, control, result, [free])
+    assert section["f_exif_px"] == pytest.approx(share * F_PX, rel=1e-6)
+    assert section["f_px"] == pytest.approx(F_PX, abs=3.0 * section["f_sigma_px"])
+    assert section["f_sigma_px"] < 6.0
+    assert free.point_px == pytest.approx(tuple(off), abs=4.0 * max(free.point_sigma_px))
+    if share != 1.0:
+        assert any("f was adjusted by" in one for one in photograph_cautions(section))
 
 
 def test_residuals_of_columns_and_rows_have_a_standard_deviation_each() -> None:
