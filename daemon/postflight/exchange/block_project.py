@@ -28,6 +28,7 @@ from daemon.postflight.exchange.metashape_reader import read_metashape
 from daemon.postflight.exchange.opensfm import read_opensfm
 from daemon.postflight.exchange.orientation_reader import read_inpho, read_pix4d
 from daemon.postflight.exchange.photogrammetry_reader import read_bingo, read_patb
+from daemon.postflight.exchange.reprojections import refuse_other_convention
 from processing.bundle.network import (
     INTERIOR,
     Attitudes,
@@ -94,8 +95,9 @@ def import_block(
         position_sigma_m: of the projection centres as observations, x, y, z; None: free network.
 
     Raises:
-        BlockError: files that cannot be read, a distortion that cannot be converted, or standard
-            deviations in metres for positions that are not in metres.
+        BlockError: files that cannot be read, a distortion that cannot be converted, measurements
+            of another convention, or standard deviations in metres for positions that are not in
+            metres.
         ProjectError: `out` holds a project.
     """
     block = READERS[program](path)
@@ -105,6 +107,7 @@ def import_block(
             "--position-sigma in metres does not hold; leave it out, or georeference the block in "
             "the other program"
         )
+    refuse_other_convention(path, block)
     pitches = [camera.pitch_mm or NOMINAL_PITCH_MM for camera in block.cameras]
     fits = [_lens_of(c, pitch) for c, pitch in zip(block.cameras, pitches, strict=True)]
     block, fits, models, corrected = _carried(block, pitches, fits)

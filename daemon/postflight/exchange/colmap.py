@@ -351,7 +351,7 @@ def _points(folder: Path, seen: Sequence[tuple[int, int, float, float]]) -> Bloc
 def _records(path: Path, *, keeps_empty: bool = False) -> Iterator[tuple[str, list[str]]]:
     """Place and words of every line that is no comment."""
     try:
-        text = read_regular_file(path, MODEL_MAX_BYTES).decode("utf-8")
+        text = read_regular_file(path, MODEL_MAX_BYTES).decode("utf-8-sig")
     except (ForeignFileError, UnicodeDecodeError) as error:
         raise BlockError(f"{path}: {error}; a COLMAP text model has this file") from error
     for number, line in enumerate(text.splitlines(), 1):
