@@ -255,14 +255,15 @@ class MarkMatcher:
             # A clock is never off by more than this: most pulses need no closer look.
             separation_ns = mark.mono_ns - strobe_ns
             rough_ns = mark.gps_ns - (reference.gps_ns - separation_ns)
-            if abs(rough_ns) > COARSE_WINDOW_NS + SIGMAS * reference.sigma_ns + abs(
-                round(separation_ns * RATE_LIMIT)
-            ):
+            limit_ns = COARSE_WINDOW_NS + pulse.sigma_ns + SIGMAS * reference.sigma_ns
+            if abs(rough_ns) > limit_ns + abs(round(separation_ns * RATE_LIMIT)):
                 continue
             if separation_ns < -EARLY_TOLERANCE_NS - SIGMAS * pulse.sigma_ns:
                 continue
             expected = self._clock.pulse_at(strobe_ns, pulse.sigma_ns)
-            if expected is not None and abs(mark.gps_ns - expected.gps_ns) <= _window(expected):
+            if expected is None:
+                continue
+            if abs(mark.gps_ns - expected.gps_ns) <= _window(expected, pulse):
                 found.append(pulse)
         return found
 
@@ -365,9 +366,10 @@ class MarkMatcher:
         return (mark.count - pulse.count - channel.offset) % (1 << mark.count_bits) == 0
 
 
-def _window(expected: GpsEstimate) -> int:
+def _window(expected: GpsEstimate, pulse: FiredPulse) -> int:
     if expected.is_coarse:
-        return COARSE_WINDOW_NS
+        # On a busy machine the round trip of a pulse alone exceeds the little.
+        return COARSE_WINDOW_NS + pulse.sigma_ns
     return WINDOW_NS + SIGMAS * expected.sigma_ns
 
 

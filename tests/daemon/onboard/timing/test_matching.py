@@ -75,6 +75,28 @@ def test_frames_of_every_head_find_their_pulse() -> None:
             assert (found.number, found.cause) == (number, Cause.USED)
 
 
+def first_of_a_busy_machine(late_ns: int) -> Matcher:
+    """A first pulse that came so long before the middle of a round trip of 80 ms, and its mark.
+
+    Messages that arrive without any delay already leave the clock 350 ms behind.
+    """
+    clock = GpsClock()
+    clock.message_arrived(GPS_NS, 0)
+    matching = Matcher(CONES, clock)
+    matching.pulse(replace(pulse(1), sigma_ns=40_000_000))
+    true_ns = GPS_NS + pulse(1).mono_ns + pulse(1).strobe_delay_ns - late_ns
+    arrived_ns = pulse(1).mono_ns + pulse(1).strobe_delay_ns + NS // 5
+    matching.mark(mark(1, gps_ns=true_ns, mono_ns=arrived_ns))
+    return matching
+
+
+def test_the_first_mark_of_a_busy_machine_is_taken() -> None:
+    """The round trip of its pulse counts beside what messages leave open."""
+    for late_ns in (10_000_000, 30_000_000):
+        assert first_of_a_busy_machine(late_ns).mark_of(1) is not None
+    assert first_of_a_busy_machine(60_000_000).mark_of(1) is None
+
+
 def test_a_lost_frame_does_not_shift_its_neighbours() -> None:
     matching = matcher(range(1, 5))
     assert [matching.frame(frame(n)).number for n in (1, 3, 4)] == [1, 3, 4]
