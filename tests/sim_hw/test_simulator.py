@@ -33,6 +33,7 @@ from sim_hw.world.scene import open_scene
 from sim_hw.world.truth import world_of
 from sim_hw.world.world import World, WorldSettings
 from tests.sim_hw.gige.test_gige_head import Controller
+from tests.support.stopwatch import Stopwatch, slowdown
 
 pytestmark = pytest.mark.realtime
 
@@ -60,15 +61,15 @@ class Emulator:
                 text=True,
             )
         assert self.process.stdout is not None
-        timer = time.monotonic()
+        watch = Stopwatch()
         line = self.process.stdout.readline()
-        assert time.monotonic() - timer < READY_WITHIN_S
+        assert watch.is_within(READY_WITHIN_S)
         assert line, self.errors.read_text()
         self.ready: dict[str, Any] = json.loads(line)
 
     def end(self) -> int:
         self.process.send_signal(signal.SIGTERM)
-        return self.process.wait(ENDS_WITHIN_S)
+        return self.process.wait(ENDS_WITHIN_S * slowdown())
 
 
 @pytest.fixture(scope="module")
@@ -102,9 +103,9 @@ def fire(address: str, sequences: Sequence[int], delays_ns: dict[str, int]) -> l
 
 
 def wait_for(condition: Any, what: str, within_s: float = 10.0) -> None:
-    deadline = time.monotonic() + within_s
+    watch = Stopwatch()
     while not condition():
-        assert time.monotonic() < deadline, f"waited {within_s} s for {what}"
+        assert watch.is_within(within_s), f"waited {within_s} s for {what}"
         time.sleep(0.05)
 
 
@@ -218,9 +219,9 @@ def marks(port: serial.Serial, *, count: int) -> list[int]:
     """Rising edges reported by the receiver, GPS ns."""
     found: list[int] = []
     reader = UBXReader(port, protfilter=2)
-    deadline = time.monotonic() + 10
+    watch = Stopwatch()
     while len(found) < count:
-        assert time.monotonic() < deadline, f"waited 10 s for {count} event marks, got {found}"
+        assert watch.is_within(10.0), f"waited 10 s for {count} event marks, got {found}"
         _, message = reader.read()
         if message is not None and message.identity == "TIM-TM2" and message.newRisingEdge:
             edge_ns = message.wnR * WEEK_NS + message.towMsR * 1_000_000 + message.towSubMsR
@@ -248,7 +249,7 @@ def is_free(address: str) -> bool:
 def test_killed_it_leaves_no_process_behind(tmp_path: Path, cache: Path) -> None:
     emulator = Emulator(tmp_path / "out", cache, "127.66.2.2", "--processes", "1")
     os.kill(emulator.process.pid, signal.SIGKILL)
-    emulator.process.wait(ENDS_WITHIN_S)
+    emulator.process.wait(ENDS_WITHIN_S * slowdown())
     addresses = [head["address"] for head in emulator.ready["heads"].values()]
     wait_for(lambda: all(map(is_free, addresses)), "the heads to go away", ENDS_WITHIN_S)
 

@@ -230,7 +230,7 @@ def test_a_flight_is_flown_from_the_page(
         print(f"trigger to verdict on the page: {[round(value, 2) for value in latencies_s]} s")
         browser.wait_for("document.querySelectorAll('#rows tr').length === 4", 10)
         planned = "import('/map.js').then((map) => map.planShown().line.join())"
-        browser.wait_for(f"{planned}.then((lines) => lines === '{LINE}')", 10)
+        browser.wait_for(f"{planned}.then((lines) => lines === '{LINE}')", 30)
         assert browser.text("#rows tr td:nth-child(3)") == LINE
         browser.wait_for("document.querySelector('#quicklook').naturalWidth > 0", 20)
         pictures_folder = os.environ.get("SYNTOPIC_PICTURES")

@@ -24,6 +24,7 @@ from sim_hw.gige.gige_head import (
     WireFaults,
 )
 from sim_hw.world.world_clock import FreeRunningClock
+from tests.support.stopwatch import slowdown
 
 pytestmark = [pytest.mark.realtime, pytest.mark.peer]
 
@@ -32,6 +33,8 @@ PATTERN = np.random.default_rng(7).integers(0, 4096, (832, 1248), dtype=np.uint1
 FRAMES = 20
 PLAIN_DEBIAN_RMEM_MAX = 212_992
 POP_TIMEOUT_US = 5_000_000
+FRAME_RETENTION_US = 100_000
+"""Aravis' own."""
 
 
 @pytest.fixture(scope="module")
@@ -120,6 +123,9 @@ class Camera:
         self.stream.set_property("socket-buffer", aravis.GvStreamSocketBuffer.FIXED)
         self.stream.set_property("socket-buffer-size", socket_buffer)
         self.stream.set_property("packet-request-ratio", 1.0)
+        # Aravis gives up a frame after 0.1 s without a packet; on a busy machine each side of the
+        # link may wait longer than that for a core.
+        self.stream.set_property("frame-retention", round(FRAME_RETENTION_US * slowdown()))
         payload = self.camera.get_payload()
         for _ in range(4):
             self.stream.push_buffer(aravis.Buffer.new_allocate(payload))

@@ -30,6 +30,7 @@ from daemon.onboard.monitoring.web.connections import (
     CONNECTIONS_PER_SOURCE,
     IDLE_MAX_S,
     REQUESTS_BURST,
+    REQUESTS_PER_S,
 )
 from daemon.onboard.monitoring.web.request_body import BODY_MAX_BYTES, parse_command_body
 from tests.daemon.onboard.monitoring.attacked_page import (
@@ -214,9 +215,12 @@ def test_a_flood_of_requests_is_answered_429_and_the_operator_200(page: Page) ->
     request = get("/api/v1/ledger")
     with page.connect() as link:
         # Pipelined; the connection is closed with the first refusal.
+        begun_s = time.monotonic()
         pour(link, request * 100, len(request) * 3 * REQUESTS_BURST)
         answers = read_all(link)
-    assert answers.count(b"HTTP/1.1 200") <= 2 * REQUESTS_BURST
+        refilled = REQUESTS_PER_S * (time.monotonic() - begun_s)
+    # The first refusal may come after requests that are answered meanwhile.
+    assert answers.count(b"HTTP/1.1 200") <= REQUESTS_BURST + refilled + 1
     assert answers.count(b"HTTP/1.1 429") <= 1
     refused = 0
     deadline = time.monotonic() + 20
