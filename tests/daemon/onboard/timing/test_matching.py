@@ -91,7 +91,7 @@ def first_of_a_busy_machine(late_ns: int) -> Matcher:
 
 
 def test_the_first_mark_of_a_busy_machine_is_taken() -> None:
-    """The round trip of its pulse counts beside what messages leave open."""
+    """The round trip of its pulse counts in addition to what messages leave open."""
     for late_ns in (10_000_000, 30_000_000):
         assert first_of_a_busy_machine(late_ns).mark_of(1) is not None
     assert first_of_a_busy_machine(60_000_000).mark_of(1) is None
