@@ -87,8 +87,9 @@ def disorder(sensor: Sensor, frame: Array, axis: int) -> float:
     first, second, third, fourth = means[:, blocks]
     # Rows of plants may be as narrow as the pattern of a few lines, but not of all.
     distances = np.minimum(first, third) / np.maximum(second, fourth)
-    within = apart[0][blocks, 0::2].mean(axis=1)
-    inside = float(np.median(within / (within + apart[0][blocks, 1::2].mean(axis=1))))
+    # Medians: a step of the signal, as in banding, is between two lines of many.
+    within, between = (np.median(apart[0][blocks, start::2], axis=1) for start in (0, 1))
+    inside = float(np.median(within / (within + between)))
     return max(float(np.median(distances)), inside / (1.0 - inside), (1.0 - inside) / inside)
 
 
