@@ -35,6 +35,34 @@ def principal_distance_mm(camera: CameraModel, interior: Array) -> float:
     return camera.f_mm if camera.model == "australis" else camera.f_mm - float(interior[2])
 
 
+def perspective_mm(camera: CameraModel, interior: Array) -> tuple[float, float, float]:
+    """Principal distance and principal point of the images without their distortion.
+
+    Australis corrects (x - xp) by (x - xp) df / f + dx0 and projects with f: together images
+    of f / (1 + df / f), which f - df is to first order only.
+
+    Args:
+        camera: model, principal point and principal distance.
+        interior: the ten, shape (10,).
+
+    Returns:
+        Principal distance, and x and y of the principal point in measured coordinates, mm.
+
+    Source: docs/explanation/mathematics/bundle.md#camera-model.
+
+    Example:
+        >>> interior = np.zeros(10)
+        >>> interior[:3] = 0.12, 0.0, 0.24
+        >>> np.round(perspective_mm(CameraModel("C", f_mm=1.2), interior), 9).tolist()
+        [1.0, -0.1, 0.0]
+    """
+    dx0, dy0, df = (float(value) for value in interior[:3])
+    if camera.model != "australis":
+        return camera.f_mm - df, camera.xp_mm - dx0, camera.yp_mm - dy0
+    scale = 1.0 + df / camera.f_mm
+    return camera.f_mm / scale, camera.xp_mm - dx0 / scale, camera.yp_mm - dy0 / scale
+
+
 def ideal_mm(camera: CameraModel, interior: Array, terms: Array, xy_mm: Array) -> Array:
     """Ideal image coordinates of measured ones, about the principal point.
 

@@ -24,7 +24,7 @@ from daemon.postflight.adjustment.given_projections import (
     turned_attitudes,
 )
 from daemon.postflight.adjustment.separate_blocks import unplaced_blocks
-from processing.bundle.camera_model import principal_distance_mm
+from processing.bundle.camera_model import perspective_mm
 from processing.bundle.initial_values import completed
 from processing.bundle.network import Network, NetworkError, no_distances, no_gnss
 from processing.bundle.rank_diagnosis import RankDefect
@@ -211,7 +211,7 @@ def _another_principal_distance(network: Network, sigma0: float | None) -> list[
     if result is None:
         return []
     found = [
-        f"{principal_distance_mm(camera, result.state.interior[k]):.5g} mm (f_mm {given.f_mm:g})"
+        f"{perspective_mm(camera, result.state.interior[k])[0]:.5g} mm (f_mm {given.f_mm:g})"
         for k, (camera, given) in enumerate(zip(cameras, network.cameras, strict=True))
     ]
     return [

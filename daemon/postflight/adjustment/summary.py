@@ -24,6 +24,7 @@ from processing.bundle.adjustment_results import (
     narrow_points,
     parameters_of,
 )
+from processing.bundle.camera_model import perspective_mm
 from processing.bundle.correlations import CORRELATION_LIMIT, high_correlations
 from processing.bundle.data_snooping import names_of
 from processing.bundle.residual_areas import residual_areas
@@ -74,14 +75,12 @@ def report_of(
             "cameras": [
                 {
                     "name": camera.name,
-                    "principal_distance_mm": camera.f_mm - result.state.interior[k, 2],
-                    "principal_point_mm": [
-                        camera.xp_mm - result.state.interior[k, 0],
-                        camera.yp_mm - result.state.interior[k, 1],
-                    ],
+                    "principal_distance_mm": f_mm,
+                    "principal_point_mm": [xp_mm, yp_mm],
                     "parameters": parameter_count(camera),
                 }
                 for k, camera in enumerate(network.cameras)
+                for f_mm, xp_mm, yp_mm in [perspective_mm(camera, result.state.interior[k])]
             ],
             "parameters": [
                 {

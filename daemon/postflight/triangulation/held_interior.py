@@ -14,14 +14,12 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from daemon.postflight.adjustment.adjusted_project import used_network
 from processing.bundle.adjust import Adjustment, AdjustmentSettings, adjust
+from processing.bundle.camera_model import perspective_mm
 from processing.bundle.network import INTERIOR, CameraModel, NetworkError
 from processing.bundle.rank_diagnosis import RankDefectError
-
-Array = NDArray[np.float64]
 
 SIGNIFICANT: Final = 4.0
 """Of the principal point in its standard deviations; 6 in 100,000 of right ones are beyond."""
@@ -120,31 +118,6 @@ def _pitch_mm(camera: CameraModel) -> float:
     return camera.pixel_mm or 1e-3
 
 
-def principal_distance_px(camera: CameraModel, interior: Array) -> float:
-    """Principal distance that perspective images have, px.
-
-    The correction +x df / f of Australis scales image coordinates by 1 + df / f before they are
-    projected with f: f / (1 + df / f), which f - df is to first order only.
-
-    Args:
-        camera: of model `australis`; without a pixel size it is 1 um.
-        interior: the ten, shape (10,).
-
-    Example:
-        >>> camera = CameraModel("C", f_mm=1.2)
-        >>> interior = np.zeros(10)
-        >>> interior[2] = 0.24
-        >>> round(principal_distance_px(camera, interior), 3)
-        1000.0
-    """
-    return camera.f_mm / scale_of_df(camera, interior) / _pitch_mm(camera)
-
-
-def scale_of_df(camera: CameraModel, interior: Array) -> float:
-    """By which df of Australis enlarges image coordinates."""
-    return 1.0 + float(interior[INTERIOR.index("df")]) / camera.f_mm
-
-
 def _changes(held: Adjustment, free: Adjustment) -> tuple[FreePrincipalPoint, ...]:
     """Of each camera, from one adjustment to the other."""
     at = {name: INTERIOR.index(name) for name in _POINT}
@@ -152,16 +125,14 @@ def _changes(held: Adjustment, free: Adjustment) -> tuple[FreePrincipalPoint, ..
     for k, camera in enumerate(held.network.cameras):
         pitch = _pitch_mm(camera)
         columns, interior = free.layout.interior[k], free.state.interior[k]
-        change = principal_distance_px(camera, interior)
-        change -= principal_distance_px(camera, held.state.interior[k])
-        pitch *= scale_of_df(camera, interior)
-        x, y = (float(interior[at[name]]) / pitch for name in _POINT)
+        f_mm, x_mm, y_mm = perspective_mm(camera, interior)
+        change_mm = f_mm - perspective_mm(camera, held.state.interior[k])[0]
+        sigma0 = free.sigma0 * f_mm / camera.f_mm
         sx, sy = (
-            free.sigma0
-            * float(np.sqrt(free.cofactor[columns[at[name]], columns[at[name]]]))
-            / pitch
+            sigma0 * float(np.sqrt(free.cofactor[columns[at[name]], columns[at[name]]])) / pitch
             for name in _POINT
         )
-        # Coordinates are corrected by dx0 and dy0, and y is up.
-        found.append(FreePrincipalPoint(change, (-x, y), (sx, sy)))
+        # y is up in mm, down in px.
+        point_px = (x_mm - camera.xp_mm) / pitch, (camera.yp_mm - y_mm) / pitch
+        found.append(FreePrincipalPoint(change_mm / pitch, point_px, (sx, sy)))
     return tuple(found)

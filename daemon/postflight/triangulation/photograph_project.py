@@ -21,8 +21,6 @@ from daemon.postflight.triangulation.control_mistakes import shift_to_control, u
 from daemon.postflight.triangulation.ground_control import GroundControl, no_control
 from daemon.postflight.triangulation.held_interior import (
     FreePrincipalPoint,
-    principal_distance_px,
-    scale_of_df,
     with_principal_point,
 )
 from daemon.postflight.triangulation.photograph_block import (
@@ -30,6 +28,7 @@ from daemon.postflight.triangulation.photograph_block import (
     provisional_camera,
 )
 from processing.bundle.adjust import Adjustment, AdjustmentSettings, adjust
+from processing.bundle.camera_model import perspective_mm
 from processing.bundle.initial_values import completed
 from processing.bundle.network import (
     INTERIOR,
@@ -364,13 +363,14 @@ def _camera_section(
     """Principal distance of a camera, px, and what its held principal point does to it."""
     size = found.sizes[camera]
     model, interior = found.cameras[camera], result.state.interior[camera]
+    f_mm = perspective_mm(model, interior)[0]
     sigma_px = _interior_sigmas(result, camera).get("df", 0.0) / size.pitch_mm
-    sigma_px /= scale_of_df(model, interior) ** 2
+    sigma_px *= (f_mm / model.f_mm) ** 2
     return {
         "camera": found.cameras[camera].name,
         "photographs": int((found.camera_of == camera).sum()),
         "f_exif_px": size.f_mm / size.pitch_mm,
-        "f_px": principal_distance_px(model, interior),
+        "f_px": f_mm / size.pitch_mm,
         "f_sigma_px": sigma_px,
         "principal_point_free": None if free is None else vars(free),
         "principal_point_estimated": int(result.layout.interior[camera][0]) >= 0,
