@@ -25,6 +25,9 @@ WORDS: Final = 100
 """Blocks of lines over a frame, lines of a block and words of a line, about, that are compared."""
 MAX_RATIO: Final = 1.35
 """Of differences: 1.04 at most in healthy frames, 1.5 and more where lines are exchanged."""
+IMBALANCE: Final = 0.05
+"""Of the signal of odd and even lines: green in lines of red and of blue, or two read-outs, differ by
+a few per cent in healthy sensors, over water by more than the ground does."""
 MIN_DIFFERENCE: Final = 1.0
 """DN, of single words: less is no ground."""
 
@@ -60,15 +63,16 @@ def disorder(sensor: Sensor, frame: Array, axis: int) -> float:
         axis: 0 compares rows, 1 columns.
 
     Returns:
-        The larger of two ratios of mean absolute differences over blocks of lines: of lines at odd
-        distances over those at even ones, and of pairs of lines in turn, the larger over the
-        smaller. Zero without ground.
+        The larger of two ratios of mean absolute differences over blocks of lines, after a usual
+        imbalance of odd and even ones is taken out: of lines at odd distances over those at even
+        ones, and of pairs of lines in turn, the larger over the smaller. Zero without ground.
     """
     lines = frame if axis == 0 else frame.T
     green = _green(sensor, axis)
     size = len(lines) - len(lines) % 2
     if size < 2 * LINES:
         return 0.0
+    unit = MIN_DIFFERENCE * sensor.raw_units_per_dn
     # Green lies in every second word.
     step = 2 * max(1, lines.shape[1] // (2 * WORDS))
     count = (lines.shape[1] - 1) // step
@@ -78,9 +82,11 @@ def disorder(sensor: Sensor, frame: Array, axis: int) -> float:
     for odd in (0, 1):
         words[odd::2] = lines[at[odd::2], green[odd] + step * np.arange(count)]
     words = words.reshape(BLOCKS, LINES, count)
+    of_even, of_odd = (words[:, start::2].mean(axis=(1, 2)) for start in (0, 1))
+    balance = np.clip(of_even / np.maximum(of_odd, unit), 1.0 - IMBALANCE, 1.0 + IMBALANCE)
+    words[:, 1::2] *= balance[:, None, None]
     apart = [np.abs(words[:, k:] - words[:, :-k]).mean(axis=2) for k in (1, 2, 3, 4)]
     means = np.array([of_lines.mean(axis=1) for of_lines in apart])
-    unit = MIN_DIFFERENCE * sensor.raw_units_per_dn
     blocks = np.flatnonzero((means > 0.0).all(axis=0))
     if len(blocks) <= BLOCKS // 2 or float(np.median(means[0])) < unit:
         return 0.0

@@ -74,6 +74,17 @@ def test_rows_of_plants_along_the_lines_are_in_order(period: float) -> None:
     )
 
 
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_few_per_cent_between_odd_and_even_lines_are_usual_also_over_water(axis: int) -> None:
+    """Green in lines of red and of blue, or two read-outs; twelve per cent are not usual."""
+    for percent, is_usual in ((4.0, True), (-4.0, True), (12.0, False)):
+        water = np.random.default_rng(3).normal(900.0, 9.0, (208, 312))
+        lines = water if axis == 0 else water.T
+        lines[1::2] *= 1.0 + 0.01 * percent
+        frame = np.rint(water).astype(np.uint16)
+        assert (disorder(PLAIN, frame, axis) < MAX_RATIO) is is_usual, percent
+
+
 def test_a_frame_without_ground_or_of_a_few_lines_is_not_judged() -> None:
     assert disorder(PLAIN, np.full((208, 312), 700, np.uint16), 0) == 0.0
     dark = np.random.default_rng(1).integers(64, 66, (208, 312)).astype(np.uint16)
