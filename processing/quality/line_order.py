@@ -26,8 +26,8 @@ WORDS: Final = 100
 MAX_RATIO: Final = 1.35
 """Of differences: 1.04 at most in healthy frames, 1.5 and more where lines are exchanged."""
 IMBALANCE: Final = 0.05
-"""Of the signal of odd and even lines: green in lines of red and of blue, or two read-outs, differ by
-a few per cent in healthy sensors, over water by more than the ground does."""
+"""Of the signal of odd and even lines: green in lines of red and of blue, or two read-outs, differ
+by a few per cent in healthy sensors, over water by more than the ground does."""
 MIN_DIFFERENCE: Final = 1.0
 """DN, of single words: less is no ground."""
 
