@@ -47,13 +47,14 @@ def test_a_sample_of_wrong_inputs_does_not_pass_as_good(rig: str) -> None:
 @pytest.mark.trust
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize("rig", [X, L, DMC])
-def test_a_rig_file_of_another_unit_is_flown_again_and_stated_no_better_than_it_is(
+def test_a_rig_file_of_another_unit_is_found_and_stated_no_better_than_it_is(
     rig: str,
 ) -> None:
     case = next(c for c in draw(1000, 3, rigs=[rig], kinds=["wrong-unit"]) if c.share > 1.0)
     outcome = run(replace(case, exposure=0))
     assert outcome.description.startswith("rig file of another unit")
-    assert outcome.result == "found" and outcome.verdict == "refly"
+    # Frames that are found are placed: with the right rig file the raw frames are good.
+    assert outcome.result == "found" and outcome.verdict != "good"
     assert outcome.error_px is not None and outcome.stated_px is not None
     assert outcome.stated_px > 0.5 * outcome.error_px > 0.1
 

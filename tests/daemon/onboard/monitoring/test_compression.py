@@ -18,7 +18,7 @@ from tests.daemon.onboard.monitoring import flight_events
 
 GZIP = {"Accept-Encoding": "gzip"}
 PLAIN = {"Accept-Encoding": "identity"}
-FIRST_LOAD_MAX_BYTES = 180_000
+FIRST_LOAD_MAX_BYTES = 190_000
 IMPORT = re.compile(r'^import (?:[^;]*? from )?"\./([\w/]+\.js)";', re.MULTILINE)
 
 
