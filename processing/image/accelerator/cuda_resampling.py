@@ -9,8 +9,11 @@ from numba import cuda
 from numpy.typing import NDArray
 
 from processing.image.accelerator.cuda_kernel import cuda_compiled_kernel
-from processing.image.accelerator.fixed_resampling import fixed_pixel, in_integers
-from processing.image.kernels import Interpolation
+from processing.image.accelerator.fixed_resampling import (
+    FixedResampling,
+    IntegerResampling,
+    fixed_pixel,
+)
 
 Array = NDArray[Any]
 
@@ -20,52 +23,9 @@ _BLOCK: Final = (32, 8)
 _pixel: Final = cuda_compiled_kernel(device=True)(fixed_pixel.py_func)
 
 
-def resample_cuda(
-    frames: Array,
-    valid: Array,
-    lattices: Array,
-    cell_px: int,
-    weights: Array,
-    gains: Array,
-    *,
-    offsets: Array | None = None,
-    interpolation: Interpolation,
-    out: Array,
-    source: Array,
-    unclean: Array | None = None,
+def _on_device(
+    frames: Array, weights: Array, given: FixedResampling, out: Array, source: Array
 ) -> None:
-    """Fetch every target pixel in integers, on the device; bits as of `resample_fixed`.
-
-    Args:
-        frames: as in `processing.image.resampling.resample`, like all that follow.
-        valid: usable area of each frame.
-        lattices: raw positions at the nodes.
-        cell_px: lattice spacing: 8, 16, 32 or 64.
-        weights: seam weights.
-        gains: factors of the signal.
-        offsets: added after the gain; None adds nothing.
-        interpolation: name of the kernel.
-        out: (height, width) uint16, overwritten; 0 is no data.
-        source: (height, width) uint8, overwritten.
-        unclean: not needed, every pixel is looked at.
-
-    Raises:
-        ValueError: as `processing.image.accelerator.fixed_resampling.in_integers`.
-
-    Source: docs/explanation/mathematics/resampling.md#evaluation and #saturation-and-holes.
-    """
-    del unclean
-    given = in_integers(
-        frames,
-        valid,
-        lattices,
-        cell_px,
-        weights,
-        gains,
-        offsets=offsets,
-        interpolation=interpolation,
-        shape=out.shape,
-    )
     words, marks = cuda.device_array(out.shape, np.uint16), cuda.device_array(out.shape, np.uint8)
     columns, rows = -(-out.shape[1] // _BLOCK[0]), -(-out.shape[0] // _BLOCK[1])
     _resample[(columns, rows), _BLOCK](
@@ -84,6 +44,10 @@ def resample_cuda(
     )
     out[:] = words.copy_to_host()
     source[:] = marks.copy_to_host()
+
+
+resample_cuda: Final = IntegerResampling(_on_device)
+"""On the device, with the bits of `resample_fixed`."""
 
 
 @cuda_compiled_kernel()

@@ -11,6 +11,7 @@ Source: docs/explanation/mathematics/resampling.md#evaluation and #saturation-an
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, Final
@@ -171,52 +172,55 @@ def fixed_table(interpolation: Interpolation) -> Array:
     return fixed
 
 
-def resample_fixed(
-    frames: Array,
-    valid: Array,
-    lattices: Array,
-    cell_px: int,
-    weights: Array,
-    gains: Array,
-    *,
-    offsets: Array | None = None,
-    interpolation: Interpolation,
-    out: Array,
-    source: Array,
-    unclean: Array | None = None,
-) -> None:
-    """Fetch every target pixel in integers, on the processor.
+@dataclass(frozen=True)
+class IntegerResampling:
+    """Fetches every target pixel in integers, like `processing.image.resampling.resample`.
 
-    Args:
-        frames: as in `processing.image.resampling.resample`, like all that follow.
-        valid: usable area of each frame.
-        lattices: raw positions at the nodes.
-        cell_px: lattice spacing: 8, 16, 32 or 64.
-        weights: seam weights.
-        gains: factors of the signal.
-        offsets: added after the gain; None adds nothing.
-        interpolation: name of the kernel.
-        out: (height, width) uint16, overwritten; 0 is no data.
-        source: (height, width) uint8, overwritten.
-        unclean: not needed, every pixel is looked at.
-
-    Raises:
-        ValueError: as `in_integers`.
+    `run` takes frames, seam weights, the tables in integers, and the words and marks to fill; what
+    devices differ in is there.
 
     Source: docs/explanation/mathematics/resampling.md#evaluation and #saturation-and-holes.
     """
-    del unclean
-    given = in_integers(
-        frames,
-        valid,
-        lattices,
-        cell_px,
-        weights,
-        gains,
-        offsets=offsets,
-        interpolation=interpolation,
-        shape=out.shape,
-    )
+
+    run: Callable[[Array, Array, FixedResampling, Array, Array], None]
+
+    def __call__(
+        self,
+        frames: Array,
+        valid: Array,
+        lattices: Array,
+        cell_px: int,
+        weights: Array,
+        gains: Array,
+        *,
+        interpolation: Interpolation,
+        out: Array,
+        source: Array,
+        offsets: Array | None = None,
+        unclean: Array | None = None,
+    ) -> None:
+        """Fill `out` and `source`; `unclean` is not needed, every pixel is looked at.
+
+        Raises:
+            ValueError: as `in_integers`.
+        """
+        given = in_integers(
+            frames,
+            valid,
+            lattices,
+            cell_px,
+            weights,
+            gains,
+            offsets=offsets,
+            interpolation=interpolation,
+            shape=out.shape,
+        )
+        self.run(frames, weights, given, out, source)
+
+
+def _on_processor(
+    frames: Array, weights: Array, given: FixedResampling, out: Array, source: Array
+) -> None:
     _resample_fixed(
         frames,
         given.valid,
@@ -231,6 +235,10 @@ def resample_fixed(
         out,
         source,
     )
+
+
+resample_fixed: Final = IntegerResampling(_on_processor)
+"""On the processor, with the bits of the device."""
 
 
 @compiled_kernel()
