@@ -25,7 +25,7 @@ LOOP: Final = (sys.executable, "-c", "while True: pass")
 MARK: Final = "realtime"
 FLIGHTS: Final = "tests/system"
 # As `make test` runs them, at the priority of the loops.
-WORKERS: Final = ("-n", "2", "--dist", "loadfile", "--no-loadscope-reorder")
+WORKERS: Final = ("-n", "3", "--dist", "loadfile", "--no-loadscope-reorder")
 PRIORITY: Final = {"SYNTOPIC_TEST_NICENESS": "0"}
 
 
