@@ -303,7 +303,21 @@ def test_the_page_can_be_installed_and_opens_without_the_service(cockpit: Cockpi
         ".then((all) => all.map((one) => new URL(one.url).pathname))"
     )
     assert not [path for path in browser.evaluate(kept) if path.startswith("/api/")]
+    # Where the browser can do it, requests of a flight go past the worker, which keeps its objects.
+    assert browser.evaluate(PAST_THE_WORKER) in ("network", "no routes")
 
+
+PAST_THE_WORKER = """(async () => {
+  if (!('workerMatchedSourceType' in PerformanceResourceTiming.prototype)) return 'no routes';
+  performance.clearResourceTimings();
+  await (await fetch('/api/v1/ledger?past')).text();
+  for (let k = 0; k < 100; k += 1) {
+    const [one] = performance.getEntriesByType('resource').filter((e) => e.name.endsWith('?past'));
+    if (one) return one.workerMatchedSourceType;
+    await new Promise((resolve) => setTimeout(resolve, 50));
+  }
+  return 'not seen';
+})()"""
 
 RETAKE = ["held #strip .thumb:nth-child(1)", "#strip .thumb:nth-child(3)", "#strip-retake"]
 

@@ -91,7 +91,13 @@ async function keep(addresses) {
 }
 
 self.addEventListener("message", (event) => event.waitUntil(keep(event.data?.keep || [])));
-self.addEventListener("install", () => self.skipWaiting());
+// What is never answered here does not come here, where the browser can be told: over a flight, thousands of requests
+// that are let through would leave megabytes of objects.
+const routes = ["/api/*", "/metrics"].map((pathname) => ({ condition: { urlPattern: { pathname } }, source: "network" }));
+self.addEventListener("install", (event) => {
+  if (event.addRoutes) event.waitUntil(event.addRoutes(routes).catch(() => {}));
+  self.skipWaiting();
+});
 self.addEventListener("activate", (event) => event.waitUntil(self.clients.claim()));
 self.addEventListener("fetch", (event) => {
   const { request } = event;
