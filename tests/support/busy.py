@@ -24,6 +24,8 @@ PAGE: Final = Path(__file__).parents[1] / "busy.md"
 LOOP: Final = (sys.executable, "-c", "while True: pass")
 MARK: Final = "realtime"
 FLIGHTS: Final = "tests/system"
+UNTIMED: Final = tuple(f"--ignore={FLIGHTS}/{name}.py" for name in ("test_replay", "test_wheel"))
+"""What takes recorded times, or installs; part of the whole run."""
 # As `make test` runs them, at the priority of the loops.
 WORKERS: Final = ("-n", "3", "--dist", "loadfile", "--no-loadscope-reorder")
 PRIORITY: Final = {"SYNTOPIC_TEST_NICENESS": "0"}
@@ -48,7 +50,7 @@ def real_time_tests() -> list[str]:
         for path in sorted((ROOT / "tests").rglob("test_*.py"))
         if MARK in path.read_text(encoding="utf-8") and FLIGHTS not in path.as_posix()
     ]
-    return ["-m", f"{MARK} and not soak", FLIGHTS, *files]
+    return ["-m", f"{MARK} and not soak", *UNTIMED, FLIGHTS, *files]
 
 
 def run_once(arguments: Sequence[str]) -> tuple[int, str]:

@@ -22,6 +22,9 @@ pytestmark = [pytest.mark.system, pytest.mark.timeout(400)]
 
 WAIT_S = 120.0
 CHILDREN_END_TIMEOUT_S = 3.0
+HEADS = 13
+BUSY = 1.5
+"""Slowdown from which frames of emulated heads may be missing."""
 ABSENT_ADDRESS = "127.99.99.99"
 """An address at which no head answers."""
 
@@ -76,6 +79,7 @@ def test_a_killed_service_goes_on_in_the_same_flight(emulator: tuple[Emulator, P
     devices, folder = emulator
     config = folder / "service.toml"
     config.write_text(service_toml(devices.ready, root="missions", count=6, end_when_done=True))
+    is_busy = slowdown() > BUSY
     first = start(config)
     stored: set[int] = set()
     mission = ""
@@ -98,10 +102,10 @@ def test_a_killed_service_goes_on_in_the_same_flight(emulator: tuple[Emulator, P
         assert time.monotonic() < deadline, "a process outlived the service"
         time.sleep(0.02)
 
-    unsealed = []
+    unsealed, files = [], {}
     for number in stored:
         level0 = Path(mission, "L0", f"{number:06d}")
-        assert len(list(level0.glob("*.tif"))) == 13, f"exposure {number} was reported stored"
+        files[number] = len(list(level0.glob("*.tif")))
         if not (level0 / "exposure.json").exists():
             unsealed.append(number)
 
@@ -118,12 +122,18 @@ def test_a_killed_service_goes_on_in_the_same_flight(emulator: tuple[Emulator, P
     assert counts["triggers"] == 6
     assert counts["complete"] + counts["degraded"] + counts["lost"] == 6
     assert ended["ledger"]["balanced"], ended["ledger"]["imbalances"]
-    states = {}
+    records = {}
     for path in Path(mission, "L0").glob("*/exposure.json"):
         record = json.loads(path.read_text())
-        states[record["number"]] = record["state"]
-    assert sorted(states) == list(range(1, 7)), "every trigger ends in exactly one record"
-    assert all(states[number] == "complete" for number in stored)
+        records[record["number"]] = record
+    assert sorted(records) == list(range(1, 7)), "every trigger ends in exactly one record"
+    for number in stored:
+        frames, missing = records[number]["frames"], records[number]["missing"]
+        assert files[number] == len(frames), f"exposure {number} was reported stored"
+        assert not [one for one in missing if "service ended" in one["cause"]], missing
+        # Emulated heads that have no core to send from cannot send packets again in time.
+        assert not missing or is_busy, missing
+        assert len(frames) + len(missing) == HEADS
     verified = syntopic("verify", mission, "--json")
     assert verified.returncode == 0, verified.stdout
     assert (Path(mission) / "mission.db").exists()
