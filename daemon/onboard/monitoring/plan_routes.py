@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import hashlib
+import json
 from typing import Annotated, Any, Literal
 
-from fastapi import FastAPI, HTTPException, Path, Response
+from fastapi import FastAPI, HTTPException, Path, Request, Response
 from fastapi.params import Depends
 
 from daemon.onboard.monitoring.coverage import Coverage, advice_json
@@ -58,13 +60,20 @@ def add_plan(app: FastAPI, state: FlightState, coverage: Coverage, watcher: Depe
         """The live triangulation: accuracy, drifts, findings, what to fly again; empty if off."""
         return dict(with_messages(state.triangulation()))
 
-    @app.get("/api/v1/advice", dependencies=[watcher], tags=["plan"])
-    async def advice() -> dict[str, Any]:
+    @app.get(
+        "/api/v1/advice",
+        dependencies=[watcher],
+        tags=["plan"],
+        response_model=dict[str, Any],
+        responses={304: {"description": "As the client has it (If-None-Match)"}},
+    )
+    async def advice(request: Request) -> Response:
         """Insufficient coverage of the plan: gaps, and segments still to be flown."""
         advice_task = coverage.advice_task()
         if advice_task is None:
-            return {}
-        return dict(with_messages(advice_json(await asyncio.to_thread(advice_task), coverage)))
+            return tagged(request, {})
+        found = advice_json(await asyncio.to_thread(advice_task), coverage)
+        return tagged(request, with_messages(found))
 
     @app.get(
         "/api/v1/advice/{file}",
@@ -94,3 +103,13 @@ def add_plan(app: FastAPI, state: FlightState, coverage: Coverage, watcher: Depe
             ),
         }
         return Response(texts[file](), media_type=KINDS[file])
+
+
+def tagged(request: Request, content: object) -> Response:
+    """JSON under a tag of its content; no body where the client has that (RFC 9110, 13.1.2)."""
+    body = json.dumps(content, ensure_ascii=False, allow_nan=False, separators=(",", ":")).encode()
+    tag = f'W/"{hashlib.sha256(body).hexdigest()[:32]}"'
+    headers = {"ETag": tag}
+    if tag in (one.strip() for one in request.headers.get("If-None-Match", "").split(",")):
+        return Response(status_code=304, headers=headers)
+    return Response(body, media_type="application/json", headers=headers)

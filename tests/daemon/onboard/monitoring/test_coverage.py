@@ -6,10 +6,13 @@ import json
 from pathlib import Path
 
 import pytest
+from fastapi import Depends, FastAPI
+from fastapi.testclient import TestClient
 
 from daemon.onboard.monitoring.coverage import Coverage, advice_json
 from daemon.onboard.monitoring.flight_state import FlightState
 from daemon.onboard.monitoring.monitoring_process import _MissionGeometry
+from daemon.onboard.monitoring.plan_routes import add_plan
 from processing.rig import shipped_rigs
 from tests.daemon.onboard.monitoring import flight_events
 
@@ -106,3 +109,18 @@ def test_without_a_plan_nothing_is_computed(tmp_path: Path) -> None:
     assert coverage.advice_task() is None
     state.apply(flight_events.mission(str(tmp_path / "gone")))
     assert coverage.plan_json() is None
+
+
+def test_unchanged_advice_is_not_sent_again(state: FlightState) -> None:
+    app = FastAPI()
+    add_plan(app, state, Coverage(state), Depends(lambda: None))
+    with TestClient(app) as client:
+        first = client.get("/api/v1/advice")
+        assert [one["kind"] for one in first.json()["segments"]] == ["to fly", "to fly"]
+        known = {"If-None-Match": f'W/"other", {first.headers["ETag"]}'}
+        again = client.get("/api/v1/advice", headers=known)
+        assert (again.status_code, again.content) == (304, b"")
+        fly(state, 1, [0, 64, 128, 192, 256])
+        changed = client.get("/api/v1/advice", headers=known)
+        assert changed.status_code == 200 and changed.headers["ETag"] != first.headers["ETag"]
+        assert changed.json()["covered_m"] > 0.0
