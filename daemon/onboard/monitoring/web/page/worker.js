@@ -91,7 +91,7 @@ async function keep(addresses) {
 }
 
 self.addEventListener("message", (event) => event.waitUntil(keep(event.data?.keep || [])));
-// What is never answered here does not come here, where the browser can be told: over a flight, thousands of requests
+// What is never answered here does not come here, where the browser can be configured: over a flight, thousands of requests
 // that are let through would leave megabytes of objects.
 const routes = ["/api/*", "/metrics"].map((pathname) => ({ condition: { urlPattern: { pathname } }, source: "network" }));
 self.addEventListener("install", (event) => {
