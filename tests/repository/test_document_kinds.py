@@ -43,3 +43,22 @@ def test_a_page_without_a_kind_is_found() -> None:
     assert kind_of("# Title\n\nReference: what it holds.\n") == "Reference"
     assert kind_of("# Title\n\n*Explanation.* Modules: `a.py`.\n") == "Explanation"
     assert kind_of("# Title\n\nPages without a kind begin like this.\n") is None
+
+
+def dated_status(text: str) -> tuple[str, str] | None:
+    """The date and the status of a decision record; None if either is missing."""
+    found = re.search(r"^Date: (\d{4}-\d\d-\d\d)\. Status: (\w[^\n]*)\.$", text, re.MULTILINE)
+    return (found[1], found[2]) if found else None
+
+
+def test_every_decision_states_its_date_and_its_status() -> None:
+    records = sorted((DOCS / "explanation/decisions").glob("[0-9]*.md"))
+    assert len(records) > 20
+    assert [path.name for path in records if dated_status(path.read_text("utf-8")) is None] == []
+
+
+def test_a_decision_without_date_or_status_is_found() -> None:
+    assert dated_status("# 1. Title\n\nDate: 2026-11-22. Status: accepted.\n") is not None
+    assert dated_status("# 1. Title\n\nDate: 2026-11-22.\n") is None
+    assert dated_status("# 1. Title\n\nStatus: accepted.\n") is None
+    assert dated_status("# 1. Title\n\nDate: lately. Status: accepted.\n") is None
