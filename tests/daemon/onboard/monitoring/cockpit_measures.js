@@ -2,7 +2,9 @@
 (() => {
   const isSeen = (one) => one.checkVisibility({ checkOpacity: true, checkVisibilityCSS: true }) && one.getClientRects().length > 0;
   const name = (one) => one.id || one.dataset.command || one.className || one.textContent.trim().slice(0, 30) || one.tagName;
-  const seen = (selector) => [...document.querySelectorAll(selector)].filter(isSeen);
+  // Behind an open dialog nothing can be read or touched.
+  const root = () => document.querySelector("dialog[open]") ?? document;
+  const seen = (selector) => [...root().querySelectorAll(selector)].filter(isSeen);
   const box = (one) => one.getBoundingClientRect();
   const overlap = (a, b) => Math.min(Math.min(a.right, b.right) - Math.max(a.left, b.left), Math.min(a.bottom, b.bottom) - Math.max(a.top, b.top));
 
@@ -20,7 +22,8 @@
 
   function outside() {
     const primary = seen("#phase, #simulated, #verdict-chip, #theme, #phase-button, #phase-second, #open-commands, .lamp, #alarm-bar button, #tabs button, #verdict, #left div, #open-settings, .g-cell, .g-bar, #guidance .age, #map-tools > *, #map-legend, .leaflet-control");
-    return primary.filter((one) => {
+    const dialogs = [...document.querySelectorAll("dialog[open], dialog[open] h2, dialog[open] > form > .commands button")];
+    return [...primary, ...dialogs].filter((one) => {
       const { left, top, right, bottom } = box(one);
       return left < -0.5 || top < -0.5 || right > innerWidth + 0.5 || bottom > innerHeight + 0.5;
     }).map(name);
@@ -46,7 +49,7 @@
   const smallTargets = () => seen("button, select, input, summary, .files a, #map-tools *, .leaflet-bar a").filter((one) => one.matches("button, select, input, summary, a"))
     .filter((one) => box(one).width < 47.5 || box(one).height < 47.5).map((one) => `${name(one)} ${box(one).width}x${box(one).height}`);
 
-  const clipped = () => seen("#phase-button, #phase-second, #alarm-bar button:not(.what), .verdict .word, #tabs .label, .lamp .name, .g-label, .g-value, .g-cell, .thumb .t-mark")
+  const clipped = () => seen("dialog button, dialog label, dialog input, dialog select, #phase-button, #phase-second, #alarm-bar button:not(.what), .verdict .word, #tabs .label, .lamp .name, .g-label, .g-value, .g-cell, .thumb .t-mark")
     .filter((one) => one.scrollWidth > one.clientWidth + 1).map((one) => `${name(one)}: ${one.textContent}`);
 
   // What a scrolling or clipping ancestor hides, of what has to be whole.
@@ -74,9 +77,37 @@
   const contrasts = () => Object.fromEntries(seen(".verdict .word, .verdict .which, #verdict-chip, #alarm-bar .what *, .faults li *, .lamp .name, .lamp .value, .p-alarm, #aircraft li *, .g-label, .g-value, #guidance .age, #phase-button, #left dd, #left dt")
     .filter((one) => one.textContent.trim()).map((one) => [`${name(one)} ${one.textContent.slice(0, 20)}`, contrast(one)]).sort((a, b) => b[1] - a[1]));
 
+  // Colours as [r, g, b, alpha], 0 to 255 and 0 to 1.
+  const rgba = (text) => { const [r, g, b, a = 1] = rgb(text); return [r, g, b, a]; };
+  function over([r, g, b, a], [r2, g2, b2, a2]) {
+    const alpha = a + a2 * (1 - a);
+    const mix = (x, y) => alpha ? (x * a + y * a2 * (1 - a)) / alpha : 0;
+    return [mix(r, r2), mix(g, g2), mix(b, b2), alpha];
+  }
+  const gray = ([r, g, b, a]) => { const y = 0.2126 * r + 0.7152 * g + 0.0722 * b; return [y, y, y, a]; };
+
+  // The contrast as it is painted: translucent grounds, opacity and the gray of a lost connection included.
+  function paintedContrast(one) {
+    let [ink, under] = [rgba(getComputedStyle(one).color), [0, 0, 0, 0]];
+    for (let up = one; up; up = up.parentElement) {
+      const style = getComputedStyle(up);
+      [ink, under] = [ink, under].map((colour) => over(colour, rgba(style.backgroundColor)));
+      if (style.filter.includes("grayscale")) [ink, under] = [gray(ink), gray(under)];
+      [ink, under] = [ink, under].map(([r, g, b, a]) => [r, g, b, a * Number(style.opacity)]);
+      if (up.matches("dialog")) break;
+    }
+    const [a, b] = [ink, under].map((colour) => luminance(over(colour, [255, 255, 255, 1]))).sort((x, y) => y - x);
+    return (a + 0.05) / (b + 0.05);
+  }
+  // Every text and field with less than 4.5:1 (WCAG 2.2, 1.4.3), large ones too. Disabled controls are exempt.
+  const weakTexts = () => seen("body *, dialog *").filter((one) => !one.closest(":disabled") && !one.closest("option, svg, .unseen")
+    && (one.matches("select, input") || [...one.childNodes].some((node) => node.nodeType === 3 && node.textContent.trim())))
+    .map((one) => [one, paintedContrast(one)]).filter(([, value]) => !(value >= 4.5))
+    .map(([one, value]) => `${name(one)} ${one.textContent.trim().slice(0, 20)} ${value.toFixed(2)}`);
+
   const scrolls = () => document.documentElement.scrollHeight > innerHeight || document.documentElement.scrollWidth > innerWidth || scrollY !== 0;
 
-  window.measures = () => ({ outside: outside(), overlapping: overlapping(), smallTexts: smallTexts(), smallTargets: smallTargets(), clipped: clipped(), cut: cut(),
+  window.measures = () => ({ outside: outside(), overlapping: overlapping(), smallTexts: smallTexts(), smallTargets: smallTargets(), clipped: clipped(), cut: cut(), weakTexts: weakTexts(),
     weakest: Object.entries(contrasts()).at(-1), scrolls: scrolls() });
   window.centre = (selector) => {
     const one = seen(selector)[0];
