@@ -1,7 +1,7 @@
 """The map of a flown mission for its report: lines, footprints with verdicts, and gaps.
 
 Coordinates are pixels of a drawing with north up, in a local plane. It shows what the operator's
-page shows, without a base map.
+page shows: track, and parts of images without data, without a base map.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from typing import Any, Final
 
 from daemon.mission.layout import Mission
 from daemon.planning.exposure_footprints import exposure_footprints
+from daemon.planning.flown_track import flown_track
 from daemon.planning.image_counts import ExposureFootprint
 from daemon.planning.model import LocalPlane, PlannedLine, Point, Specification
 from daemon.planning.plan_readers import read_plan
@@ -35,9 +36,10 @@ def flight_map(
 
     Returns:
         Width and height in pixels; `lines` with id and path, `footprints` with number, verdict and
-        path, paths of `holes` and `segments`, `scale` with length in m and in pixels, and
-        `unplaced`, the exposures without a footprint. None where there is neither line nor
-        footprint.
+        path, paths of `no_data` (parts of images without valid pixels), `track`, `holes` and
+        `segments`, `scale` with length in m and in pixels, and `unplaced`, the exposures without a
+        footprint. Lines and footprints determine the extent: a track may leave the drawing. None
+        where there is neither line nor footprint.
 
     Raises:
         DaemonError, RigError, OSError: the mission's plan, rig or configuration cannot be used.
@@ -68,11 +70,48 @@ def flight_map(
         "height": math.ceil((north - south) * px_per_m + 2 * MARGIN_PX),
         "lines": [_line(line, place, path((line.start, line.end))) for line in lines],
         "footprints": [_footprint(one, verdicts, path(one.corners)) for one in placed],
+        "no_data": [path(ring) for one in placed for ring in no_data_rings(one)],
+        "track": [path(part) for part in flown_track(mission)],
         "holes": [path(ring) for one in segments for hole in one.holes for ring in hole.rings],
         "segments": [path((one.start, one.end)) for one in segments],
         "scale": {"length_m": length_m, "px": length_m * px_per_m},
         "unplaced": [one.number for one in taken if not one.corners],
     }
+
+
+def no_data_rings(one: ExposureFootprint) -> list[tuple[Point, ...]]:
+    """The parts of an exposure without valid pixels, of any band, on the ground.
+
+    Places are bilinear between the corners of the footprint, as on the operator's page.
+
+    Args:
+        one: an exposure with a footprint.
+
+    Returns:
+        A ring of four corners for each part; empty where all of the image is valid.
+    """
+    area = one.area
+    if area is None or len(one.corners) != 4:
+        return []
+    lower_left, lower_right, upper_right, upper_left = one.corners
+
+    def place(column: int, row: int) -> Point:
+        right, down = column / area.columns, row / area.rows
+        top = _between(upper_left, upper_right, right)
+        return _between(top, _between(lower_left, lower_right, right), down)
+
+    boxes = dict.fromkeys(box for gaps in area.gaps.values() for box in gaps)
+    return [
+        (place(left, top), place(right, top), place(right, bottom), place(left, bottom))
+        for left, top, right, bottom in boxes
+    ]
+
+
+def _between(a: Point, b: Point, share: float) -> Point:
+    return Point(
+        a.latitude_deg + share * (b.latitude_deg - a.latitude_deg),
+        a.longitude_deg + share * (b.longitude_deg - a.longitude_deg),
+    )
 
 
 def _line(line: PlannedLine, place: Any, path: str) -> dict[str, Any]:
