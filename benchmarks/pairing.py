@@ -189,7 +189,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add("--exposures", type=int, default=10_000, help="of the flights with none and with many")
     add("--each", type=int, default=100, help="exposures of the flight with each single fault")
     add("--only", default="", help="faults whose name begins so; 'none' and 'many' are names too")
-    add("--seed", type=int, default=1, help="everything random follows from it")
+    add("--seed", type=int, default=1, help="seed for all random generators")
     given = parser.parse_args(arguments)
     cases = [
         (Case("none", "", ()), given.exposures),

@@ -95,11 +95,11 @@ def _given(step: str, rig: str, scene: str, number: int) -> GivenStep:
     light = first_without_smear(rig, scene, FIRST + 10 * number)
     function, seen = getattr(stitched_stages, step), list[tuple[Any, ...]]()
 
-    def kept(*arguments: Any, **others: Any) -> Any:
+    def recorded(*arguments: Any, **others: Any) -> Any:
         seen.append(arguments)
         return function(*arguments, **others)
 
-    with patch.object(stitched_stages, step, kept):
+    with patch.object(stitched_stages, step, recorded):
         remeasured(rig, light, 900 + number, scene=scene).process()
     of_rig, _, frames = seen[0][:3]
     return GivenStep(of_rig, seen[0], frames)

@@ -25,7 +25,7 @@ def parser() -> argparse.ArgumentParser:
     add = line.add_argument
     add("rig", help="name of a shipped rig, or a rig file")
     add("--out", type=Path, required=True, help="folder for calibration, truth and scene")
-    add("--seed", type=int, default=1, help="everything random follows from it")
+    add("--seed", type=int, default=1, help="seed for all random generators")
     add("--dc", type=float, default=0.0, help="temperature above calibration, K")
     add(
         "--displace",

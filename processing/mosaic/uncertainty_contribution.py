@@ -47,7 +47,7 @@ SINGLE_SENSOR_SIGMAS: Final = 1.0
 OTHER_LENS_SIGMAS: Final = 4.0
 """Of scale and of direction, beyond which a changed cone is that of another unit."""
 TURN_SIGMAS: Final = 2.0
-"""A turn of a converging head within so many standard deviations of calibration is no error."""
+"""A rotation of a converging head within so many standard deviations of calibration is no error."""
 STALE_K_PER_S: Final = 0.02
 """How fast temperatures change that were read too long ago."""
 HEAD_SCALE_PPM: Final = 50.0
@@ -165,20 +165,20 @@ def _held(
         return
     f_mm = mosaic.model.f_mm
     for head in platform.heads:
-        # A displaced sensor passes for a turned head, whose image bends otherwise.
-        by_x, by_y, _ = _true_turn(mosaic, head, held)
+        # A displaced sensor is confounded with a rotated head, whose image bends otherwise.
+        by_x, by_y, _ = _true_rotation(mosaic, head, held)
         for part, shift_mm in zip(held.parts[head.cone], (-f_mm * by_y, f_mm * by_x), strict=False):
             yield part.times(shift_mm)
 
 
-def _true_turn(mosaic: Mosaic, head: EstimatedMounting, held: HeldQuantities | None) -> Array:
-    """The turn of a head (3,), rad, less what heads with another scale make of it."""
-    turn = np.array(head.correction_rad)
+def _true_rotation(mosaic: Mosaic, head: EstimatedMounting, held: HeldQuantities | None) -> Array:
+    """The rotation of a head (3,), rad, less what heads with another scale make of it."""
+    rotation = np.array(head.correction_rad)
     scaled = None if held is None else scaled_part(held, least=HEAD_SCALE_PPM * 1e-6)
     if scaled is None:
-        return turn
+        return rotation
     first = mosaic.model.mountings[head.cone]
-    return np.asarray(turn - scaled.unknowns[first : first + 3])
+    return np.asarray(rotation - scaled.unknowns[first : first + 3])
 
 
 def _common_scale(
@@ -262,18 +262,18 @@ def _rotated_heads(
 ) -> Iterator[Array]:
     """What heads that turned do to the mean of all, which is the datum; each on its own.
 
-    Of heads whose turn is no significant one, what is beyond the usual size counts.
+    Of heads whose rotation is no significant one, what is beyond the usual size counts.
     """
     if platform is None:
         return
     pitch_mm = mosaic.model.pitch_mm
     f_px = mosaic.model.f_mm / pitch_mm
     for head in platform.heads:
-        turn = _true_turn(mosaic, head, held)
+        rotation = _true_rotation(mosaic, head, held)
         if not platform.is_expired:
             usual = TURN_SIGMAS * head.usual_rad
-            turn = np.sign(turn) * np.sqrt(np.maximum(turn**2 - usual**2, 0.0))
-        by_x, by_y, by_z = turn / (len(platform.heads) - 1)
+            rotation = np.sign(rotation) * np.sqrt(np.maximum(rotation**2 - usual**2, 0.0))
+        by_x, by_y, by_z = rotation / (len(platform.heads) - 1)
         yield np.array([-f_px * by_y, f_px * by_x, 0.0, by_z / pitch_mm])
 
 

@@ -125,7 +125,7 @@ def _entries_of_file(path: Path, problems: list[str]) -> list[tuple[str, dict[st
         return []
     listed = content.pop("fault", None)
     problems += [
-        f"{path.name}: {key} is not known here; a scenario has tables [[fault]]" for key in content
+        f"{path.name}: {key} is unknown; a scenario has tables [[fault]]" for key in content
     ]
     if not isinstance(listed, list) or not listed:
         problems.append(f"{path.name}: there is no [[fault]]; a scenario has at least one")

@@ -25,7 +25,7 @@ def command(name: str, description: str | None) -> argparse.ArgumentParser:
     line = argparse.ArgumentParser(prog=f"python -m sim_hw.{name}", description=description)
     line.add_argument("rig", help="name of a shipped rig, or a rig file")
     line.add_argument("--out", type=Path, required=True, help="a new folder for series and truth")
-    line.add_argument("--seed", type=int, default=1, help="everything random follows from it")
+    line.add_argument("--seed", type=int, default=1, help="seed for all random generators")
     line.add_argument("--take", type=int, default=1, help="2: the same parts, calibrated again")
     return line
 

@@ -195,7 +195,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add("--out", type=Path, required=True, help="folder for mission, calibration and truth")
     add("--exposures", type=int, default=1, help="of each line")
     add("--lines", type=int, default=1, help="flown there and back, 30 %% apart in overlap")
-    add("--seed", type=int, default=1, help="everything random follows from it")
+    add("--seed", type=int, default=1, help="seed for all random generators")
     add("--dc", type=float, default=0.0, help="temperature above calibration, K")
     add(
         "--displace",

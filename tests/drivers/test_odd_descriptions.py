@@ -199,7 +199,7 @@ def test_a_mode_of_exposure_in_the_makers_own_words_is_kept() -> None:
         driver.bind()
         assert emulated.registers.symbolic_or("ExposureMode", "") == "EdgePreSelect"
     found = refusal_of(with_nodes(nodes.format(own="TriggerControlled"), "ExposureMode"))
-    assert "cannot time its exposure by itself (ExposureMode has TriggerWidth, Trigger" in found
+    assert "has no timed exposure mode (ExposureMode has TriggerWidth, Trigger" in found
 
 
 @pytest.mark.parametrize(

@@ -1,14 +1,23 @@
-"""Words of `tests.repository.vocabulary` stand nowhere, and each exception is one."""
+"""Words and phrases of `tests.repository.vocabulary` stand nowhere; each exception is needed."""
 
 import ast
+import re
 import subprocess
 
-from tests.repository.vocabulary import ALLOWED, INSTEAD, ROOT, occurrences
+from tests.repository.vocabulary import (
+    ALLOWED,
+    ALLOWED_NAMES,
+    ROOT,
+    names_in,
+    occurrences,
+    phrases_in,
+    replacement,
+)
 
 
 def test_no_word_to_avoid_is_used() -> None:
     found = [
-        f"{one.path}:{one.line}: {one.word}: write {INSTEAD[one.word]}" for one in occurrences()
+        f"{one.path}:{one.line}: {one.word}: write {replacement(one.word)}" for one in occurrences()
     ]
     assert found == []
 
@@ -17,6 +26,31 @@ def test_every_exception_is_needed() -> None:
     for path, word in ALLOWED:
         text = (ROOT / path).read_text("utf-8").lower()
         assert word in text, (path, word)
+
+
+def test_every_exception_of_a_name_is_needed() -> None:
+    for path, name in ALLOWED_NAMES:
+        text = (ROOT / path).read_text("utf-8")
+        assert re.search(rf"(?:class|def) {name}\b", text), (path, name)
+
+
+def test_a_phrase_is_found_across_lines() -> None:
+    for text in (
+        "The brightest hundredth stayed.",
+        "the brightest\nhundredth",
+        "# of the brightest\n# hundredth",
+        '"the brightest "\n    "hundredth"',
+        '"the Brightest "\n    f"hundredth {x}"',
+    ):
+        assert [one.word for one in phrases_in("a.md", text)] == ["brightest hundredth"], text
+    assert list(phrases_in("a.md", "The brightest of a hundred stayed.")) == []
+
+
+def test_a_name_of_a_class_or_function_is_found() -> None:
+    text = "class FilesMade:\n    def turn_of(self): ...\n\nasync def kept(): ...\n"
+    assert {one.word for one in names_in("a.py", text)} == {"made", "turn", "kept"}
+    plain = "def test_a_turn_is_made(): ...\n\ndef rotation(): return 'kept'\n"
+    assert list(names_in("a.py", plain)) == []
 
 
 def test_public_class_names_are_unique() -> None:

@@ -134,6 +134,6 @@ def _check_brightness(
 
 
 def _brightness(path: Path) -> float:
-    """Where the brightest hundredth begins, of the full scale above black."""
+    """The 99th percentile, as a share of the full scale above black."""
     level = float(np.percentile(tifffile.imread(path), 99.0))
     return (level - BLACK_DN) / (FULL_SCALE_DN - BLACK_DN)

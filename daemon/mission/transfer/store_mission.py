@@ -17,7 +17,7 @@ from daemon.mission.canonical_json import sha256_hex
 from daemon.mission.layout import Mission, exposure_name, is_exposure_name
 from daemon.mission.store.level0_folder import CAPTURE_FILE, EXPOSURE_FILE
 from daemon.mission.transfer.object_store import ObjectStore, ObjectStoreError
-from daemon.mission.transfer.store_products import PROCESSED, asked
+from daemon.mission.transfer.store_products import PROCESSED, answers
 from daemon.mission.transfer.store_verification import read_store_manifest
 from daemon.mission.transfer.transfer_manifest import CopiedFile, TransferManifest
 
@@ -54,7 +54,7 @@ class StoredMission:
         """
         path = fetch_shared(self.store, self.manifest, folder)
         numbers = list(numbers)
-        asked(lambda n: fetch_exposure(self.store, path, n, self.exposures[n]), numbers)
+        answers(lambda n: fetch_exposure(self.store, path, n, self.exposures[n]), numbers)
         return Mission.open(path)
 
 
@@ -106,7 +106,7 @@ def fetch_shared(store: ObjectStore, manifest: TransferManifest, folder: Path) -
         for name in manifest.files
         if name.split("/", 1)[0] not in _LEFT_OUT and not name.startswith(_INDEX)
     ]
-    asked(lambda name: _fetch(store, name, manifest.files[name], path), names)
+    answers(lambda name: _fetch(store, name, manifest.files[name], path), names)
     return path
 
 

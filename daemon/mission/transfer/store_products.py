@@ -246,7 +246,7 @@ def stored_reports(store: ObjectStore, keys: Mapping[int, str]) -> dict[int, dic
         own = _record(store, f"{product_folder(number, key)}/{REPORT_FILE}")
         return {**own, "duration_s": 0.0, **durations}
 
-    return dict(zip(keys, asked(report, keys), strict=True))
+    return dict(zip(keys, answers(report, keys), strict=True))
 
 
 def product_differences(
@@ -278,7 +278,7 @@ def product_differences(
                 yield f"{folder}/{name}: differs from its manifest"
 
 
-def asked(ask: Callable[[Any], Any], what: Iterable[Any]) -> list[Any]:
+def answers(ask: Callable[[Any], Any], what: Iterable[Any]) -> list[Any]:
     """Answers to small requests, several at a time, in order.
 
     Args:

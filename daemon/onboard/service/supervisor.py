@@ -1,6 +1,6 @@
 """Supervision of the service's processes from its event loop: start, receive, liveness, end.
 
-The meaning of messages is not known here.
+The meaning of messages is not interpreted here.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class Supervisor:
         dead = self._children.pop(name, None)
         if dead is not None:
             dead.end(0.0)
-        child = _made(name, target, arguments, environment)
+        child = _child_process(name, target, arguments, environment)
         self._children[name] = child
         self._last_answer_s[name] = time.monotonic()
         asyncio.get_running_loop().add_reader(child.connection.fileno(), self._receive, child)
@@ -128,7 +128,7 @@ class Supervisor:
         self._on_death(child.name)
 
 
-def _made(
+def _child_process(
     name: str, target: str, arguments: tuple[Any, ...], environment: Mapping[str, str]
 ) -> ChildProcess:
     """The page's process uses a restricted protocol, because unknown senders can reach it."""

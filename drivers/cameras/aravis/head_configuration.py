@@ -249,11 +249,11 @@ class HeadConfiguration:
         own = [mode for mode in offered if mode not in PULSE_WIDTH_MODES]
         for mode in ("Timed", features.text("ExposureMode"), *own):
             if mode in own:
-                hint = "the head cannot time its exposure by itself"
+                hint = "the head has no timed exposure mode"
                 self._writer.set("exposure_time_us", "ExposureMode", mode, hint)
                 return
         self.refusals.append(
-            f"the head cannot time its exposure by itself (ExposureMode has {', '.join(offered)})"
+            f"the head has no timed exposure mode (ExposureMode has {', '.join(offered)})"
         )
 
     def _exposure_unit_us(self) -> float:

@@ -155,8 +155,7 @@ class V4l2Head(V4l2Settings, HeadDevice):
             session.settings = session.camera.control_values()
         except OSError as error:
             raise DeviceError(
-                f"{self.name}: the head was lost while it was set ({error.strerror}); it is "
-                "opened again by itself"
+                f"{self.name}: the head was lost while it was set ({error.strerror}); reconnecting"
             ) from None
         self._adjusted = (exposure_time_us, gain_db)
 

@@ -53,7 +53,7 @@ class AsciiLineThermometer(SerialDevice):
         ("OPEN",), maximum=16, help="readings that mean an open sensor"
     )
     unit = Setting("C", choices=("C", "F", "K"), help="unit of the readings")
-    command = Setting("", help="what asks for a reading; empty: the instrument speaks by itself")
+    command = Setting("", help="request for a reading; empty: the instrument sends unrequested")
     command_end = Setting("cr", choices=tuple(TERMINATORS), help="what ends the command")
     interval_s = Setting(1.0, minimum=0.05, maximum=3600, help="time from command to command")
 

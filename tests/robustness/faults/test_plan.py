@@ -77,7 +77,7 @@ def test_all_mistakes_are_reported_together_each_with_its_cure(tmp_path: Path) -
         "flooding is of the whole device; leave out /mark",
         "receiver/marks is not a message; write receiver/mark or receiver/navigation",
         "SU00/mark is not a message; write SU00",
-        "wrong.toml: colour is not known here",
+        "wrong.toml: colour is unknown",
         "wrong.toml: fault[0]: there is no fault 'lots'; did you mean lost?",
         "wrong.toml: fault[1].by_s is not known; lost has at_pulse, at_s, device",
         "wrong.toml: fault[1].at_s is -1",

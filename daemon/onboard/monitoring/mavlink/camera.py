@@ -430,7 +430,7 @@ class MavlinkCamera(asyncio.DatagramProtocol):
             self._report(
                 f"the last timestamps of signed commands cannot be saved at "
                 f"{self._settings.signing_state}: {reason}. After a restart a recorded command "
-                "could be obeyed again; check that disk"
+                "could be executed again; check that disk"
             )
 
     def _advance_clock(self) -> None:

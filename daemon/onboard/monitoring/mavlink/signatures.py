@@ -138,9 +138,9 @@ class Signatures:
             return
         except (OSError, ValueError, TypeError, KeyError) as error:
             raise ValueError(
-                f"{path}: the last timestamps of signed commands cannot be read ({error}); "
-                "commands that were recorded could be obeyed again. Remove the file if nobody can "
-                "have recorded any"
+                f"{path}: the last timestamps of signed commands could not be loaded ({error}); "
+                "recorded commands could be executed again. Remove the file if no command can "
+                "have been recorded"
             ) from error
         self._advance(clock)
         # Messages that another key signed are refused anyway.

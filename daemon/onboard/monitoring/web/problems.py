@@ -60,7 +60,7 @@ def _problem(status: int, detail: str, headers: Mapping[str, str] | None = None)
 
 def _title(status: int) -> str:
     titles: Mapping[int, str] = {
-        401: "Not known here",
+        401: "Token rejected",
         403: "Not allowed",
         404: "Not found",
         405: "No such method",

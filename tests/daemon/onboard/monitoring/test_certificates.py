@@ -37,16 +37,16 @@ DAY_S = 86_400.0
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def issued(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("tls")
     issue_certificate(folder, names=["camera1.example.org"])
     return folder
 
 
 @pytest.fixture
-def tls(made: Path, tmp_path: Path) -> Path:
+def tls(issued: Path, tmp_path: Path) -> Path:
     """A copy that a test may damage."""
-    for path in made.iterdir():
+    for path in issued.iterdir():
         (tmp_path / path.name).write_bytes(path.read_bytes())
         (tmp_path / path.name).chmod(path.stat().st_mode & 0o777)
     return tmp_path
@@ -70,9 +70,9 @@ def greet(server: ssl.SSLContext, client: ssl.SSLContext, name: str) -> None:
 
 
 @pytest.mark.filterwarnings("ignore:ssl.TLSVersion")
-def test_a_client_that_trusts_the_authority_accepts_the_machine_by_its_names(made: Path) -> None:
-    server = server_context(made / "server.pem", made / "server.key")
-    client = ssl.create_default_context(cafile=str(made / "authority.pem"))
+def test_a_client_that_trusts_the_authority_accepts_the_machine_by_its_names(issued: Path) -> None:
+    server = server_context(issued / "server.pem", issued / "server.key")
+    client = ssl.create_default_context(cafile=str(issued / "authority.pem"))
     host = socket.gethostname().lower().partition(".")[0]
     for name in (f"{host}.local", "127.0.0.1", "::1", "localhost", "camera1.example.org"):
         greet(server, client, name)
@@ -80,7 +80,7 @@ def test_a_client_that_trusts_the_authority_accepts_the_machine_by_its_names(mad
         greet(server, client, "other.local")
     with pytest.raises(ssl.SSLCertVerificationError, match="unable to get local issuer"):
         greet(server, ssl.create_default_context(), "localhost")
-    old = ssl.create_default_context(cafile=str(made / "authority.pem"))
+    old = ssl.create_default_context(cafile=str(issued / "authority.pem"))
     old.set_ciphers("DEFAULT:@SECLEVEL=0")
     old.minimum_version = ssl.TLSVersion.TLSv1
     old.maximum_version = ssl.TLSVersion.TLSv1_1

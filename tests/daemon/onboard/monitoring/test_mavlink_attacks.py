@@ -262,7 +262,7 @@ def test_a_disk_that_refuses_is_reported_and_the_operator_obeyed(tmp_path: Path)
     b'{"key": "x", "clock": 1, "streams": [[1, 2, 300, 4]]}', bytes(range(200, 250))])  # fmt: skip
 def test_damaged_timestamps_are_not_taken_for_none(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "state").write_bytes(content)
-    with pytest.raises(ValueError, match="recorded could be obeyed again"):
+    with pytest.raises(ValueError, match="recorded commands could be executed again"):
         Signatures(KEY, tmp_path / "state")
 
 

@@ -30,21 +30,21 @@ def make_line(tmp_path: Path, *, count: int, flown: int = 0, reserve: int = 0) -
 
 def fly(line: FlightLine) -> tuple[list[Order], list[str]]:
     orders: list[Order] = []
-    complaints: list[str] = []
+    reported: list[str] = []
 
-    def complain(sentence: str) -> None:
-        complaints.append(sentence)
+    def report(sentence: str) -> None:
+        reported.append(sentence)
         raise TimeoutError
 
     async def run() -> None:
         async with asyncio.timeout(20):
-            await line.fly(orders.append, complain)
+            await line.fly(orders.append, report)
 
     try:
         asyncio.run(run())
     except TimeoutError:
-        assert complaints
-    return orders, complaints
+        assert reported
+    return orders, reported
 
 
 def test_the_planned_number_is_flown_no_faster_than_the_camera_can(tmp_path: Path) -> None:
@@ -60,9 +60,9 @@ def test_a_resumed_line_flies_only_what_is_left(tmp_path: Path) -> None:
 
 
 def test_a_full_disk_orders_nothing_and_states_the_action(tmp_path: Path) -> None:
-    orders, complaints = fly(make_line(tmp_path, count=2, reserve=1 << 60))
+    orders, reported = fly(make_line(tmp_path, count=2, reserve=1 << 60))
     assert not orders
-    assert "free" in complaints[0]
+    assert "free" in reported[0]
 
 
 def test_exposures_carry_the_ids_of_the_planned_line_and_its_strip(tmp_path: Path) -> None:

@@ -31,10 +31,10 @@ SIZE = (1600, 1200)
 
 @pytest.fixture(scope="module")
 def scene():
-    return made_scene(K1, K2)
+    return block_scene(K1, K2)
 
 
-def made_scene(k1: float, k2: float):
+def block_scene(k1: float, k2: float):
     """Nine nadir images over uneven ground, and their measurements with 0.3 px of noise.
 
     Projection is written here: vision axes, f, k1, k2 about the middle.
@@ -202,7 +202,7 @@ STRONG = (-0.28, 0.12)
 
 def test_a_brown_distortion_that_does_not_fit_keeps_its_model(tmp_path) -> None:
     """As real cameras have it: the ten parameters leave a quarter of a pixel in the corners."""
-    path = colmap(made_scene(*STRONG), tmp_path / "in", *STRONG)
+    path = colmap(block_scene(*STRONG), tmp_path / "in", *STRONG)
     content, report = imported_and_adjusted(path, tmp_path / "project")
     note = content["notes"][-1]
     assert "keeps its own model, opencv" in note and "0.02 px is the limit" in note
@@ -212,7 +212,7 @@ def test_a_brown_distortion_that_does_not_fit_keeps_its_model(tmp_path) -> None:
     assert camera.model == "opencv"
     assert np.allclose(camera.interior[3:], [*STRONG, 0, 0, 0, 0, 0], atol=1e-9)
     # The other sign of k1 in the file is no longer the camera that took the measurements.
-    wrong = colmap(made_scene(*STRONG), tmp_path / "wrong", 0.28, -0.12)
+    wrong = colmap(block_scene(*STRONG), tmp_path / "wrong", 0.28, -0.12)
     _, report = imported_and_adjusted(wrong, tmp_path / "other")
     assert report["sigma0"] > 5.0
 
@@ -227,7 +227,7 @@ def changed_camera(path: Path, place: int, value: float) -> None:
 
 
 def test_pixels_that_are_not_square_are_carried_with_the_model(tmp_path) -> None:
-    points, centres, turns, seen = made_scene(*STRONG)
+    points, centres, turns, seen = block_scene(*STRONG)
     wider = [(k, p, u * 1.001, v) for k, p, u, v in seen]
     path = colmap((points, centres, turns, wider), tmp_path / "in", *STRONG)
     changed_camera(path, 0, F * 1.001)
@@ -236,7 +236,7 @@ def test_pixels_that_are_not_square_are_carried_with_the_model(tmp_path) -> None
 
 
 def test_another_distortion_that_does_not_fit_is_taken_out_of_the_measurements(tmp_path) -> None:
-    path = colmap(made_scene(*STRONG), tmp_path / "in", *STRONG)
+    path = colmap(block_scene(*STRONG), tmp_path / "in", *STRONG)
     changed_camera(path, 9, 1e-5)
     content, report = imported_and_adjusted(path, tmp_path / "project")
     assert "The measurements are corrected for it" in content["notes"][-1]
@@ -250,7 +250,7 @@ def test_another_distortion_that_does_not_fit_is_taken_out_of_the_measurements(t
 
 def test_a_measurement_that_no_ray_has_is_refused(tmp_path) -> None:
     """k1 = -4 folds the image over inside its border: the corners have no ray."""
-    path = colmap(made_scene(*STRONG), tmp_path / "in", -4.0, 0.0)
+    path = colmap(block_scene(*STRONG), tmp_path / "in", -4.0, 0.0)
     done = RUN.invoke(
         app, ["import", "block", str(path), "--from", "colmap", "--out", str(tmp_path / "p")]
     )

@@ -38,7 +38,7 @@ def assert_sees_its_target(flown, head: str, place: np.ndarray, turn: np.ndarray
     assert np.hypot(*(ray[:2] / ray[2])) < 2e-4
 
 
-def turn_of(words: list[str], order: str, gon: bool) -> np.ndarray:
+def rotation_of(words: list[str], order: str, gon: bool) -> np.ndarray:
     angles = np.array(words, float) * (0.9 if gon else 1.0)
     return Rotation.from_euler(order, angles, degrees=True).as_matrix()
 
@@ -64,7 +64,7 @@ def test_angles_in_the_stated_order_and_unit_are_right(
     if program == "bluh":
         key = next(number for number, name in photos.items() if name == f"{key}.jpg")
     row = next(row for row in rows if row[0] == key)
-    turn = turn_of(row[4:7], order, gon)
+    turn = rotation_of(row[4:7], order, gon)
     assert_sees_its_target(flown, head, np.array(row[1:4], float), turn)
     stated = (folder / "angles.txt").read_text()
     assert ("unit: gon" if gon else "unit: deg") in stated
@@ -72,7 +72,7 @@ def test_angles_in_the_stated_order_and_unit_are_right(
     # The other order is seen to be wrong for a tilted head.
     if head == "7":
         with pytest.raises(AssertionError):
-            swapped = turn_of(row[4:7], "XYZ" if order == "YXZ" else "YXZ", gon)
+            swapped = rotation_of(row[4:7], "XYZ" if order == "YXZ" else "YXZ", gon)
             assert_sees_its_target(flown, head, np.array(row[1:4], float), swapped)
 
 

@@ -55,15 +55,15 @@ def _arguments(flown: OrthoFlight, out: Path, *more: str) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def made(flown: OrthoFlight) -> tuple[Path, dict]:
+def product(flown: OrthoFlight) -> tuple[Path, dict]:
     out = flown.folder / "ortho"
     model = ["--elevation", str(flown.folder / "dtm.asc")]
     return out, command("orthomosaic", *_arguments(flown, out, *model))
 
 
-def test_pixels_are_where_the_ideal_orthoimage_has_them(flown, made) -> None:
+def test_pixels_are_where_the_ideal_orthoimage_has_them(flown, product) -> None:
     """Delivered orientations err by 13 cm from the attitude; the GSD is 15 cm."""
-    out, report = made
+    out, report = product
     assert report["orientation"].startswith("delivered orientations")
     with rasterio.open(out / "pan-16.tif") as raster:
         pixels = raster.read(1)
@@ -73,15 +73,15 @@ def test_pixels_are_where_the_ideal_orthoimage_has_them(flown, made) -> None:
     assert found["seam_rms_px"] < 2.0
 
 
-def test_seams_do_not_show_after_levelling(made) -> None:
-    steps = made[1]["seams"]
+def test_seams_do_not_show_after_levelling(product) -> None:
+    steps = product[1]["seams"]
     for band, before in steps["step_rms_before"].items():
         assert before > 0.02, band
         assert steps["step_rms_after"][band] < 0.01, band
 
 
-def test_files_are_cogs_in_the_system_of_the_orientations(made) -> None:
-    out, report = made
+def test_files_are_cogs_in_the_system_of_the_orientations(product) -> None:
+    out, report = product
     shapes = set()
     for image, count in (("pan", 1), ("rgb", 3), ("cir", 3)):
         for bits, kind in ((16, "uint16"), (8, "uint8")):
@@ -101,9 +101,9 @@ def test_files_are_cogs_in_the_system_of_the_orientations(made) -> None:
         assert np.count_nonzero(raster.read(1)) == report["pixels_with_data"]
 
 
-def test_seams_are_a_geopackage_that_gdal_reads(made) -> None:
+def test_seams_are_a_geopackage_that_gdal_reads(product) -> None:
     """Its areas cover the pixels with data, its lines lie between areas."""
-    out, report = made
+    out, report = product
     with sqlite3.connect(out / "seams.gpkg") as connection:
         assert connection.execute("PRAGMA application_id").fetchone() == (0x47504B47,)
         assert connection.execute("PRAGMA integrity_check").fetchone() == ("ok",)
@@ -119,8 +119,8 @@ def test_seams_are_a_geopackage_that_gdal_reads(made) -> None:
     assert data[owner > 0].mean() > 0.999
 
 
-def test_interrupted_and_repeated_gives_the_same_bytes(flown, made, monkeypatch) -> None:
-    out, report = made
+def test_interrupted_and_repeated_gives_the_same_bytes(flown, product, monkeypatch) -> None:
+    out, report = product
     again = flown.folder / "again"
     model = ["--elevation", str(flown.folder / "dtm.asc"), "--json"]
     real = making.make_tiles
