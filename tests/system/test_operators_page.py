@@ -238,8 +238,10 @@ def test_a_flight_is_flown_from_the_page(
             Path(pictures_folder) / "page.png" if pictures_folder else tmp_path / "page.png"
         )
 
-        service.wait_for(lambda e: e["event"] == "processed" and e["number"] == EXPOSURES, 10)
         for number in range(1, EXPOSURES + 1):
+            service.wait_for(
+                lambda e, n=number: e["event"] == "processed" and e["number"] == n, FLOWN_WITHIN_S
+            )
             print(f"exposure {number}, s after the trigger: {steps_s(service, number)}")
         for name, value in observed_on_page(browser, service).items():
             record_property(name, value)

@@ -8,6 +8,7 @@ import struct
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -38,6 +39,9 @@ CLOCK = FreeRunningClock(offset_ns=5_000_000_000, drift_ppm=12.5)
 PACKET_SIZE = 1400
 PATTERN = np.random.default_rng(4).integers(0, 4096, (200, 320), dtype=np.uint16)
 TIMEOUT_S = 5.0
+SO_RCVBUFFORCE = 33
+"""Of Linux (asm-generic/socket.h); Python does not name it."""
+STREAM_BUFFER_BYTES = 8_000_000
 
 
 @dataclass
@@ -78,6 +82,9 @@ class Controller:
         self.control.settimeout(TIMEOUT_S)
         self.stream = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.stream.bind(("127.0.0.1", 0))
+        # Several frames, which on a busy machine are sent before this host has a core to read them.
+        with suppress(PermissionError):
+            self.stream.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, STREAM_BUFFER_BYTES)
         self.stream.settimeout(TIMEOUT_S)
         self._request_ids = itertools.count(1)
 
