@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from daemon.configuration.model import WatchSection
+from daemon.configuration.model import PlanSection, WatchSection
 from daemon.onboard.monitoring.access.tokens import add_token
 from daemon.onboard.service.messages import Answer, ServiceCommand, ServiceEvent, Stop
 from daemon.onboard.service.processes import ChildProcess
@@ -19,7 +19,13 @@ class Service:
     """The service's end of the watch process, in the hands of the test."""
 
     def __init__(
-        self, folder: Path, *, port: int = 0, anonymous_read: bool = True, **further: Any
+        self,
+        folder: Path,
+        *,
+        port: int = 0,
+        anonymous_read: bool = True,
+        plan: PlanSection | None = None,
+        **further: Any,
     ) -> None:
         self.token = add_token(folder / "tokens.toml", "operator", "administrator")
         tokens = folder / "tokens.toml"
@@ -27,7 +33,7 @@ class Service:
             port=port, tokens=tokens, announce=False, anonymous_read=anonymous_read, **further
         )
         self.child = ChildProcess(
-            "watch", "daemon.onboard.monitoring.monitoring_process:main", (settings,), {}
+            "watch", "daemon.onboard.monitoring.monitoring_process:main", (settings, plan), {}
         )
         self.commands: list[ServiceCommand] = []
         self.events: list[Mapping[str, Any]] = []
