@@ -12,10 +12,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from daemon.configuration.service_file import load
 from daemon.mission.exposure import Exposure
 from daemon.mission.layout import Mission
 from daemon.onboard.pipeline.pipeline_queue import Messages, PipelineQueue
+from daemon.onboard.preflight.service_file import load
 from daemon.onboard.service import service
 from daemon.onboard.service.messages import Ping, Pong, Stop, WorkerBuilt
 from daemon.onboard.service.processes import ServiceConnection

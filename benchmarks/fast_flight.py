@@ -17,11 +17,11 @@ from pathlib import Path
 
 from benchmarks.fast_flight_score import Comparison, PulseTruth, Score
 from daemon.configuration.model import Configuration
-from daemon.configuration.service_file import from_mapping
 from daemon.mission.exposure import CaptureRecord, Exposure
 from daemon.onboard.flight.flight import Flight
 from daemon.onboard.flight.flight_identity import FlightIdentity
 from daemon.onboard.flight.ledger import Ledger
+from daemon.onboard.preflight.service_file import from_mapping
 from daemon.onboard.service.flight_line import FlightLine, Order
 from daemon.onboard.timing.matching import Cause, FiredPulse
 from drivers.contract import (

@@ -82,9 +82,9 @@ def check(
 
 def check_flight(config: Path, *, fire: bool, as_json: bool) -> None:
     """Look at everything a flight with this configuration needs, and print it."""
-    from daemon.configuration.service_file import load
     from daemon.onboard.preflight.check_results import CheckOutcome, worst_outcome
     from daemon.onboard.preflight.prerequisites import link_tables
+    from daemon.onboard.preflight.service_file import load
 
     configuration, rig = load(config)
     console = Console(stderr=as_json)

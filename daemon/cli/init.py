@@ -259,7 +259,7 @@ def _has_page() -> bool:
 
 def _check(console: Console, folder: Path) -> list[CheckResult]:
     from daemon.cli.check import collect_results
-    from daemon.configuration.service_file import load
+    from daemon.onboard.preflight.service_file import load
 
     path = folder / "service.toml"
     configuration, rig = load(path)

@@ -41,8 +41,8 @@ def install(
     replace: Annotated[bool, typer.Option(help="Overwriting of files edited by hand.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    from daemon.configuration.service_file import load
     from daemon.onboard import installation
+    from daemon.onboard.preflight.service_file import load
 
     command = Path(sys.argv[0]).absolute()
     configuration = PurePosixPath(config.absolute())

@@ -39,9 +39,9 @@ def run(
         typer.Option("--new-mission", help="New mission; an interrupted one is sealed and closed."),
     ] = False,
 ) -> None:
-    from daemon.configuration.service_file import load
     from daemon.mission.mirror.mirror_startup import interrupted_mission
     from daemon.onboard.preflight.resumption import close_interrupted
+    from daemon.onboard.preflight.service_file import load
     from daemon.onboard.service.processes import die_with_parent
     from daemon.onboard.service.service import Service
 

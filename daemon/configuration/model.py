@@ -1,7 +1,7 @@
 """Keys of `service.toml`: the sections, their types and limits.
 
 Drivers declare the settings of devices. How a file is read is in
-`daemon.configuration.service_file`.
+`daemon.onboard.preflight.service_file`.
 """
 
 from __future__ import annotations

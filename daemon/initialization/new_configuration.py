@@ -11,8 +11,8 @@ from typing import Final
 
 from daemon.configuration.model import ConfigurationError
 from daemon.configuration.schemas import SCHEMA_FILES, schema_file_name
-from daemon.configuration.service_file import load
 from daemon.mission.store.durable import new_files
+from daemon.onboard.preflight.service_file import load
 
 RIG_FILE: Final = "rig.toml"
 SERVICE_FILE: Final = "service.toml"

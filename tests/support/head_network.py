@@ -157,9 +157,9 @@ def _serve(heads: Sequence[dict[str, Any]]) -> None:
 
 
 def _diagnose(heads: Sequence[dict[str, Any]]) -> None:
-    from daemon.configuration.service_file import from_mapping
     from daemon.onboard.preflight.kernel_counters import read_counters
     from daemon.onboard.preflight.network_diagnosis import kernel_results, network_diagnosis
+    from daemon.onboard.preflight.service_file import from_mapping
     from tests.daemon.configuration.test_configuration import GOOD
 
     content = copy.deepcopy(GOOD)

@@ -15,9 +15,9 @@ import typer
 
 from daemon.cli.command_table import TABLE, load
 from daemon.configuration.model import ConfigurationError
-from daemon.configuration.service_file import load as load_configuration
 from daemon.initialization import discovery
 from daemon.initialization.discovery import Discovery, discover
+from daemon.onboard.preflight.service_file import load as load_configuration
 from drivers.cameras.aravis.discovery import FoundHead
 from drivers.cameras.v4l2.discovery import FoundNode
 from drivers.contract import DeviceError

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from daemon.configuration.model import ConfigurationError
-from daemon.configuration.service_file import from_mapping, load
+from daemon.onboard.preflight.service_file import from_mapping, load
 
 GOOD: dict[str, Any] = {
     "mission": {"root": "missions", "rig": "ultracam-x-mini"},

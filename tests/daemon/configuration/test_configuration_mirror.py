@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from daemon.configuration.model import Configuration, ConfigurationError
-from daemon.configuration.service_file import load
 from daemon.onboard.preflight.check_results import CheckOutcome
 from daemon.onboard.preflight.prerequisites import storage
+from daemon.onboard.preflight.service_file import load
 from processing.rig import Rig
 
 pytestmark = pytest.mark.trust

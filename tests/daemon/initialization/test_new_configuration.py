@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 from daemon.configuration.model import ConfigurationError
-from daemon.configuration.service_file import load
 from daemon.initialization import new_configuration
 from daemon.initialization.answers import Answers, Arrangement
 from daemon.initialization.new_configuration import (
@@ -25,6 +24,7 @@ from daemon.initialization.provisional import assumptions
 from daemon.initialization.rig_text import rig_text, sensor_names
 from daemon.initialization.service_text import TriggerUnit, service_text
 from daemon.mission.exposure import Exposure, FrameRecord, NavigationRecord
+from daemon.onboard.preflight.service_file import load
 from daemon.orientation.in_flight_orientation import orientation_json
 from drivers.detection.port_search import DetectionResult
 from drivers.detection.protocol_detection import DetectedDevice

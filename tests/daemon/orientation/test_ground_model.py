@@ -11,8 +11,8 @@ import pyproj
 import pytest
 
 from daemon.configuration.model import ConfigurationError, MountSection, PlanSection
-from daemon.configuration.service_file import load
 from daemon.mission.exposure import Exposure, NavigationRecord
+from daemon.onboard.preflight.service_file import load
 from daemon.orientation.ground_model import GroundModel, ground_of
 from daemon.products.exposure_conditions import conditions_of
 from processing.geometry.conditions import Conditions

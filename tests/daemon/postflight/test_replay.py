@@ -18,11 +18,11 @@ import tifffile
 from hypothesis import given
 from hypothesis import strategies as st
 
-from daemon.configuration.service_file import from_mapping
 from daemon.mission.layout import Mission
 from daemon.mission.log.flight_log import FlightLog
 from daemon.mission.log.log_records import Message, message_of
 from daemon.onboard.flight.decisions import Decision, decision_of
+from daemon.onboard.preflight.service_file import from_mapping
 from daemon.postflight.replay.codecs import Decoded, codec_for, decode_all
 from daemon.postflight.replay.flight_replay import ReplayResult, replay_log
 from daemon.postflight.replay.product_comparison import _hashes_on_disk, content_hash

@@ -43,7 +43,9 @@ def test_missions_follow_each_other_until_one_lands_or_fails(
     status: int,
 ) -> None:
     read = iter(range(10))
-    monkeypatch.setattr("daemon.configuration.service_file.load", lambda _path: (next(read), None))
+    monkeypatch.setattr(
+        "daemon.onboard.preflight.service_file.load", lambda _path: (next(read), None)
+    )
     monkeypatch.setattr("daemon.onboard.service.service.Service", FakeService)
     FakeService.endings, FakeService.flown = list(endings), []
     with pytest.raises(typer.Exit) as ended:

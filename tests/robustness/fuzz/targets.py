@@ -108,7 +108,7 @@ def rig() -> Target:
 
 def configuration() -> Target:
     from daemon.configuration.model import ConfigurationError
-    from daemon.configuration.service_file import from_mapping
+    from daemon.onboard.preflight.service_file import from_mapping
     from processing.rig.toml_text import TomlError, parse_toml
 
     seed = (

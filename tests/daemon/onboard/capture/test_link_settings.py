@@ -11,7 +11,6 @@ import pytest
 
 from daemon.cli.check import check_flight
 from daemon.configuration.model import Configuration
-from daemon.configuration.service_file import from_mapping
 from daemon.onboard.capture import link_settings
 from daemon.onboard.capture.devices import device_specs
 from daemon.onboard.capture.link_settings import (
@@ -21,6 +20,7 @@ from daemon.onboard.capture.link_settings import (
     paced_specs,
 )
 from daemon.onboard.preflight.check_results import CheckOutcome
+from daemon.onboard.preflight.service_file import from_mapping
 from processing.rig import Rig, find_rig
 from tests.daemon.configuration.test_configuration import GOOD
 
@@ -168,7 +168,9 @@ def test_check_prints_the_budget_and_gives_it_as_json(
     kernel: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: Any
 ) -> None:
     configuration, rig = configured("ultracam-x")
-    monkeypatch.setattr("daemon.configuration.service_file.load", lambda _: (configuration, rig))
+    monkeypatch.setattr(
+        "daemon.onboard.preflight.service_file.load", lambda _: (configuration, rig)
+    )
     monkeypatch.setattr("daemon.cli.check.collect_results", lambda *_, **__: list(
         link_budget(configuration, rig)
     ))  # fmt: skip

@@ -15,7 +15,6 @@ from typing import Any
 import pytest
 
 from daemon.configuration.model import SIGNING_STATE
-from daemon.configuration.service_file import from_mapping
 from daemon.onboard.monitoring.mavlink.senders import (
     DATAGRAM_MAX_BYTES,
     PEERS_MAX,
@@ -30,6 +29,7 @@ from daemon.onboard.monitoring.mavlink.signatures import (
 from daemon.onboard.monitoring.mavlink.signatures import (
     STREAMS_MAX as SIGNED_STREAMS_MAX,
 )
+from daemon.onboard.preflight.service_file import from_mapping
 from drivers.receivers.mavlink.library import MavlinkParser
 from tests.daemon.configuration.test_configuration import GOOD
 from tests.daemon.onboard.monitoring import flight_events

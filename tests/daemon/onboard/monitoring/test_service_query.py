@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 
 from daemon.cli.check import STATUSES, collect_results
-from daemon.configuration.service_file import load
 from daemon.onboard.preflight.check_results import (
     CheckOutcome,
     CheckResult,
@@ -16,6 +15,7 @@ from daemon.onboard.preflight.check_results import (
     passed,
     worst_outcome,
 )
+from daemon.onboard.preflight.service_file import load
 from daemon.onboard.service.startup import create_mission
 from tests.daemon.onboard.monitoring.test_control_socket import Service, with_socket
 from tests.daemon.onboard.service.flight_parts import Planted

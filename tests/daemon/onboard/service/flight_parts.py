@@ -20,11 +20,11 @@ import pytest
 from daemon import DaemonError
 from daemon.cli.check import collect_results
 from daemon.configuration.model import ConfigurationError
-from daemon.configuration.service_file import load
 from daemon.mission.store.level0 import tiff_parts
 from daemon.onboard.pipeline import worker
 from daemon.onboard.preflight import prerequisites, system_check
 from daemon.onboard.preflight.check_results import CheckOutcome, CheckResult, worst_outcome
+from daemon.onboard.preflight.service_file import load
 from daemon.onboard.service import supervisor
 from daemon.onboard.service.processes import ServiceConnection, ServiceDisconnectedError
 from daemon.onboard.service.service import Service

@@ -21,9 +21,9 @@ from typing import NamedTuple
 import pytest
 import serial
 
-from daemon.configuration.service_file import load
 from daemon.mission.layout import CURRENT_FILE
 from daemon.onboard.preflight import prerequisites, system_check
+from daemon.onboard.preflight.service_file import load
 from daemon.onboard.service.startup import create_mission
 from daemon.products.processor import Processor
 from drivers.base.extras import missing

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from daemon.configuration.service_file import from_mapping
 from daemon.onboard.preflight.check_results import CheckOutcome, CheckResult
+from daemon.onboard.preflight.service_file import from_mapping
 from daemon.onboard.preflight.system_check import SystemCheck
 from daemon.onboard.service.messages import DeviceSpec
 from drivers.contract import DeviceEvent

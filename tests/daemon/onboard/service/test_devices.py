@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 
 from daemon.configuration.model import Configuration
-from daemon.configuration.service_file import from_mapping
 from daemon.onboard.capture.devices import (
     device_specs,
     exposure_times_ns,
@@ -15,6 +14,7 @@ from daemon.onboard.capture.devices import (
     serial_problem,
     stated_serial_problems,
 )
+from daemon.onboard.preflight.service_file import from_mapping
 from processing.rig import Rig, find_rig
 from tests.daemon.configuration.test_configuration import GOOD
 

@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from daemon.configuration.service_file import from_mapping
 from daemon.onboard.capture.exposure_controller import PAN, ExposureController
+from daemon.onboard.preflight.service_file import from_mapping
 from daemon.onboard.service.messages import ApplyExposureSettings
 from processing.radiometry.exposure_control import BINS
 from tests.daemon.configuration.test_configuration import GOOD

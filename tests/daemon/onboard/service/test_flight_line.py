@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from daemon.configuration.service_file import from_mapping
 from daemon.onboard.flight.flight import Flight
 from daemon.onboard.flight.ledger import Ledger
+from daemon.onboard.preflight.service_file import from_mapping
 from daemon.onboard.service.flight_line import FlightLine, Order
 from tests.daemon.configuration.test_configuration import GOOD
 from tests.daemon.onboard.flight.test_flight import IDENTITY, LIMITS, nav

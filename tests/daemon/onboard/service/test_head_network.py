@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 
 from daemon.configuration.model import HeadDeviceSection
-from daemon.configuration.service_file import load
 from daemon.onboard.capture import head_network
 from daemon.onboard.capture.head_network import cautions_of
 from daemon.onboard.preflight.check_results import CheckOutcome
+from daemon.onboard.preflight.service_file import load
 from tests.daemon.onboard.service.flight_parts import Planted
 
 pytestmark = pytest.mark.trust

@@ -15,10 +15,10 @@ from typing import Any
 
 import pytest
 
-from daemon.configuration.service_file import load
 from daemon.mission.landing_messages import LandingProgress
 from daemon.mission.layout import CURRENT_FILE, Mission
 from daemon.mission.verification.verification import verify
+from daemon.onboard.preflight.service_file import load
 from daemon.onboard.service import landed_stage, poweroff
 from daemon.onboard.service.command_execution import CommandHandlers, execute
 from daemon.onboard.service.landed_stage import AUDIT_FILE, LandedStage

@@ -10,7 +10,6 @@ from typing import Any
 import pytest
 
 from daemon.configuration.model import Configuration
-from daemon.configuration.service_file import load
 from daemon.onboard.capture.link_settings import exposure_interval_s
 from daemon.onboard.preflight import prerequisites
 from daemon.onboard.preflight.check_results import CheckOutcome, CheckResult
@@ -19,6 +18,7 @@ from daemon.onboard.preflight.prerequisites import (
     CHECKS_AFTER_RESTART,
     CHECKS_AT_START,
 )
+from daemon.onboard.preflight.service_file import load
 from processing.rig import Rig
 from tests.daemon.onboard.service.flight_parts import Planted
 

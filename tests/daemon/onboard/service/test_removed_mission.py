@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 
 from daemon import cli
-from daemon.configuration.service_file import load
 from daemon.mission.layout import CURRENT_FILE, Mission
 from daemon.mission.mirror.mirror_startup import interrupted_mission
+from daemon.onboard.preflight.service_file import load
 from daemon.onboard.service.startup import create_mission
 from tests.daemon.onboard.service.flight_parts import Planted
 

@@ -10,10 +10,10 @@ import pytest
 import typer
 
 from daemon.cli.run import run as run_command
-from daemon.configuration.service_file import load
 from daemon.mission.layout import Mission
 from daemon.mission.mirror.mirror_startup import interrupted_mission
 from daemon.onboard.preflight.resumption import resume, rig_differences
+from daemon.onboard.preflight.service_file import load
 from daemon.onboard.service.notify import Notifier
 from daemon.onboard.service.startup import create_mission
 from tests.daemon.onboard.service.flight_parts import RIG, Planted, in_threads
