@@ -85,7 +85,8 @@ def test_the_report_draws_track_and_parts_without_data(tmp_path: Path) -> None:
     # North is up.
     ys = [y for _, y in drawn(page, "track")[0]]
     assert ys == sorted(ys, reverse=True) and ys[0] > ys[-1]
-    # One ring, although two bands lack the same part: it covers the right quarter of exposure 2.
+    # One ring, although the same part is without data in two bands:
+    # it covers the right quarter of exposure 2.
     (ring,) = drawn(page, "no-data")
     left_rear, right_rear, right_front, left_front = drawn(page, "good")[1]
 
