@@ -21,6 +21,9 @@ FOLDER: Final = Path(__file__).parent
 ROOT: Final = FOLDER.parents[1]
 WIDTH: Final = 100
 END: Final = "<!-- end of record -->"
+NOT_RECORDED: Final = "not recorded"
+IN_ROWS: Final = "in the rows"
+"""Command or machine: each row of the record states its own, where it is known."""
 _BLOCK: Final = re.compile(
     r"^<!-- record: (?P<name>[a-z0-9-]+) -->\n(?P<content>.*?)^<!-- end of record -->$",
     re.MULTILINE | re.DOTALL,
@@ -72,13 +75,14 @@ class Part(_Model):
 class Record(_Model):
     """One measurement: how, where and when it was made, and what came out.
 
-    `command` and `machine` are None where the source of the record does not state them.
+    `command` and `machine` are `NOT_RECORDED` where the source of an old record does not state
+    them, and `IN_ROWS` where rows differ.
     `conditions` are what else mattered: load of the machine, seeds, the state of the code.
     """
 
     date: tuple[Day, ...] = Field(min_length=1)
-    command: Text | None
-    machine: Text | None
+    command: Text
+    machine: Text
     conditions: Text | None = None
     figures: tuple[Part, ...] = Field(min_length=1)
 
@@ -125,13 +129,16 @@ def rendered(name: str, record: Record, document: Path) -> str:
             assert part.text is not None
             lines += ["", *_wrapped(part.text, "", ""), ""]
     address = Path(os.path.relpath(FOLDER / f"{name}.json", document.parent)).as_posix()
+    is_stated = record.command not in (NOT_RECORDED, IN_ROWS)
     known = [
-        None if record.command is None else f"`{record.command}`",
-        record.machine,
+        f"`{record.command}`" if is_stated else f"command {record.command}",
+        f"machine {record.machine}"
+        if record.machine in (NOT_RECORDED, IN_ROWS)
+        else record.machine,
         " and ".join(record.date),
-        record.conditions,
+        *([record.conditions] if record.conditions else []),
     ]
-    source = f"Record [{name}]({address}): {'; '.join(k for k in known if k is not None)}."
+    source = f"Record [{name}]({address}): {'; '.join(known)}."
     lines += ["", *_wrapped(source, "", "")]
     return re.sub(r"\n{3,}", "\n\n", "\n".join(lines)).strip("\n") + "\n"
 

@@ -12,6 +12,7 @@ import pytest
 from benchmarks.records import (
     END,
     FOLDER,
+    NOT_RECORDED,
     ROOT,
     Record,
     RecordError,
@@ -27,6 +28,29 @@ from benchmarks.records.__main__ import main
 
 # Not within an identifier such as lab-2026-11-22, nor the beginning of a time stamp.
 DATE = re.compile(r"(?<![-\w])20\d\d-\d\d-\d\d(?![-T\d])")
+# Old records whose source does not state it. A new record states both.
+WITHOUT_COMMAND = {
+    "aravis-unpacking",
+    "bench-cpu-time",
+    "bench-same-bits",
+    "bench-shared-cells",
+    "bench-tie-points",
+    "bench-two-stages",
+    "bundle-figures",
+    "calibration-figures",
+    "crash-states",
+    "hostile-parsers",
+    "ultracam-l",
+    "v4l2-unpacking",
+}
+WITHOUT_MACHINE = {
+    "crash-states",
+    "dc-simulated",
+    "failing-disk-in-flight",
+    "rededge-registration",
+    "silent-error-limits",
+    "thermal-calibration",
+}
 VALID = {
     "date": ["2026-11-22"],
     "command": "python -m benchmarks.flags",
@@ -41,6 +65,18 @@ def test_every_record_is_valid_and_used_once() -> None:
     )
     assert set(used) == set(all_records())
     assert not [name for name, times in used.items() if times > 1]
+
+
+def test_a_new_record_states_its_command_and_its_machine() -> None:
+    records = all_records()
+    assert {n for n, r in records.items() if r.command == NOT_RECORDED} == WITHOUT_COMMAND
+    assert {n for n, r in records.items() if r.machine == NOT_RECORDED} == WITHOUT_MACHINE
+
+
+def test_what_is_not_recorded_is_stated() -> None:
+    old = Record.model_validate(VALID | {"command": NOT_RECORDED, "machine": NOT_RECORDED})
+    text = rendered("old", old, ROOT / "README.md")
+    assert "command not recorded; machine not recorded; 2026-11-22." in text
 
 
 def test_documents_are_up_to_date(capsys: pytest.CaptureFixture[str]) -> None:
@@ -95,6 +131,8 @@ def test_a_document_with_a_broken_record_is_refused(text: str, error: str) -> No
         ({"date": []}, "date"),
         ({"date": ["22.11.2026"]}, "date"),
         ({"machine": ""}, "machine"),
+        ({"machine": None}, "machine"),
+        ({"command": None}, "command"),
         ({"load": "busy"}, "load"),
         ({"figures": []}, "figures"),
         ({"figures": [{"text": "a", "item": "b"}]}, "one of text, item and table"),
