@@ -2,7 +2,7 @@
 
 Two TUN devices in two network namespaces are joined by a forwarder that delays each packet and
 drops some. The page's process is behind one, Chromium before the other. Run as root: `python -m
-benchmarks.page_link`.
+benchmarks.page_link`. With `--bulk-s` it times one TCP stream over the same link instead.
 """
 
 from __future__ import annotations
@@ -17,10 +17,12 @@ import os
 import random
 import select
 import shutil
+import socket
 import struct
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from pathlib import Path
 from typing import Any, Final
@@ -31,6 +33,9 @@ CLONE_NEWNET: Final = 0x40000000
 SERVER, CLIENT = "10.9.0.1", "10.9.0.2"
 INTERVAL_S: Final = 2.0
 GUIDANCE_S: Final = 0.2
+BULK_PORT: Final = 8471
+CONGESTION: Final = Path("/proc/sys/net/ipv4/tcp_congestion_control")
+"""Of the present network namespace; it decides what a lossy link carries."""
 LOAD_TIMEOUT_S: Final = 180.0
 QUEUE_MAX: Final = 2000
 PROBE: Final = """
@@ -98,13 +103,84 @@ def forward(first: int, second: int, delay_s: float, loss: float, counts: str) -
                 heapq.heappush(waiting, (time.monotonic() + delay_s, order, target, packet))
 
 
+def join(congestion: str) -> tuple[int, int, int]:
+    """Make the namespace of the client, then that of the server, in which the process is then.
+
+    Args:
+        congestion: TCP congestion control of both; empty leaves that of the system.
+
+    Returns:
+        Descriptors of the client's namespace and of both TUN devices, client and server.
+    """
+    libc, devices, spaces = ctypes.CDLL(None, use_errno=True), [], []
+    for name, address in (("link0", CLIENT), ("link1", SERVER)):
+        assert libc.unshare(CLONE_NEWNET) == 0
+        spaces.append(os.open("/proc/self/ns/net", os.O_RDONLY))
+        devices.append(open_tun(name, address))
+        if congestion:
+            CONGESTION.write_text(congestion)
+    return spaces[0], devices[0], devices[1]
+
+
+def enter(space: int) -> None:
+    """Make a network namespace that of this process."""
+    assert ctypes.CDLL(None, use_errno=True).setns(space, CLONE_NEWNET) == 0
+
+
+def start_forwarder(
+    client: int, server: int, delay_s: float, loss: float, counts: Path
+) -> subprocess.Popen[bytes]:
+    """A process that carries the packets of the link."""
+    arguments = [str(client), str(server), str(delay_s), str(loss), str(counts)]
+    return subprocess.Popen(
+        [sys.executable, "-m", "benchmarks.page_link", "--forward", *arguments],
+        pass_fds=(client, server),
+    )
+
+
+def bulk_rate(delay_s: float, loss: float, bulk_s: float, congestion: str) -> dict[str, Any]:
+    """Rate of one TCP stream from the server to the client."""
+    space, client, server = join(congestion)
+    listening = socket.create_server((SERVER, BULK_PORT))
+    enter(space)
+    folder = Path(tempfile.mkdtemp(prefix="page-link"))
+    forwarder = start_forwarder(client, server, delay_s, loss, folder / "counts.json")
+    used: list[str] = []
+
+    def send() -> None:
+        stream, _ = listening.accept()
+        name = stream.getsockopt(socket.IPPROTO_TCP, socket.TCP_CONGESTION, 16)
+        used.append(name.rstrip(b"\0").decode())
+        with stream:
+            while True:
+                try:
+                    stream.sendall(bytes(65536))
+                except OSError:
+                    return
+
+    threading.Thread(target=send, daemon=True).start()
+    try:
+        with socket.create_connection((SERVER, BULK_PORT), timeout=60.0) as stream:
+            received, begin_s = 0, time.monotonic()
+            while time.monotonic() - begin_s < bulk_s:
+                received += len(stream.recv(65536))
+            elapsed_s = time.monotonic() - begin_s
+    finally:
+        forwarder.kill()
+        shutil.rmtree(folder, ignore_errors=True)
+    rate = round(received / elapsed_s / 1000, 1)
+    return {"congestion_control": used[0], "seconds": round(elapsed_s, 1), "kbytes_per_s": rate}
+
+
 def quantile(values: list[float], share: float) -> float | None:
     """A quantile of the values, s; None without any."""
     ordered = sorted(values)
     return round(ordered[min(len(ordered) - 1, int(share * len(ordered)))], 2) if ordered else None
 
 
-def measure(delay_s: float, loss: float, exposures: int, before: int) -> dict[str, Any]:
+def measure(
+    delay_s: float, loss: float, exposures: int, before: int, congestion: str
+) -> dict[str, Any]:
     """Fly over the link and read what the page noted; it is opened after `before` exposures."""
     from daemon.configuration.model import WatchSection
     from daemon.onboard.service.messages import ServiceEvent
@@ -114,12 +190,7 @@ def measure(delay_s: float, loss: float, exposures: int, before: int) -> dict[st
     browser_of = importlib.import_module("tests.support.browser").Browser
     flight_events = importlib.import_module("tests.daemon.onboard.monitoring.flight_events")
     scene = importlib.import_module("tests.daemon.onboard.monitoring.test_page_guidance")
-    libc = ctypes.CDLL(None, use_errno=True)
-    assert libc.unshare(CLONE_NEWNET) == 0
-    own = os.open("/proc/self/ns/net", os.O_RDONLY)
-    client = open_tun("link0", CLIENT)
-    assert libc.unshare(CLONE_NEWNET) == 0
-    server = open_tun("link1", SERVER)
+    space, client, server = join(congestion)
     folder = Path(tempfile.mkdtemp(prefix="page-link"))
     mission = folder / "mission"
     (mission / "L0").mkdir(parents=True)
@@ -137,13 +208,10 @@ def measure(delay_s: float, loss: float, exposures: int, before: int) -> dict[st
     settings = WatchSection(host=SERVER, port=8470, announce=False)
     entry = "daemon.onboard.monitoring.monitoring_process:main"
     child = ChildProcess("watch", entry, (settings,), {})
-    assert libc.setns(own, CLONE_NEWNET) == 0
+    enter(space)
     counts = folder / "counts.json"
-    arguments = [str(client), str(server), str(delay_s), str(loss), str(counts)]
-    forwarder = subprocess.Popen(
-        [sys.executable, "-m", "benchmarks.page_link", "--forward", *arguments],
-        pass_fds=(client, server),
-    )
+    forwarder = start_forwarder(client, server, delay_s, loss, counts)
+    used = CONGESTION.read_text().strip()
 
     def emit(event: dict[str, Any]) -> None:
         while not child.try_send(ServiceEvent(event)):
@@ -194,7 +262,8 @@ def measure(delay_s: float, loss: float, exposures: int, before: int) -> dict[st
     coverage = [min((c for c in changes if c > s), default=s + 99.0) - s for s in emitted.values()]
     frames = [one for one in log["guidance"] if begin_s <= one[0] <= begin_s + flown_s]
     ages = [age + (rtt or 0.0) / 2 for _, age, rtt in frames]
-    result: dict[str, Any] = {"exposures": exposures, "page_loaded_s": round(loaded_s, 1)}
+    result: dict[str, Any] = {"congestion_control": used, "exposures": exposures}
+    result["page_loaded_s"] = round(loaded_s, 1)
     if before:
         result["before"] = {"exposures": before, "footprints": footprints}
     for part, values in (("verdict", delays("verdict")), ("thumbnail", delays("thumbnail")),
@@ -229,8 +298,16 @@ def main() -> int:
     parser.add_argument(
         "--before", type=int, default=0, help="exposures before the page is opened (default: 0)"
     )
+    parser.add_argument(
+        "--congestion", default="", help="TCP congestion control (default: the system's)"
+    )
+    parser.add_argument("--bulk-s", type=float, help="time one TCP stream for so many seconds")
     given = parser.parse_args()
-    found = measure(given.delay_ms / 1000, given.loss, given.exposures, given.before)
+    link = given.delay_ms / 1000, given.loss
+    if given.bulk_s:
+        found = bulk_rate(*link, given.bulk_s, given.congestion)
+    else:
+        found = measure(*link, given.exposures, given.before, given.congestion)
     print(json.dumps(found, indent=1))
     return 0
 
