@@ -31,11 +31,10 @@ def compiled_kernel(
     Returns:
         The decorator.
 
-    Example:
-        >>> @compiled_kernel()
-        ... def twice(x):
-        ...     return 2.0 * x
-        >>> twice(1.5)
-        3.0
+    Example (in a module; numba caches no function of an interactive session)::
+
+        @compiled_kernel()
+        def twice(x):
+            return 2.0 * x
     """
     return njit(cache=True, nogil=True, fastmath=fastmath, error_model=error_model, **options)

@@ -67,7 +67,7 @@ class HeadDemand:
 
         Example:
             >>> HeadDemand("A", 1464, 1500).wire_nbytes  # one full packet, leader and trailer
-            1732
+            1734
         """
         full, rest = divmod(self.payload_nbytes, self.packet_size - IP_UDP_GVSP_NBYTES)
         parts = [LEADER_NBYTES, TRAILER_NBYTES] + ([rest] if rest else [])
