@@ -20,6 +20,7 @@ from processing.bundle.camera_model import ideal_mm
 from processing.bundle.damped_adjustment import FreeBlock, damped_adjustment
 from processing.bundle.initial_values import intersect
 from processing.bundle.network import CameraModel
+from processing.geometry.rotation import rotations_from_vectors
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -273,9 +274,9 @@ class _Growing:
         rotation, shift = cv2.solvePnPRefineLM(
             known[own], self.ideal[rows[own]], np.eye(3), None, rotation, shift
         )
-        turn = cv2.Rodrigues(rotation)[0]
-        self.station[image] = (-turn.T @ shift).ravel()
-        self.rotation[image] = turn.T @ _VISION
+        object_from_vision = rotations_from_vectors(rotation.ravel()).T
+        self.station[image] = (-object_from_vision @ shift).ravel()
+        self.rotation[image] = object_from_vision @ _VISION
         return True
 
     def _intersect(self) -> None:

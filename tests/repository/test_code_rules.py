@@ -71,6 +71,20 @@ def test_rotations_and_geodesy_have_their_home(imported: str, homes: set[str]) -
     assert importing == homes
 
 
+CONVERSIONS_OF_ROTATIONS = r"\bcv2\.(?:Rodrigues|RQDecomp3x3|decomposeProjectionMatrix)\b"
+
+
+def test_no_other_library_converts_rotations() -> None:
+    assert re.search(CONVERSIONS_OF_ROTATIONS, "turn = cv2.Rodrigues(rotation)[0]")
+    found = [
+        path.relative_to(ROOT).as_posix()
+        for package in ("daemon", "drivers", "processing")
+        for path in (ROOT / package).rglob("*.py")
+        if re.search(CONVERSIONS_OF_ROTATIONS, path.read_text("utf-8"))
+    ]
+    assert found == []
+
+
 def test_processes_are_spawned_never_forked() -> None:
     for package in PACKAGES:
         for path in (ROOT / package).rglob("*.py"):
