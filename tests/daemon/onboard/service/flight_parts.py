@@ -275,7 +275,7 @@ class Reported:
 def in_threads(planted: Planted) -> None:
     """Let `check` and `run` start threads in the place of processes, and make no images."""
     patch = planted.monkeypatch.setattr
-    patch(supervisor, "_made", ThreadChild)
+    patch(supervisor, "_child_process", ThreadChild)
     patch(Processor, "warm_up", lambda _processor: None)
     patch(numba, "threading_layer", lambda: "omp")
     patch(worker, "configure_threads", lambda: None)

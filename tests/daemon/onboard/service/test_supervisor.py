@@ -30,7 +30,7 @@ def refusing(link: ServiceConnection, *_: Any) -> None:
 def test_a_refusal_is_taken_in_before_the_end_of_its_process(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(supervisor, "_made", ThreadChild)
+    monkeypatch.setattr(supervisor, "_child_process", ThreadChild)
     received: list[object] = []
 
     async def begin() -> None:
