@@ -1,0 +1,53 @@
+"""Names of quality figures that telemetry passes on unread are names of typed figures.
+
+The page's process reads no figure: it passes JSON from the worker to watchers, also figures that a
+report leaves out. There a wrong name would only be a missing figure.
+"""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+from daemon.onboard.monitoring.flight_state import FIGURES_REPORTED
+from processing.quality.figures import FIGURES
+
+ROOT = Path(__file__).parents[2]
+
+
+def names_read(text: str) -> Iterator[str]:
+    """Strings that look up a figure: `figures["..."]` and `figures.get("...")`."""
+    for node in ast.walk(ast.parse(text)):
+        match node:
+            case ast.Subscript(value=ast.Name(id="figures"), slice=ast.Constant(value=str(name))):
+                yield name
+            case ast.Call(
+                func=ast.Attribute(value=ast.Name(id="figures"), attr="get"),
+                args=[ast.Constant(value=str(name)), *_],
+            ):
+                yield name
+
+
+def test_names_of_figures_in_the_telemetry_are_documented_figures() -> None:
+    text = (ROOT / "daemon/onboard/monitoring/flight_state.py").read_text("utf-8")
+    read = set(names_read(text))
+    assert read, "no figure is looked up by its name: remove this test"
+    assert (read | set(FIGURES_REPORTED)) - set(FIGURES) == set()
+
+
+def test_no_other_module_looks_figures_up_by_their_names() -> None:
+    found = {
+        path.relative_to(ROOT).as_posix()
+        for package in ("daemon", "processing")
+        for path in (ROOT / package).rglob("*.py")
+        if set(names_read(path.read_text("utf-8"))) & set(FIGURES)
+    }
+    assert found == {"daemon/onboard/monitoring/flight_state.py"}
+
+
+def test_a_lookup_is_found() -> None:
+    assert list(names_read('a = figures["x"]\nb = figures.get("y", 0)\nc = other["z"]\n')) == [
+        "x",
+        "y",
+    ]
