@@ -206,7 +206,7 @@ def survey_stored(
         manifest = store_products.read_stored_manifest(stored.store, number, key)
         return manifest is not None and found.agrees(number, manifest)
 
-    done = dict(zip(payloads, store_products.asked(is_complete, payloads), strict=True))
+    done = dict(zip(payloads, store_products.answers(is_complete, payloads), strict=True))
     pending = [number for number, is_done in done.items() if not is_done]
     return Level2Survey(
         {number: payloads[number].level2.key for number, is_done in done.items() if is_done},
@@ -223,7 +223,7 @@ def _noted_sha256(files: Mapping[str, CopiedFile], path: Path) -> str:
 def _expected_s(store: ObjectStore, found: store_products.StoredProducts) -> float | None:
     """Mean duration of an exposure in earlier runs; None without any."""
     known = [one for one, _ in zip(found.committed(), range(DURATIONS_MAX), strict=False)]
-    records = store_products.asked(lambda one: store_products.stored_provenance(store, *one), known)
+    records = store_products.answers(lambda one: store_products.stored_provenance(store, *one), known)
     durations = [
         record["duration_s"]
         for record in records

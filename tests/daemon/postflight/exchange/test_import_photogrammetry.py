@@ -17,7 +17,7 @@ from daemon.postflight.exchange.orientation_reader import read_inpho, read_pix4d
 from daemon.postflight.exchange.photogrammetry_reader import read_bingo, read_patb
 from tests.daemon.postflight.exchange.flown_block import fly
 from tests.daemon.postflight.exchange.test_colmap import SECONDS, export
-from tests.daemon.postflight.exchange.test_import_block import SIZE, F, made_scene
+from tests.daemon.postflight.exchange.test_import_block import SIZE, F, block_scene
 
 RUN = CliRunner()
 PITCH_MM = 0.004
@@ -27,7 +27,7 @@ ANGLES = "phi, omega, kappa of R = Ry(phi) Rx(omega) Rz(kappa), grid from camera
 
 @pytest.fixture(scope="module")
 def scene():
-    return made_scene(0.0, 0.0)
+    return block_scene(0.0, 0.0)
 
 
 def camera_file(folder: Path) -> None:
@@ -260,7 +260,7 @@ def cam_file(folder: Path, k1: float, k2: float, width: int = SIZE[0]) -> None:
 
 
 def test_the_distortion_of_pix4d_s_camera_file_is_carried(tmp_path) -> None:
-    folder = pix4d(made_scene(-0.28, 0.12), tmp_path / "in")
+    folder = pix4d(block_scene(-0.28, 0.12), tmp_path / "in")
     cam_file(folder, -0.28, 0.12)
     block = read_pix4d(folder)
     assert float(block.notes[-1].split()[-2]) < 0.5, block.notes[-1]

@@ -8,7 +8,7 @@ import pytest
 
 from daemon.postflight.exchange.block import BlockError
 from daemon.postflight.exchange.block_project import import_block
-from tests.daemon.postflight.exchange.test_import_block import K1, K2, bal, colmap, made_scene
+from tests.daemon.postflight.exchange.test_import_block import K1, K2, bal, colmap, block_scene
 
 
 def _with_measurements(path: Path, x: float, y: float) -> Path:
@@ -31,19 +31,19 @@ def _with_measurements(path: Path, x: float, y: float) -> Path:
     ],
 )
 def test_reversed_and_scaled_measurements_are_refused(tmp_path, x, y, words) -> None:
-    path = _with_measurements(bal(made_scene(K1, K2), tmp_path / "in"), x, y)
+    path = _with_measurements(bal(block_scene(K1, K2), tmp_path / "in"), x, y)
     with pytest.raises(BlockError, match=words):
         import_block(path, "bal", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
 def test_measurements_within_a_tenth_are_left_to_the_adjustment(tmp_path) -> None:
-    path = _with_measurements(bal(made_scene(K1, K2), tmp_path / "in"), 1.1, 1.1)
+    path = _with_measurements(bal(block_scene(K1, K2), tmp_path / "in"), 1.1, 1.1)
     import_block(path, "bal", tmp_path / "out")
 
 
 def test_a_model_with_byte_order_marks_is_read(tmp_path) -> None:
-    path = colmap(made_scene(K1, K2), tmp_path / "in")
+    path = colmap(block_scene(K1, K2), tmp_path / "in")
     for file in path.iterdir():
         file.write_bytes(b"\xef\xbb\xbf" + file.read_bytes())
     assert import_block(path, "colmap", tmp_path / "out").block.images
