@@ -317,6 +317,7 @@ class FlightState:
     def _on_verdict(self, event: Mapping[str, Any]) -> None:
         """Apply the verdict, which precedes the pictures."""
         record = self._exposure(event)
+        record.setdefault("verdict_mono_ns", event.get("mono_ns"))
         report = event.get("report", {})
         _apply_report(record, report)
         figures = report.get("figures", {})
@@ -384,6 +385,7 @@ class FlightState:
     def _on_lost(self, event: Mapping[str, Any]) -> None:
         record = self._exposure(event)
         record |= {"step": "lost", "state": "lost", "sentence": event.get("cause")}
+        record["verdict_mono_ns"] = event.get("mono_ns")
 
     def _on_not_written(self, event: Mapping[str, Any]) -> None:
         self._exposure(event)["step"] = "not written"

@@ -168,6 +168,7 @@ def status_event(
         "gps_ns": None if time_now is None else str(time_now.gps_ns),
         "clock_source": None if time_now is None else time_now.source,
         "in_holdover": time_now is not None and time_now.in_holdover,
+        "clock_coasting_s": None if time_now is None else round(time_now.coasting_ns * 1e-9, 1),
         "queue": queue,
         "missing": list(missing),
         **({"disks": [dict(disk) for disk in disks]} if disks else {}),

@@ -165,9 +165,19 @@ def axe(browser: Browser) -> list[Any]:
     ]
 
 
+TILES_SHOWN = """(() => {
+  const tiles = [...document.querySelectorAll('#map canvas.leaflet-tile')];
+  const isDrawn = (one) => one.getContext('2d').getImageData(128, 128, 1, 1).data[3] > 0;
+  const isThere = tiles.some(isDrawn) && tiles.every((one) => one.matches('.leaflet-tile-loaded'));
+  const isOnline = !document.body.matches('.connection-lost, .flight-ended');
+  return isThere || !isOnline || !document.querySelector('#map');
+})()"""
+
+
 def save_picture(browser: Browser, name: str) -> None:
     if folder := os.environ.get("SYNTOPIC_PICTURES"):
         browser.evaluate("new Promise((resolve) => setTimeout(resolve, 250))")
+        browser.wait_for(TILES_SHOWN, 10.0)
         message = browser.call("Page.captureScreenshot", format="webp", quality=55)
         path = Path(folder) / f"{name}.webp"
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -49,7 +49,7 @@
   const smallTargets = () => seen("button, select, input, summary, .files a, #map-tools *, .leaflet-bar a").filter((one) => one.matches("button, select, input, summary, a"))
     .filter((one) => box(one).width < 47.5 || box(one).height < 47.5).map((one) => `${name(one)} ${box(one).width}x${box(one).height}`);
 
-  const clipped = () => seen("dialog button, dialog label, dialog input, dialog select, #phase-button, #phase-second, #alarm-bar button:not(.what), .verdict .word, #tabs .label, .lamp .name, .g-label, .g-value, .g-cell, .thumb .t-mark")
+  const clipped = () => seen("dialog button, dialog label, dialog input, dialog select, #phase-button, #phase-second, #alarm-bar button:not(.what), .verdict .word, #tabs .label, .lamp .name, .lamp .value, .verdict .since, .g-label, .g-value, .g-cell, .thumb .t-mark")
     .filter((one) => one.scrollWidth > one.clientWidth + 1).map((one) => `${name(one)}: ${one.textContent}`);
 
   // What a scrolling or clipping ancestor hides, of what has to be whole.
@@ -74,7 +74,7 @@
     const [a, b] = [luminance(rgb(getComputedStyle(one).color)), luminance(ground(one))].sort((x, y) => y - x);
     return (a + 0.05) / (b + 0.05);
   }
-  const contrasts = () => Object.fromEntries(seen(".verdict .word, .verdict .which, #verdict-chip, #alarm-bar .what *, .faults li *, .lamp .name, .lamp .value, .p-alarm, #aircraft li *, .g-label, .g-value, #guidance .age, #phase-button, #left dd, #left dt")
+  const contrasts = () => Object.fromEntries(seen(".verdict .word, .verdict .which, .verdict .since, #verdict-chip, #alarm-bar .what *, .faults li *, .lamp .name, .lamp .value, .p-alarm, #aircraft li *, .g-label, .g-value, #guidance .age, #phase-button, #left dd, #left dt")
     .filter((one) => one.textContent.trim()).map((one) => [`${name(one)} ${one.textContent.slice(0, 20)}`, contrast(one)]).sort((a, b) => b[1] - a[1]));
 
   // Colours as [r, g, b, alpha], 0 to 255 and 0 to 1.

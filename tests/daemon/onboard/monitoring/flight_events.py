@@ -23,6 +23,7 @@ NAVIGATION = {
     "roll_rad": 0.0,
     "pitch_rad": 0.0,
     "heading_rad": 0.0,
+    "leap_seconds": 18,
 }
 
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +14,13 @@ import numpy as np
 
 from daemon.planning.guidance import GuidanceLimits, guide
 from daemon.planning.model import PlannedLine, Point
+from drivers.contract import NavSample
 from tests.daemon.onboard.flight.test_flight import nav as any_sample
 from tests.daemon.onboard.monitoring.test_base_maps import geotiff, mbtiles, tile_of
 from tests.daemon.onboard.monitoring.vector_tiles import vector_tile
 
-LIMITS = GuidanceLimits(25.0, 40.0, None)
+LIMITS = GuidanceLimits(25.0, below_m=40.0, above_m=60.0)
+SPEED_MPS = 55.0
 
 Ends = Sequence[Sequence[float]]
 """Longitude and latitude of both ends of a line, degrees."""
@@ -30,29 +33,57 @@ def guidance_frame(
     east_deg: float = 0.0,
     height_m: float = 1395.0,
 ) -> dict[str, Any]:
-    """Guidance on the first of the lines, flown at 55 m/s; the second one is next."""
-    first, second = (
-        PlannedLine(name, Point(a[1], a[0]), Point(b[1], b[0]))
-        for name, (a, b) in list(lines.items())[:2]
-    )
+    """Guidance on the first of the lines, flown at SPEED_MPS; the second one is next."""
+    first, second = _planned(lines)[:2]
     start, end = first.start, first.end
     sample = replace(
         any_sample(0.0),
         latitude_deg=start.latitude_deg + along_share * (end.latitude_deg - start.latitude_deg),
         longitude_deg=start.longitude_deg + east_deg,
-        height_m=height_m, velocity_ned_mps=(55.0, 0.0, 0.0), heading_rad=0.05,
+        height_m=height_m, velocity_ned_mps=(SPEED_MPS, 0.0, 0.0), heading_rad=0.05,
     )  # fmt: skip
+    return _frame(first, sample, second, is_captured=True)
+
+
+def approach_frame(lines: Mapping[str, Ends]) -> dict[str, Any]:
+    """Guidance between two lines: 1.2 km before the start of the second one, which runs south."""
+    second, third = _planned(lines)[1:3]
+    assert second.start.latitude_deg > second.end.latitude_deg
+    towards_rad = math.radians(190.0)
+    sample = replace(
+        any_sample(0.0),
+        latitude_deg=second.start.latitude_deg + 0.0108,
+        longitude_deg=second.start.longitude_deg + 0.0028,
+        height_m=1391.0,
+        velocity_ned_mps=(
+            SPEED_MPS * math.cos(towards_rad), SPEED_MPS * math.sin(towards_rad), 0.0
+        ),
+        heading_rad=towards_rad + 0.05,
+    )  # fmt: skip
+    return _frame(second, sample, third, is_captured=False)
+
+
+def _planned(lines: Mapping[str, Ends]) -> list[PlannedLine]:
+    return [
+        PlannedLine(name, Point(a[1], a[0]), Point(b[1], b[0])) for name, (a, b) in lines.items()
+    ]
+
+
+def _frame(
+    line: PlannedLine, sample: NavSample, following: PlannedLine, *, is_captured: bool
+) -> dict[str, Any]:
+    """The event of the service for a sample; the line is flown from its start to its end."""
     found = guide(
-        first, sample, is_reversed=False, places_m=tuple(range(0, 1200, 68)),
-        planned_height_m=1395.0, limits=LIMITS, next_line=(second, False),
+        line, sample, is_reversed=False, places_m=tuple(range(0, 1200, 68)),
+        planned_height_m=1395.0, limits=LIMITS, next_line=(following, False),
     )  # fmt: skip
     assert found is not None
     return {
         "event": "guidance", "sample_mono_ns": str(time.monotonic_ns() - 40_000_000),
         "receiver": "gnss", "fix": "3d", "latitude_deg": sample.latitude_deg,
-        "longitude_deg": sample.longitude_deg, "height_m": height_m, "is_captured": True,
-        "is_deviating": bool(found.exceeded),
-        "limits": {"across_m": 25.0, "below_m": 40.0, "above_m": None}, **found.as_json(),
+        "longitude_deg": sample.longitude_deg, "height_m": sample.height_m,
+        "is_captured": is_captured, "is_deviating": is_captured and bool(found.exceeded),
+        "limits": asdict(LIMITS), **found.as_json(),
     }  # fmt: skip
 
 

@@ -51,6 +51,8 @@ def cockpit(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cockpit]:
         yield cockpit
 
 
+MAP_SHARES = {1280: 0.65, 2000: 0.53, 390: 0.95}
+"""Least share of the width of the window that the map has, by that width."""
 NIGHT = {
     *(("on-a-line", width) for width, _ in SIZES),
     *((state, 1280) for state in ("before-arming", "between-lines", "degraded", "after-landing")),
@@ -59,11 +61,17 @@ NIGHT = {
 
 
 def check(
-    cockpit: Cockpit, state: str, guidance: Guidance | None = None, *, phone_tab: str = "map"
+    cockpit: Cockpit,
+    state: str,
+    guidance: Guidance | None = None,
+    *,
+    phone_tab: str = "map",
+    seen: str = "",
 ) -> None:
     """Measure the page at each size and in each theme, and picture it.
 
-    `phone_tab` is what a phone shows, whose map covers the pages.
+    `phone_tab` is what a phone shows, whose map covers the pages; `seen` is scrolled into view for
+    the pictures.
     """
     browser = cockpit.browser
     browser.evaluate(MEASURES.read_text())
@@ -78,11 +86,19 @@ def check(
             for fault in FAULTS:
                 assert found[fault] == [], f"{where}: {fault} {found[fault]}"
             assert not found["scrolls"], where
+            share = browser.evaluate("document.querySelector('#map').clientWidth / innerWidth")
+            assert phone_tab != "map" or share >= MAP_SHARES[width], f"{where}: {share}"
             assert found["weakest"][1] >= CONTRAST, f"{where}: {found['weakest']}"
             findings = axe(browser)
             assert findings == [], f"{where}: {findings}"
         for theme in THEMES if (state, width) in NIGHT else THEMES[:1]:
             cockpit.resize(width, height, theme)
+            if width < 500:
+                browser.click(f"#tab-{phone_tab}")
+            if seen:
+                browser.evaluate(
+                    f"document.querySelector('{seen}').scrollIntoView({{block: 'end'}})"
+                )
             cockpit.guide(guidance)
             save_picture(browser, f"{state}-{width}{'-night' if theme else ''}")
     cockpit.resize(1280, 800)
@@ -117,7 +133,7 @@ def test_on_a_line(cockpit: Cockpit) -> None:
     assert cockpit.browser.text("#guidance [data-key=height] .g-label") == "Height −40/+60 m"
     for lamp, value in (
         ("time", "GPS"),
-        ("position", "3D · 17 sat."),
+        ("position", "17 sat."),
         ("disk", "618 GB"),
         ("processing", "0 waiting"),
     ):
@@ -164,6 +180,12 @@ def test_the_map_has_the_theme_of_the_page(cockpit: Cockpit) -> None:
     cockpit.resize(1280, 800)
 
 
+def acknowledge(cockpit: Cockpit, alarm: str) -> None:
+    cockpit.service.commands.clear()
+    cockpit.browser.click(f"{alarm} .acknowledge")
+    cockpit.service.until(lambda: [c.name for c in cockpit.service.commands] == ["acknowledge"])
+
+
 def test_a_deviation_beyond_its_limit_is_an_alarm(cockpit: Cockpit) -> None:
     sentence = "38 m right of line A0 (limit 25 m). Steer left"
     event = {"event": "deviation", "fault": True, "line": "A0", "exceeded": ["across"]}
@@ -177,7 +199,7 @@ def test_a_deviation_beyond_its_limit_is_an_alarm(cockpit: Cockpit) -> None:
     )
     cockpit.emit({"event": "deviation", "fault": False, "line": "A0", "sentence": "It is over."})
     cockpit.until("document.body.dataset.sounding === ''")
-    cockpit.browser.evaluate("document.querySelector('#faults .acknowledge').click()")
+    acknowledge(cockpit, "#faults")
     cockpit.until("document.querySelector('#alarm-bar').hidden")
 
 
@@ -190,7 +212,7 @@ def test_between_lines(cockpit: Cockpit) -> None:
     check(cockpit, "between-lines", lambda: approach_frame(LINES))
     for key, label, value in (
         ("line", "Next line", "A1"),
-        ("bearing", "Bearing · distance", "190° · 1220 m"),
+        ("bearing", "Bearing · distance", "190° · 1219 m"),
         ("height", "Height −40/+60 m", "−4 m"),
         ("start", "To start", "1201 m · 0:22"),
         ("countdown", "Next of 18", "22.2 s"),
@@ -243,8 +265,7 @@ def test_an_alarm_is_acknowledged_by_name_and_reports_the_end_of_its_cause(
 ) -> None:
     item = "document.querySelector('[data-fault=\"device gnss\"]')"
     cockpit.until(f"{item} !== null")
-    cockpit.browser.evaluate(f"{item}.querySelector('.acknowledge').click()")
-    cockpit.service.until(lambda: cockpit.service.commands[-1].name == "acknowledge")
+    acknowledge(cockpit, "[data-fault='device gnss']")
     cockpit.until(f"{item}.innerText.includes('acknowledged by operator (administrator)')")
     item = "document.querySelector('[data-fault=\"device SU03\"]')"
     cockpit.emit(flight_events.recovered("SU03"))
@@ -286,7 +307,7 @@ def test_after_landing_the_summary_stays_without_an_alarm(cockpit: Cockpit) -> N
         assert (
             browser.evaluate(f"document.querySelector('[data-action={action}]').disabled") is False
         )
-    check(cockpit, "landed", phone_tab="flight")
+    check(cockpit, "landed", phone_tab="flight", seen=".next-steps")
     cockpit.service.end()
     cockpit.until("document.body.classList.contains('flight-ended')")
     assert not browser.evaluate("document.body.classList.contains('connection-lost')")

@@ -28,6 +28,7 @@ def test_an_exposure_proceeds_from_trigger_to_verdict() -> None:
         steps.append(reported["step"])
     assert steps == ["triggered", "stored", "sealed", "processed"]
     assert reported["verdict"] == "good"
+    assert reported["verdict_mono_ns"] == "1"
     assert reported["figures"] == {"sigma0_px": 0.01, "tie_points_pp": 900, "dc_k": 11.8}
     assert state.brief()["verdicts"] == {"good": 1, "usable": 0, "refly": 0}
     json.dumps(state.snapshot())

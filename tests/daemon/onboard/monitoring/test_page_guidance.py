@@ -150,6 +150,56 @@ def test_base_maps_are_drawn_below_the_lines(browser: Browser) -> None:
     browser.click("#map-thumbnails")
 
 
+def choose_map(browser: Browser, number: str) -> None:
+    browser.evaluate(
+        "(() => { const one = document.querySelector('#map-choice');"
+        f" one.value = '{number}'; one.dispatchEvent(new Event('change')); }})()"
+    )
+
+
+def test_a_tile_that_is_refused_is_asked_for_again(browser: Browser) -> None:
+    browser.evaluate(
+        "window.refused = 0; window.realFetch = window.fetch;"
+        "window.fetch = (address, options) => String(address).includes('/maps/0/')"
+        " && window.refused < 3 ? (window.refused += 1, Promise.reject(new TypeError('lost')))"
+        " : window.realFetch(address, options); true"
+    )
+    choose_map(browser, "")
+    choose_map(browser, "0")
+    browser.wait_for("window.refused === 3", WITHIN_S)
+    blank = (
+        "[...document.querySelectorAll('#map canvas[data-map=\"0\"]')].filter((one) =>"
+        " !one.getContext('2d').getImageData(128, 128, 1, 1).data[3]).length"
+    )
+    browser.wait_for(f"{blank} === 0", WITHIN_S)
+    browser.evaluate("window.fetch = window.realFetch; true")
+
+
+def test_only_pictures_are_dimmed_at_night(browser: Browser) -> None:
+    """Vector tiles have a style of their own."""
+    dimmed = "document.querySelector('.leaflet-ground-pane .leaflet-layer.raster') !== null"
+    assert not browser.evaluate(dimmed)
+    choose_map(browser, "1")
+    assert browser.evaluate(dimmed)
+    choose_map(browser, "0")
+
+
+def limits_shown(browser: Browser, below_m: float | None, above_m: float | None) -> Any:
+    """The label of the height for limits of a frame."""
+    limits = json.dumps({"across_m": 25.0, "below_m": below_m, "above_m": above_m})
+    return browser.evaluate(
+        "import('/guidance_view.js').then(({cellsOf}) => cellsOf({exceeded: [], is_captured: true,"
+        f" across_m: 0, line: 'A', limits: {limits}}}).find((one) => one.key === 'height').label)"
+    )
+
+
+def test_the_label_of_the_height_has_the_limits_that_there_are(browser: Browser) -> None:
+    assert limits_shown(browser, 40.0, 60.0) == "Height −40/+60 m"
+    assert limits_shown(browser, 40.0, None) == "Height ≥ −40 m"
+    assert limits_shown(browser, None, 60.0) == "Height ≤ +60 m"
+    assert limits_shown(browser, None, None) == "Height"
+
+
 def test_a_way_is_measured(browser: Browser) -> None:
     browser.click("#map-measure")
     box = browser.evaluate(

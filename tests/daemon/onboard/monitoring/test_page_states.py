@@ -199,6 +199,38 @@ def test_the_suggested_exposure_of_pan_ignores_a_saturated_colour(browser: Brows
     assert browser.evaluate(script) == {"pan": pytest.approx(1.5), "R": 0.5}
 
 
+def test_after_the_last_line_the_large_button_lands(service: Service, browser: Browser) -> None:
+    button = "document.querySelector('#phase-button').innerText === '{}'"
+    lines = {"flown": ["A1"], "current": None, "next": None}
+    armed = flight_events.status("armed", triggers=1)
+    service.emit(armed | {"lines": lines})
+    browser.wait_for(button.format("Land"), WITHIN_S)
+    assert browser.text("#phase-second") == "Start line"
+    # Without a position nothing is next, although the line is left.
+    service.emit(armed | {"lines": lines | {"flown": []}})
+    browser.wait_for(button.format("Start line"), WITHIN_S)
+    assert browser.text("#phase-second") == "Land"
+    service.emit(armed | {"lines": lines})
+    browser.wait_for(button.format("Land"), WITHIN_S)
+    service.emit({"event": "retake", "line": "A1 R1", "of": "A1", "at": LINES["A1"], "number": 1})
+    browser.wait_for(button.format("Start line"), WITHIN_S)
+
+
+def test_the_age_of_the_verdict_is_that_of_its_record(service: Service, browser: Browser) -> None:
+    """Also for a page that was opened later."""
+    exposed = flight_events.exposure(2, "good")
+    for event in exposed:
+        service.emit(event | {"mono_ns": "5000000000"})
+    service.emit(flight_events.status(triggers=2) | {"mono_ns": "45000000000"})
+    age = "parseInt(document.querySelector('#verdict .since').innerText)"
+    browser.wait_for(f"{age} >= 40", WITHIN_S)
+    seen = browser.evaluate(age)
+    browser.wait_for(f"{age} > {seen}", WITHIN_S)
+    # Of a time before that of the verdict, as after another start of the computer, there is none.
+    service.emit(flight_events.status(triggers=2))
+    browser.wait_for("document.querySelector('#verdict .since').innerText === ''", WITHIN_S)
+
+
 def test_a_new_mission_has_nothing_of_the_one_before(
     folder: Path, service: Service, browser: Browser
 ) -> None:

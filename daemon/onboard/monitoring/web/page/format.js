@@ -64,6 +64,9 @@ export function span(s) {
   return minutes >= 60 ? `${Math.floor(minutes / 60)} h ${String(minutes % 60).padStart(2, "0")}` : `${minutes} min`;
 }
 
+// An age: seconds while they count, then hours and minutes.
+export const ageText = (s) => s < 100 ? `${number(s)} s` : span(s);
+
 // A standard deviation of time with a readable prefix.
 export function sigma(ns) {
   if (!isKnown(ns)) return UNKNOWN;

@@ -14,6 +14,14 @@ const way = (m) => Math.abs(m) >= FAR_M ? distance(m) : length(m);
 const arrowOf = (m) => Math.abs(m) < 0.5 ? "" : m > 0 ? " ▶" : " ◀";
 const sideOf = (m) => m > 0 ? "right" : "left";
 
+// The label of the height with the limits that there are: below and above the planned height.
+function heightLabel({ below_m: below, above_m: above }) {
+  // The unit once: the label is narrow.
+  if (below != null && above != null) return t("guidance.height_both", { below: height(below).split(" ")[0], above: height(above) });
+  if (below != null) return t("guidance.height_below", { limit: height(below) });
+  return above == null ? t("guidance.height") : t("guidance.height_above", { limit: height(above) });
+}
+
 export function ageState(ageS) {
   return ageS > LOST_S ? "lost" : ageS > STALE_S ? "stale" : "fresh";
 }
@@ -25,11 +33,12 @@ export function cellsOf(frame) {
   const cells = [
     { key: "line", label: t(frame.is_captured ? "guidance.line" : "guidance.next_line"),
       value: `${frame.line}${frame.is_reversed ? " ⇄" : ""}`, describe: frame.line },
-    { key: "across", label: t("guidance.across", { limit: length(frame.limits.across_m) }),
-      value: frame.is_captured
-        ? `${length(Math.abs(frame.across_m))}${arrowOf(frame.across_m)}` : `${angle(frame.bearing_deg)} · ${way(frame.start_distance_m)}`,
-      describe: t(`guidance.${sideOf(frame.across_m)}`), state: isOut("across") },
-    { key: "height", label: t("guidance.height"),
+    frame.is_captured
+      ? { key: "across", label: t("guidance.across", { limit: length(frame.limits.across_m) }),
+        value: `${length(Math.abs(frame.across_m))}${arrowOf(frame.across_m)}`,
+        describe: t(`guidance.${sideOf(frame.across_m)}`), state: isOut("across") }
+      : { key: "bearing", label: t("guidance.bearing"), value: `${angle(frame.bearing_deg)} · ${way(frame.start_distance_m)}` },
+    { key: "height", label: heightLabel(frame.limits),
       value: frame.height_deviation_m == null ? "–"
         : `${frame.height_deviation_m >= 0 ? "+" : "−"}${height(Math.abs(frame.height_deviation_m))}`,
       state: isOut("height") },

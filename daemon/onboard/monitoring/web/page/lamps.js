@@ -2,7 +2,7 @@
 
 import { element } from "./dom.js";
 import { t } from "./i18n.js";
-import { number, sigma } from "./format.js";
+import { ageText, bytes, number, span } from "./format.js";
 
 export const POSITION_HOLDS_S = 5;
 const CLOCK_CAUTION_NS = 1e6;
@@ -31,10 +31,12 @@ function trigger(flight) {
 }
 
 function time(flight) {
-  const { clock_sigma_ns: sigmaNs, in_holdover: inHoldover } = flight.brief.status || {};
+  const { clock_sigma_ns: sigmaNs, in_holdover: inHoldover, clock_coasting_s: coastingS } = flight.brief.status || {};
   const hasFault = flight.brief.faults.some((one) => one.stands && one.device === "clock");
   if (sigmaNs == null) return { state: "off", value: "–" };
-  return { state: hasFault || inHoldover || sigmaNs > CLOCK_CAUTION_NS ? "caution" : "good", value: sigma(sigmaNs) };
+  const isCoarse = sigmaNs > CLOCK_CAUTION_NS;
+  const holdover = () => coastingS == null ? t("lamp.holdover") : t("lamp.holdover_for", { age: ageText(coastingS) });
+  return { state: hasFault || inHoldover || isCoarse ? "caution" : "good", value: inHoldover ? holdover() : t(isCoarse ? "lamp.coarse" : "lamp.gps") };
 }
 
 // The position; null if it is older than POSITION_HOLDS_S.
@@ -50,27 +52,30 @@ function position(flight) {
     const isNeeded = flight.brief.phase === "flying" || flight.brief.phase === "armed";
     return { state: isNeeded || isUnavailable(devicesOf(flight, "navigator")[0] || {}) ? "warning" : "off", value: "–" };
   }
-  if (!present) return { state: "warning", value: t("lamp.old", { s: number(known.age_s) }) };
+  if (!present) return { state: "warning", value: t("lamp.old", { age: ageText(known.age_s) }) };
   if (present.fix === "none") return { state: "caution", value: t("lamp.no_fix") };
   // A receiver that is lost is no longer good, although its last position is not old yet.
   const isLosing = devicesOf(flight, "navigator").some(isUnavailable);
-  return { state: isLosing ? "caution" : "good", value: present.satellites == null ? "OK" : `${number(present.satellites)} SV` };
+  const satellites = present.satellites == null ? "3D" : t("lamp.satellites", { n: number(present.satellites) });
+  return { state: isLosing ? "caution" : "good", value: present.fix === "2d" ? "2D" : satellites };
 }
 
 function disk(flight) {
-  const { exposures_left: left, exposures_planned: planned, is_disk_low: isLow, disks = [] } = flight.brief.status || {};
+  const { exposures_left: left, exposures_planned: planned, is_disk_low: isLow, disk_free_bytes: free, disk_seconds: seconds, disks = [] } = flight.brief.status || {};
   if (left == null) return { state: "off", value: "–" };
   const hasProblem = disks.some((one) => one.state !== "in use" || one.healthy === false);
   const isShort = planned != null && left < planned;
   // As severe as what is reported of the disks.
   const isSevere = flight.brief.faults.some((one) => one.stands && one.severity === "warning" && /^disk\b/.test(one.device));
-  return { state: left === 0 || isSevere ? "warning" : isLow || isShort || hasProblem ? "caution" : "good", value: number(left) };
+  // Minutes where they count, else the free space.
+  const value = isLow && seconds != null ? span(seconds) : free == null ? t("lamp.exposures", { n: number(left) }) : bytes(free);
+  return { state: left === 0 || isSevere ? "warning" : isLow || isShort || hasProblem ? "caution" : "good", value };
 }
 
 function processing(flight) {
   const waiting = flight.brief.status?.queue;
   if (waiting == null) return { state: "off", value: "–" };
-  return { state: waiting > QUEUE_CAUTION ? "caution" : "good", value: number(waiting) };
+  return { state: waiting > QUEUE_CAUTION ? "caution" : "good", value: t("lamp.waiting", { n: number(waiting) }) };
 }
 
 function link(flight, feed) {

@@ -10,12 +10,25 @@ import { thumbnailOf } from "./thumbnails.js";
 
 const THUMBNAILS_MAX = 60;
 const OVERZOOM = 4;
+const AGAIN_MIN_MS = 1000;
+const AGAIN_MAX_MS = 32000;
 const isNight = () => document.documentElement.dataset.theme === "dark";
+
+// A tile that was refused or lost with the link would stay a hole: asked for again while it is on the map.
+async function fetchTile(tile, address) {
+  for (let waitMs = AGAIN_MIN_MS; ; waitMs = Math.min(2 * waitMs, AGAIN_MAX_MS)) {
+    const answer = await fetchOk(address);
+    if (answer || !tile.isConnected) return answer;
+    await new Promise((resolve) => setTimeout(resolve, waitMs));
+  }
+}
 
 // Tiles of the service: pictures, or vector tiles drawn here. Fetched, since a picture's address carries no token.
 const ServiceTiles = L.GridLayer.extend({
   initialize(about, options) {
     this.about = about;
+    // Vector tiles have a style of the night of their own; pictures are dimmed then.
+    if (about.kind !== "vector") options.className = "raster";
     L.GridLayer.prototype.initialize.call(this, options);
   },
   createTile(at, done) {
@@ -28,7 +41,7 @@ const ServiceTiles = L.GridLayer.extend({
   async fill(tile, at) {
     // The name keeps tiles of another map with the same number apart in the browser's cache.
     const query = `?name=${encodeURIComponent(this.about.name)}`;
-    const answer = await fetchOk(`/api/v1/maps/${this.about.id}/${at.z}/${at.x}/${at.y}${query}`);
+    const answer = await fetchTile(tile, `/api/v1/maps/${this.about.id}/${at.z}/${at.x}/${at.y}${query}`);
     const isEmpty = !answer || answer.status === 204;
     if (this.about.kind === "vector") {
       drawTile(tile, isEmpty ? null : new Uint8Array(await answer.arrayBuffer()), isNight());
@@ -170,7 +183,8 @@ export function startLayers(map, feed) {
     }
     if (isNightShown !== isNight()) {
       isNightShown = isNight();
-      shown?.redraw();
+      // Pictures are dimmed as they are: without a link they could not be fetched again.
+      if (shown?.about.kind === "vector") shown.redraw();
     }
     if (isAsked) return;
     isAsked = true;

@@ -2,6 +2,7 @@
 
 import { by, element } from "./dom.js";
 import { serverTexts, t } from "./i18n.js";
+import { isPlanFlown } from "./plan.js";
 
 const PHASE_CLASS = { flying: "good", armed: "good", fault: "warning", idle: "caution" };
 const ALARMS = "alarms";
@@ -9,15 +10,18 @@ const NEXT = { ready: "arm", armed: "start", flying: "stop" };
 
 // What the large button does in a phase: a command, "alarms" to open their page, or nothing.
 function commandsOf(brief) {
+  if (brief.phase === "fault") return { next: ALARMS, second: null };
   const hasFlown = (brief.status?.ledger?.triggers?.triggers ?? 0) > 0;
-  return { next: brief.phase === "fault" ? ALARMS : NEXT[brief.phase] ?? null, second: brief.phase === "armed" && hasFlown ? "land" : null };
+  if (brief.phase !== "armed" || !hasFlown) return { next: NEXT[brief.phase] ?? null, second: null };
+  // After the last planned line the next step is the landing.
+  return isPlanFlown(brief.status.lines) ? { next: "land", second: "start" } : { next: "start", second: "land" };
 }
 
 function setButton(button, name) {
   button.hidden = !name && button.id === "phase-second";
   button.disabled = !name;
   button.classList.toggle("stop", name === "stop" || name === ALARMS);
-  button.classList.toggle("destructive", name === "land");
+  button.classList.toggle("destructive", name === "land" && button.id === "phase-second");
   if (button.dataset.next === (name ?? "")) return;
   button.dataset.next = name ?? "";
   if (name) button.textContent = name === ALARMS ? t("phase.see_alarms") : t(`command.${name}`);

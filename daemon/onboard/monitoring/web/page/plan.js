@@ -25,6 +25,13 @@ let plan = null;
 // Gaps of the coverage as it was last computed; null before that.
 export const gaps = () => gapsFound;
 
+// Whether every line of the plan and every retake is flown. Unknown without a plan: false.
+export function isPlanFlown({ flown = [], current = null } = {}) {
+  if (!plan?.lines.length || current != null) return false;
+  const done = new Set(flown);
+  return plan.lines.every((one) => done.has(one.id)) && plan.retakes.every((one) => done.has(one.line));
+}
+
 const areaOf = (one) => one.holes.reduce((sum, gap) => sum + gap.area_m2, 0);
 
 // Shortfalls of a segment: missing bands, and images found of images required.
