@@ -173,6 +173,32 @@ def test_the_command_prints_version_and_help(installed: Installation) -> None:
     assert "demo" in installed.run("syntopic", "--help").stdout
 
 
+PAGE_CODE = """
+from fastapi.testclient import TestClient
+from daemon.onboard.monitoring.access.command_gateway import CommandGateway
+from daemon.onboard.monitoring.access.tokens import read_tokens
+from daemon.onboard.monitoring.flight_state import FlightState
+from daemon.onboard.monitoring.web.api import AccessSettings, create_app
+
+settings = AccessSettings(read_tokens(None), anonymous_read=True)
+app = create_app(FlightState("syntopic"), CommandGateway(lambda command: None), settings)
+with TestClient(app) as client:
+    page = client.get("/")
+    assert page.status_code == 200, page.text
+    assert "Syntopic" in page.text, page.text
+    name = page.text.partition('<script type="module" src="')[2].partition('"')[0]
+    script = client.get("/" + name)
+    assert script.status_code == 200, script.text
+    assert "javascript" in script.headers["content-type"], script.headers
+    print("page", len(page.text), len(script.text))
+"""
+
+
+def test_the_page_is_served_from_the_wheel(installed: Installation) -> None:
+    done = installed.run("python", "-c", PAGE_CODE)
+    assert done.stdout.startswith("page "), done.stderr
+
+
 def test_without_the_photographs_the_emulator_names_the_missing_distribution(
     installed: Installation,
 ) -> None:
