@@ -16,7 +16,7 @@ ANSWERS: Final[Mapping[str, str]] = {
     "trigger_policies.py": r"class .*(Interval|Distance)",
     "roles.py": r"COMMAND_ROLES",
     "prerequisites.py": r"CHECKS: Final",
-    "store.py": r"def _write_frame",
+    "writer.py": r"def _store\(",
     "mirrored.py": r"def .*drop",
     "inventory.py": r"why such a file has no hash",
     "transfer_removal.py": r"def .*remov",
