@@ -13,7 +13,7 @@ import pytest
 
 from processing.rig import shipped_rigs
 from tests.daemon.onboard.monitoring import flight_events
-from tests.daemon.onboard.monitoring.cockpit import LINES, MEASURES, Cockpit, lines
+from tests.daemon.onboard.monitoring.cockpit import LINES, MEASURES, Cockpit, lines, on_line
 from tests.daemon.onboard.monitoring.guidance_frames import guidance_frame
 from tests.daemon.onboard.monitoring.page_service import WITHIN_S, Service
 from tests.support.browser import Browser, chromium
@@ -93,7 +93,7 @@ def test_the_newest_footprint_lies_below_the_tools_of_the_map(cockpit: Cockpit) 
 
 
 def test_the_map_is_fitted_again_when_guidance_takes_its_room(cockpit: Cockpit) -> None:
-    cockpit.guide(0.00005)
+    cockpit.guide(on_line(0.00005))
     cockpit.until(
         "import('/map.js').then((map) => map.footprintLayers()"
         ".map((one) => one.getElement().getBoundingClientRect()).filter((one) => one.height > 1)"
@@ -170,7 +170,7 @@ def test_the_alarm_bar_counts_what_is_active_and_what_is_only_unseen(cockpit: Co
 
 def test_what_was_shown_before_a_sleep_is_not_fresh_after_it(cockpit: Cockpit) -> None:
     cockpit.status("flying", triggers=7)
-    cockpit.guide(0.00005)
+    cockpit.guide(on_line(0.00005))
     found = cockpit.browser.evaluate(
         """Promise.all(['/wake.js', '/time_of_day.js'].map((one) => import(one)))
           .then(async ([{ checkSleep }, { timeOfDay }]) => {
@@ -208,7 +208,7 @@ def test_what_was_shown_before_a_sleep_is_not_fresh_after_it(cockpit: Cockpit) -
     cockpit.until("!document.body.classList.contains('connection-lost')")
     cockpit.until("!document.title.includes('CONNECTION LOST')")
     # Guidance connects again too, although its second connection never opened.
-    cockpit.guide(0.00005)
+    cockpit.guide(on_line(0.00005))
 
 
 def test_a_lost_link_that_was_acknowledged_gives_its_bar_to_the_next_alarm(
