@@ -8,10 +8,12 @@ duration are in `KEY.provenance.json`, outside of what is compared between two r
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import hashlib
 import os
-from collections.abc import Iterator, Mapping, Sequence
+import stat
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
@@ -31,6 +33,7 @@ UNCOMPARED_KEYS: Final = frozenset({"timings_s", "duration_s"})
 
 _FORMAT: Final = 1
 _KEY_CHARACTERS: Final = 64
+_BLOCK_BYTES: Final = 1 << 20
 
 Parts = Sequence[bytes | memoryview]
 
@@ -105,13 +108,27 @@ def parse_manifest(data: bytes, key: str) -> ProductManifest | None:
         if content["format"] != _FORMAT:
             return None
         files = {
-            str(name): ProductFile(int(file["nbytes"]), str(file["sha256"]))
+            _plain_file_name(name): ProductFile(_count(file["nbytes"]), str(file["sha256"]))
             for name, file in content["files"].items()
         }
+        if REPORT_FILE not in files:
+            return None
         found = ProductManifest(str(content["key"]), files, str(content["compared_sha256"]))
     except (RecordError, KeyError, TypeError, ValueError, AttributeError):
         return None
     return found if found.key == key else None
+
+
+def _plain_file_name(name: str) -> str:
+    if name in ("", ".", "..") or "/" in name or "\0" in name:
+        raise ValueError(name)
+    return name
+
+
+def _count(value: object) -> int:
+    if type(value) is not int or value < 0:
+        raise TypeError(value)
+    return value
 
 
 def is_complete(mission: Mission, number: int, key: str) -> bool:
@@ -256,28 +273,65 @@ def commit(
     return True
 
 
-def product_problems(mission: Mission, number: int, key: str) -> list[str]:
+def product_problems(
+    mission: Mission,
+    number: int,
+    key: str,
+    step: Callable[[int], None] = lambda count: None,
+) -> list[str]:
     """What of a committed product set is missing or was altered, one sentence each.
+
+    A set that another process replaces meanwhile is compared with its next manifest.
 
     Args:
         mission: of the exposure.
         number: of the exposure.
         key: SHA-256 of what the products were computed from.
+        step: called with the number of bytes read.
     """
     manifest = read_manifest(mission, number, key)
-    if manifest is None:
-        return [f"exposure {number}: no manifest of key {key[:12]}"]
-    folder, problems = mission.level2(number), []
+    while manifest is not None:
+        problems = _differences(mission.level2(number), manifest, step)
+        present = read_manifest(mission, number, key)
+        if not problems or present == manifest:
+            return problems
+        manifest = present
+    if (manifest_folder(mission, number) / f"{key}.json").exists():
+        return [f"exposure {number}: the manifest of key {key[:12]} is damaged"]
+    return [f"exposure {number}: no manifest of key {key[:12]}"]
+
+
+def _differences(folder: Path, manifest: ProductManifest, step: Callable[[int], None]) -> list[str]:
+    problems = []
     for name, file in manifest.files.items():
+        where = f"{folder.parent.name}/{folder.name}/{name}"
         try:
-            with (folder / name).open("rb") as opened:
-                found = hashlib.file_digest(opened, "sha256").hexdigest()
+            found = _regular_file_sha256(folder / name, step)
         except OSError as error:
-            problems.append(f"{folder.name}/{name}: {error.strerror}")
+            problems.append(f"{where}: cannot be read ({error.strerror})")
             continue
         if found != file.sha256:
-            problems.append(f"{folder.name}/{name}: differs from its manifest")
+            problems.append(f"{where}: differs from its manifest")
     return problems
+
+
+def _regular_file_sha256(path: Path, step: Callable[[int], None]) -> str:
+    """The hash of a plain file; links are not followed and pipes not waited for.
+
+    Raises:
+        OSError: it is missing, no plain file, or cannot be read.
+    """
+    descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    digest = hashlib.sha256()
+    try:
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            raise OSError(errno.EINVAL, "is no plain file")
+        while block := os.read(descriptor, _BLOCK_BYTES):
+            digest.update(block)
+            step(len(block))
+    finally:
+        os.close(descriptor)
+    return digest.hexdigest()
 
 
 def committed_keys(mission: Mission, number: int) -> list[str]:

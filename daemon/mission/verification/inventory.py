@@ -24,7 +24,7 @@ _REASONS: tuple[tuple[str, str], ...] = (
     ("disks.json", "which disks hold the mission; written again when a disk is dropped or joins"),
     (".superseded/", "set aside when two copies of the mission were brought together"),
     (f"L0/{DISCARDED}/", "set aside by recovery; it was never stored"),
-    ("L2/", "products, made again from Level-0 (syntopic process)"),
+    ("L2/", "products without a manifest, made again from Level-0 (syntopic process)"),
     ("L3/", "products, made again from Level-2 (syntopic pansharpen)"),
     ("manifests/", "hashes of products, written again with them (syntopic process)"),
     ("export/", "derived from the mission for other programs"),

@@ -21,6 +21,7 @@ from daemon.mission.catalog.catalog import Catalog, CatalogError, IndexedExposur
 from daemon.mission.layout import DISCARDED, Mission, is_exposure_name
 from daemon.mission.log.log_seals import CHANGING_FILES, SEALS_FILE, read_seals
 from daemon.mission.store.level0_folder import hash_file
+from daemon.mission.store.product_manifests import MANIFESTS
 from daemon.mission.verification.chain import ChainLink, follow_chain
 from daemon.mission.verification.chain_file import CHAIN_FILE, History, LogSeal, read_history
 from daemon.mission.verification.inventory import (
@@ -36,6 +37,7 @@ from daemon.mission.verification.verified_exposure import (
     FoundExposure,
     check_exposure,
 )
+from daemon.mission.verification.verified_products import check_products
 
 Progress = Callable[[int, int], None]
 CheckAll = Callable[[Sequence[ExpectedExposure], Callable[[int], None]], list[FoundExposure]]
@@ -133,6 +135,7 @@ class _Verification:
         )
         genesis = self._mission_files()
         exposures = self._exposures(numbers, is_chained=bool(genesis))
+        self._products()
         self._logs(is_flown_mission=bool(genesis))
         if genesis:
             self._records(exposures, genesis)
@@ -312,6 +315,12 @@ class _Verification:
                 self.problems.append(f"exposure {number}: the index names another record")
             elif found.is_readable and found.is_there and row.frames != found.frames:
                 self.problems.append(f"exposure {number}: index and record name different frames")
+
+    def _products(self) -> None:
+        checked = check_products(self.mission, self.inventory, self.step)
+        self.problems += checked.problems
+        if checked.files:
+            self._cover("products", MANIFESTS, *checked.files)
 
     def _logs(self, *, is_flown_mission: bool) -> None:
         logs: dict[str, LogSeal | None] = dict(self.history.logs)
