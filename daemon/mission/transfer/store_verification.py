@@ -8,9 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
 
 from daemon.mission.canonical_json import RECORD_MAX_BYTES, RecordError, parse_record
 from daemon.mission.layout import Mission, is_exposure_name
+from daemon.mission.store.level0_folder import CAPTURE_FILE, EXPOSURE_FILE
 from daemon.mission.transfer.object_store import ObjectStore, ObjectStoreError, StoredObject
 from daemon.mission.transfer.store_products import (
     PROCESSED,
@@ -58,12 +60,16 @@ def check_store_copy(
 ) -> None:
     """Read a copy from the store and compare every object with the manifest.
 
+    Frames are compared with the hashes in their exposures' records, too.
+
     Raises:
         TransferError: an object is missing or differs.
         ObjectStoreError: the store refused.
     """
     found = {one.name: one for one in target.list_objects()}
     problem = next(_differences(target, manifest, found, step), None)
+    if problem is None:
+        problem = next(iter(_recorded_frames(target, manifest, found).problems), None)
     if problem is not None:
         raise TransferError(f"{problem}; what the source still has is kept")
 
@@ -110,24 +116,16 @@ def verify_in_store(
     about = manifest.files.get("mission.json")
     if manifest.genesis_sha256 != (about.sha256 if about else ""):
         problems.append("mission.json: is not the one that the manifest names")
-    exposures, frames = 0, 0
-    for name, entry in found.items():
-        parts = name.split("/")
-        if len(parts) == 3 and parts[0] == "L0" and parts[2] == "exposure.json":
-            if not is_exposure_name(parts[1]):
-                continue
-            exposures += 1
-            counted, wrong = _frames(target, manifest, entry)
-            frames += counted
-            problems += wrong
+    recorded = _recorded_frames(target, manifest, found)
+    problems += recorded.problems
     covered = [CoveredFiles("objects of the mission", len(manifest.files), MANIFEST_FILE)]
     products = list_products(target)
     if count := sum(1 for _ in products.committed()):
         problems += product_differences(target, products, lambda _count: None)
         covered.append(CoveredFiles("product sets", count, f"{PROCESSED}/manifests"))
     return VerifyReport(
-        exposures,
-        frames,
+        recorded.exposures,
+        recorded.frames,
         manifest.nbytes,
         tuple(problems),
         covered=tuple(covered),
@@ -161,8 +159,41 @@ def _differences(
                 yield problem
 
 
+@dataclass
+class _RecordedFrames:
+    """Records and frames that were found, and frames that are not what their record names."""
+
+    exposures: int = 0
+    frames: int = 0
+    problems: list[str] = field(default_factory=list)
+
+
+def _recorded_frames(
+    target: ObjectStore, manifest: TransferManifest, found: dict[str, StoredObject]
+) -> _RecordedFrames:
+    """Compare frames with the hashes in the records of their exposures.
+
+    The record of the storage counts where an exposure was not sealed.
+    """
+    recorded = _RecordedFrames()
+    folders = {name.rpartition("/")[0] for name in found if name.startswith("L0/")}
+    for folder in sorted(folders):
+        sealed, stored = (found.get(f"{folder}/{name}") for name in (EXPOSURE_FILE, CAPTURE_FILE))
+        record = sealed or stored
+        if record is None or not is_exposure_name(folder.removeprefix("L0/")):
+            continue
+        recorded.exposures += sealed is not None
+        counted, wrong = _frames(target, manifest, record, found)
+        recorded.frames += counted
+        recorded.problems += wrong
+    return recorded
+
+
 def _frames(
-    target: ObjectStore, manifest: TransferManifest, entry: StoredObject
+    target: ObjectStore,
+    manifest: TransferManifest,
+    entry: StoredObject,
+    found: dict[str, StoredObject],
 ) -> tuple[int, list[str]]:
     """Frames that a record names, and those whose hash is not that of the copy."""
     folder = entry.name.rpartition("/")[0]
@@ -179,9 +210,17 @@ def _frames(
         return 0, [f"{entry.name}: cannot be read ({error})"]
     wrong = []
     for file, sha256 in named:
-        there = manifest.files.get(f"{folder}/{file}")
+        name = f"{folder}/{file}"
+        noted, there = manifest.files.get(name), found.get(name)
+        if noted is None:
+            wrong.append(f"{name}: is missing")
+            continue
         if there is None:
-            wrong.append(f"{folder}/{file}: is missing")
-        elif sha256 and there.sha256 is not None and there.sha256 != sha256:
-            wrong.append(f"{folder}/{file}: differs from the hash in its record")
+            continue  # `_differences` names it
+        if sha256 and (noted.sha256 or target.sha256(there, _no_step)) != sha256:
+            wrong.append(f"{name}: differs from the hash in its record")
     return len(named), wrong
+
+
+def _no_step(_count: int) -> None:
+    """Bytes read twice are not counted."""

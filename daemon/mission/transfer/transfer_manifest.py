@@ -49,7 +49,7 @@ class TransferError(DaemonError):
 
 @dataclass(frozen=True)
 class CopiedFile:
-    """A file of the copy. `sha256` is None until the whole copy was verified with it."""
+    """A file of the copy. `sha256` is None until it was verified: in the state "copying" only."""
 
     nbytes: int
     sha256: str | None
@@ -150,7 +150,7 @@ def _note(content: dict[str, Any]) -> TransferManifest:
     if state not in ("copying", "complete", "sealed"):
         raise ValueError(state)
     is_verified = "state" in content
-    return TransferManifest(
+    note = TransferManifest(
         mission=_text(content["mission"]),
         genesis_sha256=_text(content["genesis"]),
         state=state,
@@ -164,6 +164,9 @@ def _note(content: dict[str, Any]) -> TransferManifest:
         frames=_count(content.get("frames", 0)),
         sealed_utc=_text(content.get("sealed_utc", "")),
     )
+    if state != "copying" and any(file.sha256 is None for file in note.files.values()):
+        raise ValueError("a verified copy has a hash of every file")
+    return note
 
 
 def _file_name(name: str) -> str:

@@ -15,7 +15,11 @@ from daemon.mission.layout import Mission
 from daemon.mission.transfer import object_store, transfer_removal
 from daemon.mission.transfer.object_store import ObjectStore, ObjectStoreError
 from daemon.mission.transfer.store_transfer import finish_store_transfer, transfer_to_store
-from daemon.mission.transfer.store_verification import read_store_manifest, verify_in_store
+from daemon.mission.transfer.store_verification import (
+    check_store_copy,
+    read_store_manifest,
+    verify_in_store,
+)
 from daemon.mission.transfer.transfer_manifest import EXCLUDED_FILES, TransferError
 from daemon.mission.transfer.transfer_removal import removing_path
 from tests.daemon.mission.stores.faulty_s3 import BUCKET, REGION, Faults
@@ -200,6 +204,84 @@ def test_a_forged_manifest_does_not_hide_an_exchanged_frame(mission: Mission, st
     plant(mission, "transfer.json", json.dumps(manifest).encode())
     found = verify_in_store(ObjectStore(f"{url}/{mission.id}")).problems
     assert len(found) == 1 and "differs from the hash in its record" in found[0]
+
+
+def forged(mission: Mission, state: str, names: set[str] | None = None) -> None:
+    """Write null in the place of hashes of the manifest in the store, with a state."""
+    manifest = json.loads(objects(mission.id)["transfer.json"])
+    manifest["state"] = state
+    for name, file in manifest["files"].items():
+        if names is None or name in names:
+            file["sha256"] = None
+    plant(mission, "transfer.json", json.dumps(manifest).encode())
+
+
+@pytest.mark.parametrize("state", ["complete", "sealed"])
+def test_a_verified_manifest_without_hashes_hides_no_exchanged_frame(
+    mission: Mission, store, state: str
+) -> None:
+    url, name = store(), "L0/000002/SU00.tif"
+    transfer_to_store(mission, ObjectStore(url))
+    other = objects(mission.id)["L0/000004/SU00.tif"]
+    plant(mission, name, other)
+    forged(mission, state, {name})
+    done = CliRunner().invoke(app, ["verify", f"{url}/{mission.id}"])
+    assert done.exit_code != 0 and "is damaged" in str(done.exception)
+    for options in ([], ["--remove-source"]):
+        again = CliRunner().invoke(app, ["transfer", str(mission.path), url, *options])
+        assert again.exit_code != 0 and mission.path.exists()
+
+
+def test_a_sealed_manifest_without_any_hash_does_not_end_a_removal(
+    mission: Mission, store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    url = store()
+    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+        patched.setattr(transfer_removal, "finish_removal", _interrupted)
+        transfer_to_store(mission, ObjectStore(url), remove_source=True)
+    removing = removing_path(mission.path)
+    forged(mission, "sealed")
+    plant(mission, "L0/000002/SU00.tif", objects(mission.id)["L0/000004/SU00.tif"])
+    with pytest.raises(TransferError, match="damaged"):
+        finish_store_transfer(mission.path, ObjectStore(url))
+    assert (removing / "L0/000002/SU00.tif").exists()
+
+
+def _interrupted(*_arguments: object) -> None:
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("is_sealed", [True, False])
+def test_a_copy_whose_frames_are_not_those_of_their_records_is_refused(
+    mission: Mission, store, is_sealed: bool
+) -> None:
+    url, name = store(), "L0/000002/SU00.tif"
+    transfer_to_store(mission, ObjectStore(url))
+    there = objects(mission.id)
+    manifest = json.loads(there["transfer.json"])
+    manifest["files"][name] = manifest["files"]["L0/000004/SU00.tif"]
+    plant(mission, name, there["L0/000004/SU00.tif"])
+    if not is_sealed:
+        plant(mission, "L0/000002/exposure.json", None)
+        del manifest["files"]["L0/000002/exposure.json"]
+    plant(mission, "transfer.json", json.dumps(manifest).encode())
+    target = ObjectStore(f"{url}/{mission.id}")
+    note = read_store_manifest(target)
+    assert note is not None
+    with pytest.raises(TransferError, match=f"{name}: differs from the hash in its record"):
+        check_store_copy(target, note, lambda _count: None)
+
+
+def test_an_unverified_frame_of_a_copy_in_progress_is_compared_with_its_record(
+    mission: Mission, store
+) -> None:
+    url, name = store(), "L0/000002/SU00.tif"
+    transfer_to_store(mission, ObjectStore(url))
+    plant(mission, name, objects(mission.id)["L0/000004/SU00.tif"])
+    forged(mission, "copying", {name})
+    problems = verify_in_store(ObjectStore(f"{url}/{mission.id}")).problems
+    assert len(problems) == 2 and "not complete" in problems[0]
+    assert problems[1] == f"{name}: differs from the hash in its record"
 
 
 def test_the_source_goes_only_after_a_sealed_copy_that_was_read_back(
