@@ -93,7 +93,7 @@ NOT_RUN: Final[Mapping[tuple[str, str], str]] = {
     (
         "how-to/processing/orthomosaic.md",
         "photographs",
-    ): "needs photographs of a flight; test_import_photographs.py has some",
+    ): "needs photographs of a flight; seneca_photographs.py has some",
     ("how-to/processing/midas.md", "block"): "needs a measured block; its tests make one",
     (
         "how-to/processing/midas.md",
