@@ -21,10 +21,12 @@ from daemon.postflight.batch.executor import (
     BatchExecutor,
     BatchTask,
     BatchWork,
+    ExecutorEndedError,
     TaskDone,
     TaskFailed,
     TaskLost,
     TaskOutcome,
+    is_passing,
 )
 from daemon.postflight.batch.in_process import InProcessExecutor
 
@@ -41,9 +43,6 @@ FINISH_TIMEOUT_S: Final = 30.0
 """How long exposures in work may take to finish after Ctrl-C."""
 _POLL_S: Final = 0.5
 
-_PASSING_ERRNOS: Final = frozenset(
-    {errno.ETIMEDOUT, errno.EAGAIN, errno.ESTALE, errno.EINTR, errno.EBUSY, errno.EREMOTEIO}
-)
 _UNWRITABLE_CURES: Final = {
     errno.ENOSPC: "Free space on the disk",
     errno.EDQUOT: "Free space below the quota",
@@ -126,17 +125,25 @@ def run_batch(
         tasks: one for each exposure.
         progress: called after every change of the counts.
 
+    Where the executor cannot continue, the remaining tasks are failures with its cause.
+
     Raises:
-        Exception: the work cannot be opened, or the executor cannot continue.
+        Exception: the work cannot be opened.
     """
     run = _Run(executor, tasks, progress)
+    ended_by: ExecutorEndedError | None = None
     try:
         executor.start(work)
-        run.to_end()
+        try:
+            run.to_end()
+        except ExecutorEndedError as error:
+            ended_by = error
     except KeyboardInterrupt:
         run.outcome.is_interrupted = True
     finally:
         run.take(executor.close(FINISH_TIMEOUT_S if run.outcome.is_interrupted else 5.0))
+    if ended_by is not None:
+        run.fail_remaining(f"not computed: {ended_by}")
     run.outcome.failures.sort(key=lambda failure: failure.exposure)
     return run.outcome
 
@@ -182,6 +189,16 @@ class _Run:
             else:
                 self._take_failure(task, outcome)
             self._progress(self.outcome.counts)
+
+    def fail_remaining(self, cause: str) -> None:
+        """List every task without result as failed.
+
+        Args:
+            cause: why.
+        """
+        deferred = [task for _, _, task in self._deferred]
+        for task in (*self._in_work.values(), *self._waiting, *deferred, *self._last):
+            self._fail(task, cause)
 
     def _submit(self) -> None:
         now_s = time.monotonic()
@@ -232,7 +249,7 @@ class _Run:
             if time.monotonic() - since_s < CLAIM_TIMEOUT_S:
                 self._defer(task, CLAIM_RETRY_S)
                 return
-        elif _is_passing(error) and self._store_retries[number] < len(STORE_RETRIES_S):
+        elif is_passing(error) and self._store_retries[number] < len(STORE_RETRIES_S):
             delay_s = STORE_RETRIES_S[self._store_retries[number]]
             self._store_retries[number] += 1
             self.outcome.counts.store_retries += 1
@@ -253,10 +270,3 @@ class _Run:
         self.outcome.failures.append(ExposureFailure(task.number, cause))
         self.outcome.counts.failed += 1
         self._progress(self.outcome.counts)
-
-
-def _is_passing(error: Exception) -> bool:
-    """Whether the same call may succeed a few seconds later."""
-    if isinstance(error, TimeoutError | ConnectionError):
-        return True
-    return isinstance(error, OSError) and error.errno in _PASSING_ERRNOS

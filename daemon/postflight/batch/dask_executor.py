@@ -16,20 +16,26 @@ import time
 import uuid
 import warnings
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
-from importlib.metadata import PackageNotFoundError, version
 from typing import Any, Final
 
 import dask
 import distributed
 from distributed.versions import VersionMismatchWarning
 
-from daemon import DaemonError
+from daemon.mission.exposure_batch import cause_of
 from daemon.postflight.batch.cluster_address import (
     ClusterAddress,
     certificate_problem,
     is_loopback,
+)
+from daemon.postflight.batch.cluster_checks import (
+    ClusterError,
+    check_memory,
+    check_scheduler,
+    check_versions,
+    unsuitable_workers,
 )
 from daemon.postflight.batch.dask_losses import TASK_PREFIX, ReturnLostTasks
 from daemon.postflight.batch.executor import (
@@ -39,8 +45,9 @@ from daemon.postflight.batch.executor import (
     TaskFailed,
     TaskLost,
     TaskOutcome,
+    is_passing,
 )
-from daemon.postflight.batch.local_processes import OPEN_TIMEOUT_S, outcome_of
+from daemon.postflight.batch.local_processes import OPEN_TIMEOUT_S, outcome_of, picklable
 
 CONNECT_TIMEOUT_S: Final = 15.0
 WORKERS_TIMEOUT_S: Final = 60.0
@@ -53,19 +60,13 @@ QUEUED_FACTOR: Final = 2
 """Tasks submitted for each thread of a worker: one in work, one waiting next to it."""
 WORKS_MAX: Final = 2
 """Works that a worker has open: one ends while the next begins."""
-CHECKED_PACKAGES: Final = ("dask", "distributed", "msgpack", "cloudpickle")
-"""Packages whose versions must be the same, for both sides to understand each other."""
-
-
-class ClusterError(DaemonError):
-    """A cluster that cannot be used; the message states what to do."""
 
 
 class WorkRefused:
-    """A worker that cannot do the work at all, and why."""
+    """A worker that cannot do the work at all, why, and its address."""
 
-    def __init__(self, error: Exception) -> None:
-        self.error = error
+    def __init__(self, error: Exception, worker: str = "") -> None:
+        self.error, self.worker = error, worker
 
 
 _actions: OrderedDict[str, dict[int, BatchAction]] = OrderedDict()
@@ -93,9 +94,16 @@ def run_on_worker(pickled_work: bytes, task: BatchTask | None) -> TaskOutcome | 
             try:
                 action = first.clone() if first else pickle.loads(pickled_work).open()
             except Exception as error:  # noqa: BLE001 - the command states it
-                return WorkRefused(error)
+                return WorkRefused(picklable(error), _own_address())
             own[thread] = action
     return None if task is None else outcome_of(action, task)
+
+
+def _own_address() -> str:
+    try:
+        return str(distributed.get_worker().address)
+    except ValueError:
+        return ""  # not in a worker
 
 
 def security_of(address: ClusterAddress, role: str) -> distributed.Security | None:
@@ -141,6 +149,9 @@ class DaskExecutor:
         self._capacity, self._counted_s = 1, 0.0
         self._is_registration_due = False
         self._workers, self._threads, self._workers_seen_s = 0, 0, 0.0
+        self._task_nbytes = 0
+        self._suitable: dict[str, str] = {}  # what is wrong with a worker, by address
+        self._restricted: dict[int, frozenset[str]] = {}
         self.dashboard = ""
 
     @property
@@ -164,7 +175,7 @@ class DaskExecutor:
         self._work = pickle.dumps(work)
         client = self._connect(CONNECT_TIMEOUT_S)
         self.dashboard = _dashboard_of(client, self._address)
-        _check_versions(client)
+        check_versions(client)
         try:
             client.wait_for_workers(1, timeout=WORKERS_TIMEOUT_S)
         except TimeoutError as error:
@@ -172,8 +183,10 @@ class DaskExecutor:
                 f"no worker joined {self._address.url} within {WORKERS_TIMEOUT_S:.0f} s. "
                 f"Run: syntopic worker {self._address.url}"
             ) from error
-        _check_versions(client)
-        _check_memory(client, work)
+        check_versions(client)
+        check_memory(client, work)
+        self._task_nbytes = work.memory_nbytes
+        self._suitable = dict.fromkeys(client.nthreads(), "")
         client.register_plugin(ReturnLostTasks())
         self._workers_seen_s = time.monotonic()
         # One worker opens the work before all others, so that kernels are compiled once.
@@ -205,7 +218,12 @@ class DaskExecutor:
             with suppress(OSError, TimeoutError):
                 self._client.register_plugin(ReturnLostTasks())
                 self._is_registration_due = False
+        permitted = self._permitted()
+        if permitted == []:
+            self._unsent.append(TaskLost(task.number, "scheduler", "every worker was set aside"))
+            return
         self._submitted += 1
+        self._restricted[task.number] = frozenset(permitted or ())
         future = self._client.submit(
             run_on_worker,
             self._work,
@@ -213,6 +231,7 @@ class DaskExecutor:
             # Runs of one scheduler share its names; a task of another run is another task.
             key=f"{TASK_PREFIX}-{task.number}-{self._run}-{self._submitted}",
             pure=False,
+            workers=permitted,
         )
         self._futures[task.number] = future
         future.add_done_callback(lambda ended: self._ended.put((task.number, ended)))
@@ -277,8 +296,61 @@ class DaskExecutor:
             return [TaskFailed(number, error)]
         del self._futures[number]
         if isinstance(outcome, WorkRefused):
-            raise outcome.error
+            return [self._refused(number, outcome)]
         return [outcome]
+
+    def _refused(self, number: int, refused: WorkRefused) -> TaskOutcome:
+        """A worker that joined later could not load the work.
+
+        What passes is tried again as a failure of the task; any other worker is set aside.
+
+        Raises:
+            ClusterError: it is not known which worker it was.
+        """
+        cause = cause_of(refused.error)
+        if is_passing(refused.error):
+            return TaskFailed(number, refused.error)
+        if not refused.worker:
+            raise ClusterError(f"a worker cannot load the work: {cause}")
+        self._set_aside(refused.worker, f"worker {refused.worker} cannot load the work: {cause}")
+        return TaskLost(number, "scheduler", cause)
+
+    def _set_aside(self, worker: str, problem: str) -> None:
+        if not self._suitable.get(worker):
+            self._announce(f"{problem} It gets no exposures of this run.")
+        self._suitable[worker] = problem
+        self._counted_s = 0.0
+
+    def _permitted(self) -> list[str] | None:
+        """The workers that may compute; None for all, where no worker was set aside."""
+        if not any(self._suitable.values()):
+            return None
+        return [worker for worker, problem in self._suitable.items() if not problem]
+
+    def _check_joined(self, present: Mapping[str, int]) -> None:
+        """Check workers that joined; return tasks that no present worker may compute.
+
+        Raises:
+            OSError, TimeoutError: the scheduler does not answer.
+        """
+        if self._client is None or not self._task_nbytes:
+            return
+        for gone in self._suitable.keys() - present.keys():
+            del self._suitable[gone]
+        joined = present.keys() - self._suitable.keys()
+        if joined:
+            for worker, problem in unsuitable_workers(
+                self._client, joined, self._task_nbytes
+            ).items():
+                if problem:
+                    self._set_aside(worker, problem)
+                else:
+                    self._suitable[worker] = ""
+        for number, future in list(self._futures.items()):
+            restricted = self._restricted.get(number)
+            if restricted and not restricted & present.keys() and future.status == "pending":
+                self._client.cancel([self._futures.pop(number)])
+                self._unsent.append(TaskLost(number, "scheduler", "its workers left"))
 
     def _reconnect(self) -> list[TaskOutcome]:
         """A new connection after the scheduler died; tasks in work are submitted again."""
@@ -291,7 +363,7 @@ class DaskExecutor:
             try:
                 client = self._connect(min(5.0, self._reconnect_timeout_s))
                 client.wait_for_workers(1, timeout=max(1.0, limit_s - time.monotonic()))
-                _check_versions(client)
+                check_scheduler(client)
                 client.register_plugin(ReturnLostTasks())
                 self._workers_seen_s = time.monotonic()
                 self._count_threads()
@@ -346,9 +418,11 @@ class DaskExecutor:
         self._counted_s = time.monotonic()
         if self._client is not None:
             try:
-                threads = list(self._client.nthreads().values())
+                present = dict(self._client.nthreads())
+                self._check_joined(present)
             except (OSError, TimeoutError):
                 return
+            threads = [n for name, n in present.items() if not self._suitable.get(name)]
             self._threads = sum(threads)
             self._capacity = QUEUED_FACTOR * self._threads
             if threads:
@@ -364,10 +438,11 @@ class DaskExecutor:
             self._count_threads()
         if self._threads or time.monotonic() - self._workers_seen_s < self._away_timeout_s:
             return
+        aside = "".join(f". {problem}" for problem in self._suitable.values() if problem)
         raise ClusterError(
             f"all workers left {self._address.url}; none came back within "
-            f"{self._away_timeout_s:.0f} s, with {len(self._futures)} exposures in work. Run: "
-            f"syntopic worker {self._address.url}, and run the same command again; complete "
+            f"{self._away_timeout_s:.0f} s, with {len(self._futures)} exposures in work{aside}. "
+            f"Run: syntopic worker {self._address.url}, and run the same command again; complete "
             "exposures are not computed again"
         )
 
@@ -380,49 +455,6 @@ def _dashboard_of(client: distributed.Client, address: ClusterAddress) -> str:
             f"{link} (open to the network: give dask scheduler --dashboard-address 127.0.0.1:8787)"
         )
     return link
-
-
-def _check_versions(client: distributed.Client) -> None:
-    """Compare the packages by which both sides understand each other.
-
-    Raises:
-        ClusterError: a version differs.
-    """
-    try:
-        theirs, ours = client.run_on_scheduler(version, "syntopic"), version("syntopic")
-    except PackageNotFoundError:
-        theirs, ours = "none", version("syntopic")
-    if theirs != ours:
-        raise ClusterError(
-            f"the scheduler has syntopic {theirs}, this command {ours}. Install the same version "
-            "where the scheduler runs: pip install 'syntopic[cluster]'"
-        )
-    found: dict[str, Any] = client.get_versions(check=False)
-    own = found["client"]["packages"]
-    sides = {"the scheduler": found["scheduler"]}
-    sides |= {f"worker {name}": about for name, about in found["workers"].items()}
-    for side, about in sides.items():
-        packages = about["packages"]
-        for name in (*CHECKED_PACKAGES, "python"):
-            # A Python version is three numbers with a suffix; the first two decide.
-            digits = 2 if name == "python" else 9
-            versions = [str(v.get(name)).split(".")[:digits] for v in (packages, own)]
-            if versions[0] != versions[1]:
-                raise ClusterError(
-                    f"{side} has {name} {packages.get(name)}, this command {own.get(name)}. "
-                    "Install the same versions: pip install 'syntopic[cluster]' on all machines"
-                )
-
-
-def _check_memory(client: distributed.Client, work: BatchWork) -> None:
-    for name, about in client.scheduler_info()["workers"].items():
-        threads, limit = max(1, about["nthreads"]), about["memory_limit"] or 0
-        if limit and limit < threads * work.memory_nbytes:
-            raise ClusterError(
-                f"worker {name} declares {limit / 1e9:.1f} GB for {threads} exposures at a time; "
-                f"{threads * work.memory_nbytes / 1e9:.1f} GB are needed. Start it with fewer "
-                "--processes"
-            )
 
 
 def _not_begun(client: distributed.Client, futures: dict[int, distributed.Future]) -> list[int]:

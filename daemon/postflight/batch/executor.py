@@ -7,8 +7,29 @@ returns an outcome for each task. Retries, quarantine and order are in
 
 from __future__ import annotations
 
+import errno
 from dataclasses import Field, dataclass
-from typing import Any, ClassVar, Literal, Protocol, TypeAlias
+from typing import Any, ClassVar, Final, Literal, Protocol, TypeAlias
+
+from daemon import DaemonError
+
+_PASSING_ERRNOS: Final = frozenset(
+    {errno.ETIMEDOUT, errno.EAGAIN, errno.ESTALE, errno.EINTR, errno.EBUSY, errno.EREMOTEIO}
+)
+
+
+class ExecutorEndedError(DaemonError):
+    """An executor that cannot continue; the message states what to do.
+
+    What was computed before counts: the run lists the remaining exposures with this cause.
+    """
+
+
+def is_passing(error: Exception) -> bool:
+    """Whether the same call may succeed a few seconds later."""
+    if isinstance(error, TimeoutError | ConnectionError):
+        return True
+    return isinstance(error, OSError) and error.errno in _PASSING_ERRNOS
 
 
 @dataclass(frozen=True)
@@ -109,7 +130,11 @@ class BatchExecutor(Protocol):
         """Begin a task; never called for more than `capacity` at a time."""
 
     def wait(self, timeout_s: float) -> list[TaskOutcome]:
-        """Outcomes since the last call; waits for the first one up to `timeout_s`."""
+        """Outcomes since the last call; waits for the first one up to `timeout_s`.
+
+        Raises:
+            ExecutorEndedError: it cannot continue.
+        """
 
     def close(self, timeout_s: float) -> list[TaskOutcome]:
         """Let tasks in work finish for up to `timeout_s`, then end all processes.

@@ -29,11 +29,13 @@ from daemon.mission.exposure_batch import cause_of
 from daemon.postflight.batch.executor import (
     BatchTask,
     BatchWork,
+    ExecutorEndedError,
     LossKind,
     TaskDone,
     TaskFailed,
     TaskLost,
     TaskOutcome,
+    is_passing,
 )
 from daemon.products.processing_threads import configure_threads, thread_counts
 
@@ -41,11 +43,13 @@ OPEN_TIMEOUT_S: Final = 600.0
 """Kernels of a new version are compiled within this time."""
 RESTART_MAX: Final = 3
 """Starts in a row that end before the work is loaded; then the machine cannot do it."""
+REOPEN_DELAYS_S: Final = (1.0, 4.0, 16.0)
+"""Delays before the starts after the work could not be loaded, because of what passes."""
 
 _SPAWN = multiprocessing.get_context("spawn")
 
 
-class WorkerStartError(DaemonError):
+class WorkerStartError(ExecutorEndedError):
     """Worker processes cannot be started; the message states what to do."""
 
 
@@ -119,6 +123,9 @@ class LocalProcessExecutor:
         self._work = b""
         self._environment: dict[str, str] = {}
         self._failed_starts = 0
+        self._failed_opens = 0
+        self._next_start_s = 0.0
+        self._was_ready = False
         self._is_closing = False
 
     @property
@@ -175,6 +182,13 @@ class LocalProcessExecutor:
         )
 
     def _receive(self, timeout_s: float) -> None:
+        if len(self._workers) < self._count and self._next_start_s and not self._is_closing:
+            remaining_s = self._next_start_s - time.monotonic()
+            timeout_s = max(0.0, min(timeout_s, remaining_s))
+            if remaining_s <= 0:
+                self._next_start_s = 0.0
+                while len(self._workers) < self._count:
+                    self._start_worker()
         ends: dict[Any, _Worker] = {w.connection: w for w in self._workers}
         for ready in wait(list(ends), timeout_s):
             worker = ends[ready]
@@ -184,7 +198,8 @@ class LocalProcessExecutor:
                 self._replace(worker)
                 continue
             if isinstance(message, _Ready):
-                worker.is_ready, self._failed_starts = True, 0
+                worker.is_ready, self._was_ready = True, True
+                self._failed_starts = self._failed_opens = 0
             elif isinstance(message, _Compiled):
                 worker.end(5.0)
                 self._workers.remove(worker)
@@ -194,10 +209,41 @@ class LocalProcessExecutor:
                 worker.task = None
                 self._found.append(message)
             else:
-                raise message.error
+                self._take_open_failure(worker, message.error)
         for worker in self._workers:
             if not worker.is_ready and time.monotonic() - worker.begun_s > OPEN_TIMEOUT_S:
                 worker.process.kill()
+
+    def _take_open_failure(self, worker: _Worker, error: Exception) -> None:
+        """A process could not load the work: what passes is tried again later.
+
+        Raises:
+            Exception: the first process could not; the work cannot be done at all.
+            WorkerStartError: a later one could not, for good or too often.
+        """
+        if not self._was_ready:
+            raise error
+        worker.end(5.0)
+        self._workers.remove(worker)
+        if self._is_closing:
+            return
+        if not is_passing(error):
+            raise WorkerStartError(
+                f"a process that was started later cannot load the work: {cause_of(error)}. "
+                "Run the same command again; complete exposures are not computed again"
+            )
+        if self._next_start_s:
+            return  # another process failed by the same cause just now
+        is_alone = not any(w.is_ready for w in self._workers)
+        if self._failed_opens >= len(REOPEN_DELAYS_S) and is_alone:
+            raise WorkerStartError(
+                f"no process can load the work, after {self._failed_opens + 1} attempts: "
+                f"{cause_of(error)}. Run the same command again; complete exposures are not "
+                "computed again"
+            )
+        delay_s = REOPEN_DELAYS_S[min(self._failed_opens, len(REOPEN_DELAYS_S) - 1)]
+        self._failed_opens += 1
+        self._next_start_s = time.monotonic() + delay_s
 
     def _replace(self, worker: _Worker) -> None:
         worker.process.join(5.0)
@@ -206,7 +252,7 @@ class LocalProcessExecutor:
         self._workers.remove(worker)
         if worker.task is not None:
             self._found.append(TaskLost(worker.task.number, kind, cause))
-        if not worker.is_ready:
+        if not worker.is_ready and not self._is_closing:
             self._failed_starts += 1
             if self._failed_starts >= RESTART_MAX and not any(w.is_ready for w in self._workers):
                 raise WorkerStartError(
@@ -234,7 +280,7 @@ def worker_main(
         with compilations() as compiled:
             action = pickle.loads(pickled_work).open()
     except Exception as error:  # noqa: BLE001 - the command states it
-        connection.send(TaskFailed(0, _picklable(error)))
+        connection.send(TaskFailed(0, picklable(error)))
         return
     try:
         if compiled and not computes_compiled:
@@ -273,10 +319,10 @@ def outcome_of(action: Any, task: BatchTask) -> TaskOutcome:
     except MemoryError:
         return TaskLost(task.number, "out-of-memory", "the process could not allocate memory")
     except Exception as error:  # noqa: BLE001 - it is the outcome of this task
-        return TaskFailed(task.number, _picklable(error))
+        return TaskFailed(task.number, picklable(error))
 
 
-def _picklable(error: Exception) -> Exception:
+def picklable(error: Exception) -> Exception:
     """The error, or its message where pickling would lose or alter it."""
     try:
         again = pickle.loads(pickle.dumps(error))

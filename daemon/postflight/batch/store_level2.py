@@ -223,7 +223,9 @@ def _noted_sha256(files: Mapping[str, CopiedFile], path: Path) -> str:
 def _expected_s(store: ObjectStore, found: store_products.StoredProducts) -> float | None:
     """Mean duration of an exposure in earlier runs; None without any."""
     known = [one for one, _ in zip(found.committed(), range(DURATIONS_MAX), strict=False)]
-    records = store_products.answers(lambda one: store_products.stored_provenance(store, *one), known)
+    records = store_products.answers(
+        lambda one: store_products.stored_provenance(store, *one), known
+    )
     durations = [
         record["duration_s"]
         for record in records

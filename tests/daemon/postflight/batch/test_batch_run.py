@@ -8,10 +8,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from daemon.postflight.batch import batch_run
+from daemon.mission.transfer.object_store import ObjectStoreUnavailableError
+from daemon.postflight.batch import batch_run, local_processes
 from daemon.postflight.batch.batch_run import BatchOutcome, run_batch
 from daemon.postflight.batch.capacity import plan_processes
 from daemon.postflight.batch.executor import BatchExecutor, BatchTask
@@ -156,3 +158,64 @@ def test_a_process_that_compiled_kernels_computes_nothing(tmp_path: Path) -> Non
     assert executor.pids == (int((tmp_path / "opened").read_text().split()[-1]),)
     assert len((tmp_path / "opened").read_text().split()) == 3
     executor.close(5.0)
+
+
+@dataclass(frozen=True)
+class ReopenedWork(ToyWork):
+    """Opens as often as stated; then its store does not answer for so many times."""
+
+    opens: int = 1
+    refusals: int = 0
+    is_passing: bool = True
+
+    def open(self) -> ToyAction:
+        file = self.attempts / "opens"
+        with file.open("ab") as opens:
+            opens.write(b".")
+        if self.opens < file.stat().st_size <= self.opens + self.refusals:
+            raise ObjectStoreUnavailableError("no answer") if self.is_passing else ValueError("rig")
+        return super().open()
+
+
+def reopened(folder: Path, count: int, **work: Any) -> BatchOutcome:
+    tasks = [BatchTask(number, "killed 1" if number == 2 else "") for number in range(1, 6)]
+    return run_batch(LocalProcessExecutor(count), ReopenedWork(folder, **work), tasks)
+
+
+@pytest.fixture
+def reopens_soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(local_processes, "REOPEN_DELAYS_S", (0.1, 0.1, 0.1))
+
+
+@pytest.mark.trust
+def test_a_store_that_does_not_answer_a_replacement_process_does_not_end_the_run(
+    tmp_path: Path, reopens_soon: None
+) -> None:
+    outcome = reopened(tmp_path, 1, refusals=3)
+    assert sorted(outcome.results) == [1, 2, 3, 4, 5] and not outcome.failures
+    assert attempts_of(tmp_path, "opens") == 1 + 3 + 1
+
+
+@pytest.mark.trust
+@pytest.mark.parametrize(
+    ("refusals", "is_passing", "sentence"),
+    [(99, True, "after 4 attempts: no answer"), (99, False, "cannot load the work: ValueError")],
+)
+def test_work_that_no_later_process_can_load_leaves_results_and_failures(
+    tmp_path: Path, reopens_soon: None, refusals: int, is_passing: bool, sentence: str
+) -> None:
+    outcome = reopened(tmp_path, 1, refusals=refusals, is_passing=is_passing)
+    assert outcome.results == {1: 10}
+    found = causes(outcome)
+    assert sorted(found) == [2, 3, 4, 5] and outcome.counts.failed == 4
+    assert all(cause.startswith("not computed: ") and sentence in cause for cause in found.values())
+
+
+@pytest.mark.trust
+def test_a_process_that_cannot_load_the_work_leaves_it_to_the_others(
+    tmp_path: Path, reopens_soon: None
+) -> None:
+    tasks = [BatchTask(number, "slow") for number in range(1, 9)]
+    outcome = run_batch(LocalProcessExecutor(2), ReopenedWork(tmp_path, refusals=99), tasks)
+    assert len(outcome.results) == 8 and not outcome.failures
+    assert attempts_of(tmp_path, "opens") > 2

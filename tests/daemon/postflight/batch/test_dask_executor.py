@@ -16,6 +16,7 @@ import pytest
 from typer.testing import CliRunner
 
 from daemon.cli import app
+from daemon.mission.transfer.object_store import ObjectStoreUnavailableError
 from daemon.postflight.batch import dask_executor
 from daemon.postflight.batch.batch_run import LOSSES_MAX, run_batch
 from daemon.postflight.batch.cluster_address import (
@@ -23,8 +24,9 @@ from daemon.postflight.batch.cluster_address import (
     certificate_problem,
     cluster_address,
 )
-from daemon.postflight.batch.dask_executor import ClusterError, DaskExecutor, run_on_worker
-from daemon.postflight.batch.executor import BatchTask, TaskDone
+from daemon.postflight.batch.cluster_checks import ClusterError, check_versions, unsuitable_workers
+from daemon.postflight.batch.dask_executor import DaskExecutor, WorkRefused, run_on_worker
+from daemon.postflight.batch.executor import BatchTask, TaskDone, TaskFailed, TaskLost
 from tests.daemon.diverging_camera import ROOT
 from tests.daemon.postflight.batch.test_cluster import free_port
 from tests.daemon.postflight.batch.toy_work import ToyWork, attempts_of
@@ -146,17 +148,17 @@ def client_with(**packages: str) -> Any:
 
 
 def test_versions_that_do_not_match_are_refused_with_both() -> None:
-    dask_executor._check_versions(client_with())
+    check_versions(client_with())
     for name, version, text in (
         ("distributed", "9", "worker tcp://a has distributed 9, this command 2"),
         ("python", "3.12.1", "worker tcp://a has python 3.12.1, this command 3.11.7"),
     ):
         with pytest.raises(ClusterError, match=f"{text}. Install the same versions"):
-            dask_executor._check_versions(client_with(**{name: version}))
+            check_versions(client_with(**{name: version}))
     client = client_with()
     client.run_on_scheduler = lambda _function, _name: "0.0.1"
     with pytest.raises(ClusterError, match=r"the scheduler has syntopic 0.0.1"):
-        dask_executor._check_versions(client)
+        check_versions(client)
 
 
 def test_a_run_without_workers_ends_with_what_it_waited_for() -> None:
@@ -187,3 +189,110 @@ def test_processes_of_this_machine_do_not_go_with_a_cluster(tmp_path: Path) -> N
     done = CliRunner().invoke(app, command)
     assert done.exit_code != 0
     assert "Leave it out, and give it to: syntopic worker" in f"{done.output} {done.exception}"
+
+
+def joining_client(**about: Any) -> Any:
+    """A client whose cluster gets a second worker; `about` is that worker's description."""
+    own = {"dask": "1", "distributed": "2", "msgpack": "3", "cloudpickle": "4", "python": "3.11.7"}
+    packages = own | about.pop("packages", {})
+    workers = {
+        "tcp://good": {"nthreads": 1, "memory_limit": 10_000},
+        "tcp://late": {"nthreads": 1, "memory_limit": 10_000} | about,
+    }
+    return SimpleNamespace(
+        status="running",
+        nthreads=lambda: dict.fromkeys(workers, 1),
+        scheduler_info=lambda: {"workers": workers},
+        get_versions=lambda check: {
+            "client": {"packages": own},
+            "workers": {"tcp://good": {"packages": own}, "tcp://late": {"packages": packages}},
+        },
+    )
+
+
+@pytest.mark.parametrize(
+    ("about", "sentence"),
+    [
+        ({"memory_limit": 10}, "worker tcp://late declares 0.0 GB for 1 exposures at a time"),
+        ({"packages": {"dask": "9"}}, "worker tcp://late has dask 9, this command 1"),
+    ],
+)
+def test_a_worker_that_joins_later_and_does_not_suit_is_set_aside(
+    about: dict[str, Any], sentence: str
+) -> None:
+    sentences: list[str] = []
+    executor = DaskExecutor(LOCAL, announce=sentences.append)
+    executor._client = joining_client(**about)
+    executor._task_nbytes, executor._suitable = 1000, {"tcp://good": ""}
+    assert executor.capacity == dask_executor.QUEUED_FACTOR
+    assert executor._permitted() == ["tcp://good"]
+    (found,) = sentences
+    assert found.startswith(sentence) and found.endswith("It gets no exposures of this run.")
+    executor._count_threads()
+    assert len(sentences) == 1
+    suits = DaskExecutor(LOCAL, announce=sentences.append)
+    suits._client = joining_client()
+    suits._task_nbytes, suits._suitable = 1000, {"tcp://good": ""}
+    assert suits.capacity == 2 * dask_executor.QUEUED_FACTOR and suits._permitted() is None
+    assert len(sentences) == 1
+
+
+def test_a_worker_that_does_not_answer_is_checked_again() -> None:
+    client = joining_client()
+    assert unsuitable_workers(client, ["tcp://late", "tcp://gone"], 1) == {"tcp://late": ""}
+
+
+def refused_by(executor: DaskExecutor, error: Exception, worker: str) -> list[Any]:
+    future = SimpleNamespace(result=lambda timeout: WorkRefused(error, worker))
+    executor._futures[7] = cast(Any, future)
+    return executor._outcome(7, future)
+
+
+def test_a_later_worker_that_cannot_load_the_work_does_not_end_the_run() -> None:
+    sentences: list[str] = []
+    executor = DaskExecutor(LOCAL, announce=sentences.append)
+    executor._suitable = {"tcp://good": "", "tcp://late": ""}
+    passing = ObjectStoreUnavailableError("s3://survey: no answer")
+    assert refused_by(executor, passing, "tcp://late") == [TaskFailed(7, passing)]
+    assert executor._permitted() is None and not sentences
+    (lost,) = refused_by(executor, ValueError("numba 1 instead of 2"), "tcp://late")
+    assert isinstance(lost, TaskLost) and lost.kind == "scheduler"
+    assert executor._permitted() == ["tcp://good"]
+    assert "tcp://late cannot load the work: ValueError: numba 1 instead of 2" in sentences[0]
+    with pytest.raises(ClusterError, match="cannot load the work"):
+        refused_by(executor, ValueError("numba 1"), "")
+
+
+def test_exposures_whose_permitted_workers_left_are_submitted_again() -> None:
+    cancelled: list[Any] = []
+    client = joining_client(memory_limit=10)
+    client.cancel = cancelled.extend
+    executor = DaskExecutor(LOCAL)
+    executor._client, executor._task_nbytes = client, 1000
+    pending = cast(Any, SimpleNamespace(status="pending"))
+    executor._futures = {1: pending, 2: pending, 3: pending}
+    executor._restricted = {
+        1: frozenset({"tcp://gone"}), 2: frozenset({"tcp://good"}), 3: frozenset(),
+    }  # fmt: skip
+    executor._count_threads()
+    assert cancelled == [pending] and sorted(executor._futures) == [2, 3]
+    assert [one.number for one in executor._unsent] == [1]
+
+
+@pytest.mark.trust
+@pytest.mark.timeout(120)
+def test_exposures_go_only_to_workers_that_suit(encrypted: ClusterAddress, tmp_path: Path) -> None:
+    executor = DaskExecutor(encrypted)
+    executor.start(ToyWork(tmp_path))
+    try:
+        for name in list(executor._suitable)[1:]:
+            executor._set_aside(name, "for the test.")
+        assert executor.capacity == dask_executor.QUEUED_FACTOR
+        executor.submit(BatchTask(1))
+        assert executor.wait(30.0) == [TaskDone(1, 10)]
+        executor._set_aside(next(iter(executor._suitable)), "for the test.")
+        executor.submit(BatchTask(2))
+        (lost,) = executor.wait(5.0)
+        assert isinstance(lost, TaskLost) and lost.kind == "scheduler" and executor.capacity == 0
+    finally:
+        executor.close(1.0)

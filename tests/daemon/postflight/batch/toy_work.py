@@ -66,6 +66,6 @@ def _happen(what: str) -> None:
         time.sleep(0.5)
 
 
-def attempts_of(folder: Path, number: int) -> int:
+def attempts_of(folder: Path, number: int | str) -> int:
     """How often a task was begun."""
     return (folder / str(number)).stat().st_size
