@@ -93,10 +93,25 @@ def _print_refusal(error: Exception) -> NoReturn:
         refusal = missing_module(error)
     elif isinstance(error, OSError):
         refusal = _disk_refusal(error)
+    elif isinstance(error, ValueError):
+        refusal = _validation_refusal(error)
     if not isinstance(refusal, DaemonError | DriverError | ProcessingError):
         raise error
     console.print(str(refusal), style="red", markup=False)
     sys.exit(ExitStatus.PROBLEM)
+
+
+def _validation_refusal(error: ValueError) -> Exception:
+    """The sentences of values that a file's model refuses; another `ValueError` as it is."""
+    from pydantic import ValidationError
+
+    from daemon import DaemonError
+    from processing.rig.problem_sentences import findings_of, sentences
+
+    if not isinstance(error, ValidationError):
+        return error
+    found = sentences(findings_of(error), f"values of {error.title}")
+    return DaemonError("\n".join([*found, "Correct these values in the input and repeat."]))
 
 
 def _disk_refusal(error: OSError) -> Exception:

@@ -185,7 +185,8 @@ Programs: colmap (folder of a text model), opensfm (reconstruction.json and trac
 (cameras.xml), bundler (bundle.out), bal (problem file), bingo, patb and pix4d (folder with
 measurements, orientation and cameras.txt), inpho (project). Distortion is converted to the ten
 parameters by fit; above 0.02 px Brown's model is kept, or the measurements are corrected. Without
---position-sigma the project is a free network.
+--position-sigma the project is a free network; where files do not state that coordinates are in
+metres, it needs --metric.
 
 Examples: `syntopic import block sparse/0 --from colmap --out block`,
 `syntopic import block bundle.out --from bundler --out block --image-sigma 0.3`
@@ -206,6 +207,12 @@ def block(
         tuple[float, float, float] | None,
         typer.Option(help="Standard deviation of positions in m: x y z (default: free network)."),
     ] = None,
+    metric: Annotated[
+        bool,
+        typer.Option(
+            "--metric", help="Coordinates are in metres, although the files do not state it."
+        ),
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     from daemon.configuration.model import ConfigurationError
@@ -215,7 +222,14 @@ def block(
         raise ConfigurationError([f"--from is {program!r}; {', '.join(READERS)} are right"])
     if position_sigma is not None and not all(0.0 < sigma < 1e6 for sigma in position_sigma):
         raise ConfigurationError(["--position-sigma has three positive numbers, in metres"])
-    done = import_block(path, program, out, sigma_px=image_sigma, position_sigma_m=position_sigma)
+    done = import_block(
+        path,
+        program,
+        out,
+        sigma_px=image_sigma,
+        position_sigma_m=position_sigma,
+        is_metric=metric,
+    )
     block = done.block
     counts = {
         "images": len(block.images),

@@ -22,12 +22,14 @@ from daemon.postflight.adjustment.project import CheckPoints
 from daemon.postflight.adjustment.project_file import AdjustSection, CameraSection, ProjectFile
 from daemon.postflight.adjustment.project_writer import write_project
 from daemon.postflight.exchange.block import FIT_LIMIT_PX, Block, BlockCamera, BlockError
+from daemon.postflight.exchange.block_check import check_block, project_name
 from daemon.postflight.exchange.bundler import read_bal, read_bundler
 from daemon.postflight.exchange.colmap import read_colmap
+from daemon.postflight.exchange.inpho_reader import read_inpho
 from daemon.postflight.exchange.metashape_reader import read_metashape
 from daemon.postflight.exchange.opensfm import read_opensfm
-from daemon.postflight.exchange.orientation_reader import read_inpho, read_pix4d
 from daemon.postflight.exchange.photogrammetry_reader import read_bingo, read_patb
+from daemon.postflight.exchange.pix4d_reader import read_pix4d
 from daemon.postflight.exchange.reprojections import refuse_other_convention
 from processing.bundle.network import (
     INTERIOR,
@@ -84,6 +86,7 @@ def import_block(
     *,
     sigma_px: float = 0.5,
     position_sigma_m: tuple[float, float, float] | None = None,
+    is_metric: bool = False,
 ) -> ImportedBlock:
     """Write an adjustment project of another program's files.
 
@@ -93,19 +96,21 @@ def import_block(
         out: folder of the project; it must be new.
         sigma_px: standard deviation of image coordinates.
         position_sigma_m: of the projection centres as observations, x, y, z; None: free network.
+        is_metric: coordinates are in metres, although the files do not state it.
 
     Raises:
-        BlockError: files that cannot be read, a distortion that cannot be converted, measurements
-            of another convention, or standard deviations in metres for positions that are not in
-            metres.
+        BlockError: files that cannot be read, numbers that no camera, image or point has, a
+            distortion that cannot be converted, measurements of another convention, or standard
+            deviations in metres for positions that are not known to be in metres.
         ProjectError: `out` holds a project.
     """
     block = READERS[program](path)
-    if position_sigma_m is not None and not block.is_metric:
+    check_block(path, block)
+    if position_sigma_m is not None and not (block.is_metric or is_metric):
         raise BlockError(
-            f"{path}: its positions are not in metres ({'; '.join(block.notes)}), so that "
-            "--position-sigma in metres does not hold; leave it out, or georeference the block in "
-            "the other program"
+            f"{path}: its positions are not known to be in metres ({'; '.join(block.notes)}), so "
+            "that --position-sigma in metres does not hold; leave it out, georeference the block "
+            "in the other program, or state with --metric that its coordinates are in metres"
         )
     refuse_other_convention(path, block)
     pitches = [camera.pitch_mm or NOMINAL_PITCH_MM for camera in block.cameras]
@@ -273,7 +278,7 @@ def _network(
     sigma_px: float,
     position_sigma_m: tuple[float, float, float] | None,
 ) -> Network:
-    names = tuple(image.name.replace(" ", "_") for image in block.images)
+    names = tuple(project_name(image.name) for image in block.images)
     n, points = len(names), block.points
     cameras = []
     for camera, pitch, lens, model in zip(block.cameras, pitches, lenses, models, strict=True):

@@ -23,6 +23,7 @@ from daemon.postflight.exchange.block import (
     BlockImage,
     BlockPoints,
 )
+from daemon.postflight.exchange.block_check import is_rotation
 from processing.geometry.forward_distortion import ForwardDistortion
 from processing.geometry.rotation import rotations_from_vectors
 
@@ -31,6 +32,10 @@ Array = NDArray[np.float64]
 BUNDLE_MAX_BYTES = 2_000_000_000
 COUNT_MAX = 50_000_000
 _MARK = "# Bundle file v0.3"
+
+
+class _EndsEarlyError(BlockError):
+    """A number that is needed behind the last one of a file."""
 
 
 def read_bundler(path: Path) -> Block:
@@ -42,7 +47,7 @@ def read_bundler(path: Path) -> Block:
     text = _text(path)
     if not text.startswith(_MARK):
         raise BlockError(f"{path}: does not begin with {_MARK!r}; give a bundle.out of Bundler")
-    numbers = _numbers(path, text.split("\n", 1)[1])
+    numbers = _numbers(path, text.partition("\n")[2])
     images, points = _count(path, numbers), _count(path, numbers)
     cameras: list[tuple[float, float, float]] = []
     found: list[tuple[str, Array, Array]] = []
@@ -53,6 +58,11 @@ def read_bundler(path: Path) -> Block:
         shift = np.array([next(numbers) for _ in range(3)])
         if f > 0.0:
             index[k] = len(found)
+            if not is_rotation(rotation):
+                raise BlockError(
+                    f"{path}: image {k}: its matrix is no rotation (scaled, sheared or mirrored); "
+                    "export the bundle again"
+                )
             cameras.append((f, k1, k2))
             found.append((f"image{k:06d}", rotation, shift))
     xyz, seen = [], []
@@ -61,10 +71,16 @@ def read_bundler(path: Path) -> Block:
         for _ in range(3):
             next(numbers)
         for _ in range(_count(path, numbers)):
-            image, _, x, y = (next(numbers) for _ in range(4))
-            if int(image) not in index:
-                raise BlockError(f"{path}: point {p} is seen by image {int(image)}, which has no f")
-            seen.append((index[int(image)], p, x, y))
+            image = _index(path, f"point {p}: image", next(numbers), images)
+            next(numbers)
+            x, y = (next(numbers) for _ in range(2))
+            if image not in index:
+                raise BlockError(
+                    f"{path}: point {p} is seen by image {image}, which has no f; remove its "
+                    "measurements"
+                )
+            seen.append((index[image], p, x, y))
+    _refuse_rest(path, numbers)
     left_out = images - len(found)
     notes = (f"{left_out} images without a focal length are left out",) if left_out else ()
     return _block(path, cameras, found, xyz, seen, notes)
@@ -81,9 +97,14 @@ def read_bal(path: Path) -> Block:
     seen = []
     for _ in range(count):
         image, point, x, y = (next(numbers) for _ in range(4))
-        if not (0 <= image < images and 0 <= point < points):
-            raise BlockError(f"{path}: an observation of image {image:g} and point {point:g}")
-        seen.append((int(image), int(point), x, y))
+        seen.append(
+            (
+                _index(path, "an observation of image", image, images),
+                _index(path, "an observation of point", point, points),
+                x,
+                y,
+            )
+        )
     cameras, found = [], []
     for k in range(images):
         values = [next(numbers) for _ in range(9)]
@@ -91,6 +112,7 @@ def read_bal(path: Path) -> Block:
         cameras.append((values[6], values[7], values[8]))
         found.append((f"image{k:06d}", rotation, np.array(values[3:6])))
     xyz = [[next(numbers) for _ in range(3)] for _ in range(points)]
+    _refuse_rest(path, numbers)
     return _block(path, cameras, found, xyz, seen, ())
 
 
@@ -126,7 +148,12 @@ def _block(
     )
     return Block(
         path.stem, models, images, points=points,
-        notes=(*notes, "the file states no size of the images: that of the measurements is used"),
+        notes=(
+            *notes,
+            "the file states no size of the images: that of the measurements is used",
+            "the file states neither the frame nor the scale of its coordinates",
+        ),
+        is_metric=False,
     )  # fmt: skip
 
 
@@ -152,7 +179,28 @@ def _numbers(path: Path, text: str) -> Iterator[float]:
         if not np.isfinite(value):
             raise BlockError(f"{path}: {word!r} where a finite number is needed")
         yield value
-    raise BlockError(f"{path}: ends before its last number; copy it again")
+    raise _EndsEarlyError(f"{path}: ends before its last number; copy it again")
+
+
+def _index(path: Path, what: str, value: float, count: int) -> int:
+    if not (0 <= value < count and value == int(value)):
+        raise BlockError(
+            f"{path}: {what} {value:g}; whole numbers from 0 to {count - 1} are right: export the "
+            "file again"
+        )
+    return int(value)
+
+
+def _refuse_rest(path: Path, numbers: Iterator[float]) -> None:
+    """Refuse numbers behind the last one that the counts announce."""
+    try:
+        value = next(numbers)
+    except _EndsEarlyError:
+        return
+    raise BlockError(
+        f"{path}: {value:g} is behind the last number that its counts announce; the counts or the "
+        "numbers are wrong: export the file again"
+    )
 
 
 def _count(path: Path, numbers: Iterator[float]) -> int:

@@ -9,6 +9,7 @@ Source: COLMAP documentation, "Output Format" and "Rig Support"; its `src/colmap
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
@@ -37,6 +38,8 @@ FORMS: tuple[Form, ...] = ("pinhole", "opencv", "full_opencv")
 MODEL_MAX_BYTES = 2_000_000_000
 CENTRE_PX = 0.5
 """Coordinates of the first pixel's centre."""
+_QUATERNION_WITHIN = 1e-3
+"""Largest difference of a quaternion's length from 1."""
 
 _NAMES: Mapping[str, tuple[str, ...]] = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
@@ -215,10 +218,12 @@ def read_colmap(folder: Path) -> Block:
     Raises:
         BlockError: a file is missing or has a line that is not understood; it names the line.
     """
+    _refuse_binary(folder)
     cameras: dict[int, int] = {}
     found: list[BlockCamera] = []
     for place, words in _records(folder / "cameras.txt"):
         with _reading(place):
+            _refuse_repeated(place, "camera", int(words[0]), cameras)
             cameras[int(words[0])] = len(found)
             found.append(_camera(place, words))
     rows = list(_records(folder / "images.txt", keeps_empty=True))
@@ -235,9 +240,10 @@ def read_colmap(folder: Path) -> Block:
             number, camera = int(words[0]), int(words[8])
             if camera not in cameras:
                 raise BlockError(f"{place}: camera {camera} is not in cameras.txt")
-            pose = [float(v) for v in words[1:8]]
-            turn, shift = rotations_from_quaternions(pose[:4]), np.array(pose[4:])
-            frame, own = posed.get(number, (number, (turn, shift)))
+            if len(words) < 10:
+                raise BlockError(f"{place}: image {number} has no name; export the model again")
+            _refuse_repeated(place, "image", number, index)
+            frame, own = posed.get(number, (number, _pose_of(place, words[1:8])))
             rotation, centre = camera_pose(*own)
             index[number] = len(images)
             name = " ".join(words[9:])
@@ -245,12 +251,14 @@ def read_colmap(folder: Path) -> Block:
         with _reading(where):
             for x, y, point in zip(measured[::3], measured[1::3], measured[2::3], strict=True):
                 if int(point) >= 0:
-                    seen.append((index[number], int(point), float(x), float(y)))
+                    column, row = _finite(where, (x, y), 2)
+                    seen.append((index[number], int(point), column, row))
     if not images:
         raise BlockError(f"{folder}: images.txt names no image; there is nothing to import")
     return Block(
         folder.name, tuple(found), tuple(images), points=_points(folder, seen),
-        notes=("COLMAP's files do not state the frame of their coordinates",),
+        notes=("COLMAP's files state neither the frame nor the scale of their coordinates",),
+        is_metric=False,
     )  # fmt: skip
 
 
@@ -271,6 +279,46 @@ class _reading:  # noqa: N801
                 f"{self.place}: not a line of COLMAP's text format ({error}); export the model "
                 "with `colmap model_converter --output_type TXT`"
             ) from error
+
+
+def _refuse_binary(folder: Path) -> None:
+    """Refuse a folder with a binary model and no text model."""
+    binary = [path.name for path in sorted(folder.glob("*.bin"))] if folder.is_dir() else []
+    if binary and not (folder / "cameras.txt").exists():
+        raise BlockError(
+            f"{folder}: holds a binary model ({', '.join(binary[:5])}), and text is read; convert "
+            f"it with `colmap model_converter --input_path {folder} --output_path TEXT_FOLDER "
+            "--output_type TXT`"
+        )
+
+
+def _refuse_repeated(place: str, what: str, number: int, known: Mapping[int, int]) -> None:
+    if number in known:
+        raise BlockError(
+            f"{place}: {what} {number} is there twice; export the model again, or remove a line"
+        )
+
+
+def _finite(place: str, words: Sequence[str], count: int) -> list[float]:
+    values = [float(word) for word in words]
+    if len(values) != count or not all(map(math.isfinite, values)):
+        raise BlockError(
+            f"{place}: {' '.join(words)[:60]!r} where {count} finite numbers are needed; remove "
+            "the line, or export the model again"
+        )
+    return values
+
+
+def _pose_of(place: str, words: Sequence[str]) -> tuple[Array, Array]:
+    """Rotation (3, 3) and translation (3,) of QW, QX, QY, QZ, TX, TY, TZ."""
+    values = _finite(place, words, 7)
+    length = math.hypot(*values[:4])
+    if abs(length - 1.0) > _QUATERNION_WITHIN:
+        raise BlockError(
+            f"{place}: a quaternion of length {length:g}; a rotation has length 1: export the "
+            "model again"
+        )
+    return rotations_from_quaternions(values[:4]), np.array(values[4:])
 
 
 def _camera(place: str, words: Sequence[str]) -> BlockCamera:
@@ -301,16 +349,12 @@ def _frame_poses(folder: Path) -> dict[int, tuple[int, tuple[Array, Array]]]:
             while rest:
                 has_pose = int(rest[2])
                 if has_pose:
-                    pose = [float(v) for v in rest[3:10]]
-                    sensors[rig, int(rest[1])] = (
-                        rotations_from_quaternions(pose[:4]), np.array(pose[4:]),
-                    )  # fmt: skip
+                    sensors[rig, int(rest[1])] = _pose_of(place, rest[3:10])
                 rest = rest[10 if has_pose else 3 :]
     posed = {}
     for place, words in _records(folder / "frames.txt"):
         with _reading(place):
-            pose = [float(v) for v in words[2:9]]
-            turn, shift = rotations_from_quaternions(pose[:4]), np.array(pose[4:])
+            turn, shift = _pose_of(place, words[2:9])
             data = words[10:]
             if len(data) != 3 * int(words[9]):
                 raise BlockError(f"{place}: {words[9]} images are announced, others are listed")
@@ -332,8 +376,9 @@ def _points(folder: Path, seen: Sequence[tuple[int, int, float, float]]) -> Bloc
     xyz: list[list[float]] = []
     for place, words in _records(folder / "points3D.txt"):
         with _reading(place):
+            _refuse_repeated(place, "point", int(words[0]), at)
             at[int(words[0])] = len(xyz)
-            xyz.append([float(v) for v in words[1:4]])
+            xyz.append(_finite(place, words[1:4], 3))
     unknown = next((point for _, point, *_ in seen if point not in at), None)
     if unknown is not None:
         raise BlockError(

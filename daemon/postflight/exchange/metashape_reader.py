@@ -9,7 +9,7 @@ models"; files of its "Export Cameras" (document version 2.0.0).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -74,12 +74,14 @@ def read_metashape(path: Path) -> Block:
     try:
         return _block_of(path, chunks[0])
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise BlockError(f"{path}: not Metashape's camera file ({error!r})") from error
+        raise BlockError(
+            f"{path}: not Metashape's camera file ({error!r}); give the file of its Export Cameras"
+        ) from error
 
 
 def _block_of(path: Path, chunk: ET.Element) -> Block:
-    sensors = {sensor.attrib["id"]: sensor for sensor in chunk.iterfind("sensors/sensor")}
-    every = {camera.attrib["id"]: camera for camera in chunk.iterfind("cameras//camera")}
+    sensors = _by_id(path, "sensor", chunk.iterfind("sensors/sensor"))
+    every = _by_id(path, "camera", chunk.iterfind("cameras//camera"))
     for camera in every.values():
         if camera.attrib["sensor_id"] not in sensors:
             raise BlockError(
@@ -87,9 +89,14 @@ def _block_of(path: Path, chunk: ET.Element) -> Block:
                 f"{camera.attrib['sensor_id']}, which is not in the file"
             )
     numbers = {one: number for number, one in enumerate(every, 1)}
-    aligned = {one: found for one in every if (found := _posed(path, every, one)) is not None}
+    disabled = {one for one, camera in every.items() if camera.get("enabled") in ("false", "0")}
+    aligned = {
+        one: found
+        for one in every
+        if one not in disabled and (found := _posed(path, every, one)) is not None
+    }
     if not aligned:
-        raise BlockError(f"{path}: no camera has a transform; align the photos first")
+        raise BlockError(f"{path}: no enabled camera has a transform; align the photos first")
     transform = _transform_of(path, chunk, [every[one] for one in aligned])
     scale = transform.scale if transform is not None else 1.0
     index: dict[str, int] = {}
@@ -121,12 +128,28 @@ def _block_of(path: Path, chunk: ET.Element) -> Block:
                 np.asarray(turn @ VISION_FROM_CAMERA),
             )
         )
-    left_out = [camera.attrib["label"] for one, camera in every.items() if one not in aligned]
-    notes += [f"not aligned: {', '.join(left_out)}"] if left_out else []
+    for what, left_out in (
+        ("disabled and left out", [one for one in every if one in disabled]),
+        ("not aligned", [one for one in every if one not in aligned and one not in disabled]),
+    ):
+        names = ", ".join(every[one].attrib["label"] for one in left_out)
+        notes += [f"{what}: {names}"] if names else []
     if any(camera.find("rolling_shutter") is not None for camera in every.values()):
         notes.append("rolling shutter compensation of Metashape is not carried")
     name = chunk.get("label", path.stem)
     return _placed(path, chunk, Block(name, tuple(cameras), tuple(images)), transform, notes)
+
+
+def _by_id(path: Path, what: str, elements: Iterable[ET.Element]) -> dict[str, ET.Element]:
+    found: dict[str, ET.Element] = {}
+    for one in elements:
+        if one.attrib["id"] in found:
+            raise BlockError(
+                f"{path}: {what} {one.attrib['id']} ({one.get('label', '')}) is there twice; "
+                "export the cameras again"
+            )
+        found[one.attrib["id"]] = one
+    return found
 
 
 def _posed(path: Path, every: Mapping[str, ET.Element], one: str) -> tuple[Array, bool] | None:
@@ -139,8 +162,6 @@ def _posed(path: Path, every: Mapping[str, ET.Element], one: str) -> tuple[Array
                 f"{path}: camera {camera.attrib['label']} names master {master}, which is not in "
                 "the file"
             )
-        if camera.get("enabled", "true") in ("false", "0"):
-            return None
         camera, from_master = every[master], True
     text = camera.findtext("transform")
     if text is None:

@@ -42,7 +42,14 @@ from processing.geometry.rotation import (
 Array = NDArray[np.float64]
 
 RECONSTRUCTION_MAX_BYTES = 2_000_000_000
-_PROJECTIONS = ("brown", "perspective")
+_PROJECTIONS = {
+    "brown": ("focal_x", "focal_y", "c_x", "c_y", "k1", "k2", "k3", "p1", "p2"),
+    "perspective": ("focal", "k1", "k2"),
+}
+"""Camera models that are carried, and their parameters."""
+_DESCRIBING = ("projection_type", "width", "height")
+_AGAIN = "export the reconstruction again"
+NO_PLACE = "no reference_lla: the file states neither the place nor the scale of its coordinates"
 
 
 def opensfm_texts(
@@ -205,43 +212,66 @@ def read_opensfm(path: Path) -> Block:
         )
     try:
         return _block_of(file, content[0])
-    except (KeyError, TypeError, ValueError) as error:
-        raise BlockError(f"{file}: not OpenSfM's format ({error!r})") from error
+    except KeyError as error:
+        raise BlockError(f"{file}: not OpenSfM's format: it has no {error}; {_AGAIN}") from error
+    except (AttributeError, TypeError, ValueError) as error:
+        raise BlockError(f"{file}: not OpenSfM's format ({error}); {_AGAIN}") from error
 
 
-def _block_of(file: Path, content: Mapping[str, Any]) -> Block:
-    names = list(content["cameras"])
-    cameras = tuple(_camera(file, name, content["cameras"][name]) for name in names)
+def _block_of(file: Path, content: Any) -> Block:
+    content = _object(content, "the reconstruction")
+    described = _object(content["cameras"], "cameras")
+    names = list(described)
+    cameras = tuple(_camera(file, name, _object(described[name], name)) for name in names)
+    instances = _object(content.get("rig_instances", {}), "rig_instances")
     frames = {
         shot: k
-        for k, one in enumerate(content.get("rig_instances", {}).values(), 1)
-        for shot in one["rig_camera_ids"]
+        for k, (name, one) in enumerate(instances.items(), 1)
+        for shot in _object(
+            _object(one, f"rig instance {name}")["rig_camera_ids"], "rig_camera_ids"
+        )
     }
     images = []
-    for number, (name, shot) in enumerate(content["shots"].items(), 1):
+    for number, (name, one) in enumerate(_object(content["shots"], "shots").items(), 1):
+        shot = _object(one, f"shot {name}")
         if shot["camera"] not in names:
             raise BlockError(
-                f"{file}: shot {name} names camera {shot['camera']}, which is not there"
+                f"{file}: shot {name} names camera {shot['camera']}, which is not there; {_AGAIN}"
             )
         turn = rotations_from_vectors(np.array(_numbers(shot["rotation"])))
         rotation, centre = camera_pose(turn, np.array(_numbers(shot["translation"])))
         camera = names.index(shot["camera"])
         images.append(BlockImage(name, camera, frames.get(name, number), centre, rotation))
     if not images:
-        raise BlockError(f"{file}: the reconstruction has no shots")
-    frame, notes = None, []
-    if lla := content.get("reference_lla"):
-        if lla.get("altitude", 0.0) == 0.0:
-            frame = LocalFrame(lla["latitude"], lla["longitude"])
-        else:
-            notes.append(f"heights count from {lla['altitude']} m above the ellipsoid")
+        raise BlockError(f"{file}: the reconstruction has no shots; there is nothing to import")
+    is_placed = bool(content.get("reference_lla"))
+    frame, notes = _frame(file, content["reference_lla"]) if is_placed else (None, [NO_PLACE])
     tracks = file.parent / TRACKS_FILE
     points = BlockPoints()
     if tracks.exists():
-        points = read_tracks(tracks, content.get("points", {}), images, cameras)
+        found = _object(content.get("points", {}), "points")
+        points = read_tracks(tracks, found, images, cameras)
     else:
         notes.append(f"no {TRACKS_FILE} next to {file.name}, which has the image measurements")
-    return Block(file.parent.name, cameras, tuple(images), frame, points=points, notes=tuple(notes))
+    return Block(
+        file.parent.name, cameras, tuple(images), frame, points=points, notes=tuple(notes),
+        is_metric=is_placed,
+    )  # fmt: skip
+
+
+def _frame(file: Path, reference: Any) -> tuple[LocalFrame | None, list[str]]:
+    """The local frame about `reference_lla`, and a note where its heights are others."""
+    lla = _object(reference, "reference_lla")
+    latitude, longitude = (_number(lla, key) for key in ("latitude", "longitude"))
+    altitude = _number(lla, "altitude", 0.0)
+    if abs(latitude) > 90.0 or abs(longitude) > 180.0:
+        raise BlockError(
+            f"{file}: reference_lla has latitude {latitude:g} and longitude {longitude:g}; degrees "
+            "within 90 and 180 are right: correct it"
+        )
+    if altitude == 0.0:
+        return LocalFrame(latitude, longitude), []
+    return None, [f"heights count from {altitude} m above the ellipsoid"]
 
 
 def _camera(file: Path, name: str, content: Mapping[str, Any]) -> BlockCamera:
@@ -250,19 +280,55 @@ def _camera(file: Path, name: str, content: Mapping[str, Any]) -> BlockCamera:
         raise BlockError(
             f"{file}: camera {name} is of type {kind}; {' and '.join(_PROJECTIONS)} are carried"
         )
-    width, height = int(content["width"]), int(content["height"])
+    carried = _PROJECTIONS[kind]
+    strange = [
+        key
+        for key, value in content.items()
+        if key not in (*carried, *_DESCRIBING) and not (isinstance(value, str) or value == 0)
+    ]
+    if strange:
+        raise BlockError(
+            f"{file}: camera {name} of type {kind} has {', '.join(strange)}; {', '.join(carried)} "
+            "are carried: reconstruct without these parameters"
+        )
+    width, height = (_number(content, key) for key in ("width", "height"))
+    if (width, height) != (int(width), int(height)):
+        raise BlockError(
+            f"{file}: camera {name} has {width:g} x {height:g} px; whole numbers are right: "
+            "correct its size"
+        )
     size = max(width, height)
-    fx = content["focal_x"] if kind == "brown" else content["focal"]
-    fy = content["focal_y"] if kind == "brown" else content["focal"]
-    terms = {key: float(content.get(key, 0.0)) for key in ("k1", "k2", "k3", "p1", "p2")}
+    fx = _number(content, "focal_x" if kind == "brown" else "focal")
+    fy = _number(content, "focal_y" if kind == "brown" else "focal")
+    terms = {key: _number(content, key, 0.0) for key in ("k1", "k2", "k3", "p1", "p2")}
     model = ForwardDistortion(
         fx * size,
         fy * size,
-        content.get("c_x", 0.0) * size + (width - 1) / 2.0,
-        content.get("c_y", 0.0) * size + (height - 1) / 2.0,
+        _number(content, "c_x", 0.0) * size + (width - 1) / 2.0,
+        _number(content, "c_y", 0.0) * size + (height - 1) / 2.0,
         **terms,
     )
-    return BlockCamera(name, width, height, model)
+    return BlockCamera(name, int(width), int(height), model)
+
+
+def _object(value: Any, what: str) -> Mapping[str, Any]:
+    if not isinstance(value, dict):
+        kind = "a list" if isinstance(value, list) else repr(value)[:40]
+        raise ValueError(f"{what} is {kind}, and an object is right")
+    return value
+
+
+def _number(content: Mapping[str, Any], key: str, default: float | None = None) -> float:
+    """A finite number by its key.
+
+    Raises:
+        KeyError: it is not there and has no default.
+        ValueError: something else is there.
+    """
+    value = content[key] if default is None else content.get(key, default)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise ValueError(f"{key} is {value!r}, and a finite number is right")
+    return float(value)
 
 
 def _numbers(values: Sequence[Any]) -> list[float]:

@@ -11,7 +11,6 @@ Geomatics documents it; PATB image coordinates, photo and focal length, then poi
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePath
@@ -21,27 +20,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.postflight.exchange.block import (
-    VISION_FROM_CAMERA,
     Block,
     BlockCamera,
     BlockError,
     BlockImage,
-    BlockPoints,
 )
+from daemon.postflight.exchange.intersected_points import Measured, intersected
 from daemon.postflight.exchange.photogrammetry import ANGLES, CAMERAS_FILE, UNITS, Unit
 from daemon.postflight.exchange.text_lines import lines_of, numbers_of, only_file
 from processing.geometry.forward_distortion import (
     ForwardDistortion,
-    measured_px_from_rays,
-    rays_from_measured_px,
 )
 from processing.geometry.rotation import rotation_from_angles
 
 Array = NDArray[np.float64]
 
-MISFIT_SHARE: Final = 0.01
-"""Median misfit of the intersected points above which orientations and measurements disagree, as
-a share of the longer side."""
+_OTHER_TRIED_PX: Final = 1.0
+"""Median misfit above which other orders and units of the angles are tried."""
+_OTHER_BETTER: Final = 0.5
+"""Share of it below which another order or unit is the right one."""
 _FOCAL_WITHIN: Final = 1e-3
 _END: Final = "-99"
 _ORTHOGONAL_TO: Final = 1e-5
@@ -57,23 +54,6 @@ class Oriented:
     rotation: Array
 
 
-@dataclass(frozen=True)
-class Measured:
-    """One image: what names its camera (a name, or a focal length), and its points in mm."""
-
-    camera: str
-    points: Mapping[str, tuple[float, float]]
-
-
-@dataclass(frozen=True)
-class _Ray:
-    """One measurement: its image, its pixel, and x / z, y / z of its ray, y down."""
-
-    image: int
-    px: Array
-    xy: Array
-
-
 def read_bingo(folder: Path) -> Block:
     """Read `*bingo*.txt` or `*.dat` with measurements, the orientation, and `cameras.txt`.
 
@@ -84,12 +64,44 @@ def read_bingo(folder: Path) -> Block:
     """
     cameras = cameras_of(folder)
     order, unit, system = _stated(folder)
-    oriented = named_orientations(
-        only_file(folder, ("orientation.bingo",), "that of `export block`"), order, unit
-    )
+    path = only_file(folder, ("orientation.bingo",), "that of `export block`")
     measurements = only_file(folder, BINGO_PATTERNS, "<name>_bingo.txt")
     measured = bingo_measurements(measurements, cameras)
-    return measured_block(folder, cameras, oriented, measured, system, {})
+    oriented = named_orientations(path, order, unit)
+    block, median_px = _measured_block(folder, cameras, oriented, measured, system, {})
+    if median_px > _OTHER_TRIED_PX:
+        _refuse_other_angles(folder, path, (order, unit, median_px), cameras, measured)
+    return block
+
+
+def _refuse_other_angles(
+    folder: Path,
+    path: Path,
+    stated: tuple[str, Unit, float],
+    cameras: Mapping[str, BlockCamera],
+    measured: Mapping[str, Measured],
+) -> None:
+    """Refuse a stated order and unit with which the rays meet worse than with others.
+
+    The rays of images that look down with small angles meet within pixels with a wrong unit, too.
+    """
+    order, unit, median_px = stated
+    (other_unit,) = (one for one in UNITS if one != unit)
+    (other_order,) = (one for one in _ORDERS.values() if one != order)
+    tried = ((order, other_unit), (other_order, unit), (other_order, other_unit))
+    called = {axes: name for name, axes in _ORDERS.items()}
+    for axes, in_unit in tried:
+        oriented = named_orientations(path, axes, in_unit)
+        try:
+            _, other_px = _measured_block(folder, cameras, oriented, measured, "", {})
+        except BlockError:
+            continue
+        if other_px < _OTHER_BETTER * median_px:
+            raise BlockError(
+                f"{folder / 'angles.txt'}: with {called[order]} in {unit} the rays miss each other "
+                f"by {median_px:.2f} px (median), with {called[axes]} in {in_unit} by "
+                f"{other_px:.2f} px; state order and unit of {path.name} as they are"
+            )
 
 
 def read_patb(folder: Path) -> Block:
@@ -336,6 +348,18 @@ def measured_block(
     system: str,
     names: Mapping[str, str],
 ) -> Block:
+    """A block of oriented images with their measurements, and points intersected from them."""
+    return _measured_block(folder, cameras, oriented, measured, system, names)[0]
+
+
+def _measured_block(
+    folder: Path,
+    cameras: Mapping[str, BlockCamera],
+    oriented: Mapping[str, Oriented],
+    measured: Mapping[str, Measured],
+    system: str,
+    names: Mapping[str, str],
+) -> tuple[Block, float]:
     oriented = _by_names_of(measured, oriented)
     without = sorted(set(measured) - set(oriented))
     if without:
@@ -360,14 +384,14 @@ def measured_block(
     )
     if not images:
         raise BlockError(f"{folder}: no image has measurements")
-    points, median_px = _intersected(folder, tuple(cameras.values()), images, measured)
+    points, median_px = intersected(folder, tuple(cameras.values()), images, measured)
     notes.append(
         f"points are intersected from the orientations, which they fit with a median of "
         f"{median_px:.2f} px"
     )
-    return Block(
-        folder.resolve().name, tuple(cameras.values()), images, points=points, notes=tuple(notes)
-    )
+    name = folder.resolve().name
+    block = Block(name, tuple(cameras.values()), images, points=points, notes=tuple(notes))
+    return block, median_px
 
 
 def _by_names_of(
@@ -378,94 +402,3 @@ def _by_names_of(
         return oriented
     by_stem = {PurePath(name).stem: one for name, one in oriented.items()}
     return by_stem if len(by_stem) == len(oriented) else oriented
-
-
-def _intersected(
-    folder: Path,
-    cameras: Sequence[BlockCamera],
-    images: Sequence[BlockImage],
-    measured: Mapping[str, Measured],
-) -> tuple[BlockPoints, float]:
-    """Points seen in two images or more, from the rays of all, and the median misfit in px.
-
-    Raises:
-        BlockError: rays that do not meet, or meet behind the cameras.
-    """
-    seen: dict[str, list[_Ray]] = {}
-    for k, one in enumerate(measured.values()):
-        camera = cameras[images[k].camera]
-        pitch = camera.pitch_mm or 1.0
-        middle = np.array([(camera.width_px - 1) / 2.0, (camera.height_px - 1) / 2.0])
-        xy_mm = np.array(list(one.points.values())).reshape(-1, 2)
-        pixels = middle + xy_mm * [1.0, -1.0] / pitch
-        directions = rays_from_measured_px(camera.model, pixels)
-        is_outside = (np.abs(pixels - middle) > middle + 1.0).any(axis=1)
-        for row, point in enumerate(one.points):
-            if is_outside[row] or not np.isfinite(directions[row]).all():
-                raise BlockError(
-                    f"{folder}: point {point} of image {images[k].name} lies outside of the image "
-                    f"({xy_mm[row, 0]:g}, {xy_mm[row, 1]:g} mm); are coordinates in mm, and "
-                    f"{CAMERAS_FILE} right?"
-                )
-            seen.setdefault(point, []).append(_Ray(k, pixels[row], directions[row]))
-    names: list[str] = []
-    xyz: list[Array] = []
-    image: list[int] = []
-    of: list[int] = []
-    px: list[Array] = []
-    misfits: list[float] = []
-    behind = 0
-    for point, rays in seen.items():
-        if len(rays) < 2:
-            continue
-        place, misfit_px, in_front = _meeting(cameras, images, rays)
-        behind += not in_front
-        misfits += misfit_px
-        image += [ray.image for ray in rays]
-        of += [len(names)] * len(rays)
-        px += [ray.px for ray in rays]
-        names.append(point)
-        xyz.append(place)
-    if not names:
-        raise BlockError(f"{folder}: no point is measured in two images; there is no block")
-    median_px = float(np.median(misfits))
-    limit_px = MISFIT_SHARE * max(max(c.width_px, c.height_px) for c in cameras)
-    if not median_px < limit_px or 2 * behind > len(names):
-        raise BlockError(
-            f"{folder}: the rays miss each other by {median_px:.0f} px (median), and {behind} of "
-            f"{len(names)} points lie behind the cameras. Order or unit of the angles, the "
-            "direction of y (up), or the coordinate system of the orientation is another one"
-        )
-    return BlockPoints(
-        np.array(xyz),
-        tuple(names),
-        np.array(image, dtype=np.int64),
-        np.array(of, dtype=np.int64),
-        np.array(px),
-    ), median_px
-
-
-def _meeting(
-    cameras: Sequence[BlockCamera], images: Sequence[BlockImage], rays: Sequence[_Ray]
-) -> tuple[Array, list[float], bool]:
-    """Where rays meet best, how far in px each measurement is from it, and whether in front."""
-    normal, right = np.zeros((3, 3)), np.zeros(3)
-    for ray in rays:
-        image = images[ray.image]
-        along = image.rotation @ VISION_FROM_CAMERA @ np.append(ray.xy, 1.0)
-        along /= np.linalg.norm(along)
-        across = np.eye(3) - np.outer(along, along)
-        normal += across
-        right += across @ image.centre_m
-    try:
-        place = np.linalg.solve(normal, right)
-    except np.linalg.LinAlgError:
-        return images[rays[0].image].centre_m, [math.inf], False
-    misfits, in_front = [], True
-    for ray in rays:
-        image = images[ray.image]
-        x, y, z = VISION_FROM_CAMERA @ image.rotation.T @ (place - image.centre_m)
-        in_front = in_front and z > 0.0
-        back = measured_px_from_rays(cameras[image.camera].model, np.array([[x / z, y / z]]))
-        misfits.append(float(np.linalg.norm(back[0] - ray.px)))
-    return np.asarray(place), misfits, bool(in_front)

@@ -11,6 +11,7 @@ import pytest
 import processing.rig
 from daemon import DaemonError, cli
 from daemon.cli.exit_status import ExitStatus
+from daemon.postflight.adjustment.project_file import CameraSection
 from drivers.contract import DeviceError
 from processing.bundle.image_rows import BehindCameraError
 from processing.geometry.image_proposal import ProposalError
@@ -64,6 +65,20 @@ def test_errors_of_every_package_end_in_their_status(
     assert status_of(monkeypatch) == status
     printed = capsys.readouterr().err
     assert str(error).strip() in printed and "Traceback" not in printed
+
+
+def test_values_that_a_model_refuses_are_sentences(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def app() -> None:
+        CameraSection(name="c", f_mm=-900.0)
+
+    monkeypatch.setattr(cli, "app", app)
+    assert status_of(monkeypatch) == ExitStatus.PROBLEM
+    printed = capsys.readouterr().err
+    assert "CameraSection" in printed and "f_mm" in printed and "-900" in printed
+    assert "Correct these values" in printed
+    assert "pydantic" not in printed and "Traceback" not in printed
 
 
 def test_a_defect_of_the_program_is_no_refusal(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -172,7 +172,7 @@ def test_an_imported_block_adjusts_to_the_truth(scene, tmp_path, program, write)
     done = RUN.invoke(
         app,
         ["import", "block", str(path), "--from", program, "--out", str(tmp_path / "project"),
-         "--image-sigma", "0.3", "--position-sigma", "0.05", "0.05", "0.05", "--json"],
+         "--image-sigma", "0.3", "--position-sigma", "0.05", "0.05", "0.05", "--metric", "--json"],
     )  # fmt: skip
     assert done.exit_code == 0, done.output + str(done.exception)
     content = json.loads(done.stdout)
@@ -189,7 +189,7 @@ def imported_and_adjusted(path: Path, out: Path) -> tuple[dict, dict]:
     done = RUN.invoke(
         app,
         ["import", "block", str(path), "--from", "colmap", "--out", str(out), "--image-sigma",
-         "0.3", "--position-sigma", "0.05", "0.05", "0.05", "--json"],
+         "0.3", "--position-sigma", "0.05", "0.05", "0.05", "--metric", "--json"],
     )  # fmt: skip
     assert done.exit_code == 0, done.output + str(done.exception)
     adjusted = RUN.invoke(app, ["adjust", str(out), "--json"])

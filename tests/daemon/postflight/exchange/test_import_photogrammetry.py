@@ -13,8 +13,9 @@ from typer.testing import CliRunner
 from daemon.cli import app
 from daemon.postflight.adjustment.project import read_project
 from daemon.postflight.exchange.block import BlockError
-from daemon.postflight.exchange.orientation_reader import read_inpho, read_pix4d
+from daemon.postflight.exchange.inpho_reader import read_inpho
 from daemon.postflight.exchange.photogrammetry_reader import read_bingo, read_patb
+from daemon.postflight.exchange.pix4d_reader import read_pix4d
 from tests.daemon.postflight.exchange.flown_block import fly
 from tests.daemon.postflight.exchange.test_colmap import SECONDS, export
 from tests.daemon.postflight.exchange.test_import_block import SIZE, F, block_scene
@@ -322,7 +323,8 @@ def grouped(text: str) -> list[list[str]]:
         ("  $ORI_STAT", "  $PHOTO_POINTS :\n  $ORI_STAT", "measurements are not carried"),
         ("$PROJECT 5.0.0", "$POINTS\n$END\n$PROJECT 5.0.0", "section .POINTS is not carried"),
         ("$CAMERA_ID : nadir", "$CAMERA_ID : other", "camera 'other' is not in the file"),
-        ("$EXT_ORI :", "$EXT_ORI_OLD :", "has no .EXT_ORI"),
+        ("$EXT_ORI :", "$ORI_STAT :", "line 12: .ORI_STAT is there twice"),
+        ("$EXT_ORI :", "$EXT_ORI_OLD :", ".EXT_ORI_OLD of .PHOTO is not carried"),
         ("$TYPE : nadir", "$TYPE : nadir\n  $CCD_ROWS : many", "is not understood|CenterTopLeft"),
     ],
 )

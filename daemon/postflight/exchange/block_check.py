@@ -1,0 +1,121 @@
+"""What holds for every imported block, whatever format it came from.
+
+Cameras have a size and a finite principal distance, images have names of their own and a proper
+rotation, and coordinates are finite.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from daemon.postflight.exchange.block import Block, BlockCamera, BlockError
+
+ORTHOGONAL_TO: Final = 1e-4
+"""Largest element of R R' - I with which a matrix of a file is a rotation."""
+_NAMED: Final = 3
+_TERMS: Final = ("skew_px", "k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "radial_r8")
+
+
+def check_block(path: Path, block: Block) -> None:
+    """Refuse a block whose numbers cannot be those of cameras, images and points.
+
+    Args:
+        path: of the files, for the message.
+        block: as read.
+
+    Raises:
+        BlockError: the first finding, with the camera, image or point.
+    """
+    for camera in block.cameras:
+        _check_camera(path, camera)
+    _refuse_repeated(path, "camera", [camera.name for camera in block.cameras])
+    for image in block.images:
+        where = f"{path}: image {image.name}"
+        if not image.name.strip():
+            raise BlockError(f"{path}: an image has no name; give each image a name")
+        if not np.isfinite(image.centre_m).all():
+            raise BlockError(
+                f"{where}: its position is not finite; remove the image, or orient it again"
+            )
+        if not is_rotation(image.rotation):
+            raise BlockError(
+                f"{where}: its matrix is no rotation (scaled, sheared or mirrored); export the "
+                "orientations again"
+            )
+    _refuse_repeated(path, "image", [project_name(image.name) for image in block.images])
+    finite = np.isfinite(block.points.xyz_m).all(axis=1)
+    if not finite.all():
+        number = int(np.flatnonzero(~finite)[0])
+        raise BlockError(
+            f"{path}: point {block.points.names[number]}: its coordinates are not finite; remove "
+            "the point and its measurements"
+        )
+    measured = np.isfinite(block.points.px).all(axis=1)
+    if not measured.all():
+        number = int(np.flatnonzero(~measured)[0])
+        image = block.images[int(block.points.image[number])]
+        point = block.points.names[int(block.points.point[number])]
+        raise BlockError(
+            f"{path}: image {image.name}: its measurement of point {point} is not finite; remove it"
+        )
+
+
+def project_name(name: str) -> str:
+    """Name of an image in the project: its tables have no spaces in names."""
+    return name.replace(" ", "_")
+
+
+def is_rotation(matrix: np.ndarray, to: float = ORTHOGONAL_TO) -> bool:
+    """Whether a matrix (3, 3) is orthogonal to `to` and not mirrored."""
+    if not np.isfinite(matrix).all():
+        return False
+    off = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
+    return off <= to and float(np.linalg.det(matrix)) > 0.0
+
+
+def _check_camera(path: Path, camera: BlockCamera) -> None:
+    model, where = camera.model, f"{path}: camera {camera.name}"
+    if min(camera.width_px, camera.height_px) <= 0:
+        raise BlockError(
+            f"{where}: its size is {camera.width_px} x {camera.height_px} px; state columns and "
+            "rows of its images"
+        )
+    for value in (model.fx_px, model.fy_px):
+        if not (math.isfinite(value) and value > 0.0):
+            raise BlockError(
+                f"{where}: its principal distance is {value:g} px; it is finite and positive: "
+                "correct it, or remove the camera and its images"
+            )
+    if not (math.isfinite(model.cx_px) and math.isfinite(model.cy_px)):
+        raise BlockError(
+            f"{where}: its principal point is {model.cx_px:g}, {model.cy_px:g} px; it is finite: "
+            "correct it"
+        )
+    wrong = [name for name in _TERMS if not math.isfinite(getattr(model, name))]
+    if wrong:
+        raise BlockError(f"{where}: its {', '.join(wrong)} are not finite; correct them")
+    if camera.pitch_mm is not None and not (math.isfinite(camera.pitch_mm) and camera.pitch_mm > 0):
+        raise BlockError(
+            f"{where}: its pixel size is {camera.pitch_mm:g} mm; it is finite and positive: "
+            "correct it"
+        )
+
+
+def _refuse_repeated(path: Path, what: str, names: Iterable[str]) -> None:
+    seen: set[str] = set()
+    repeated: list[str] = []
+    for name in names:
+        if name in seen and name not in repeated:
+            repeated.append(name)
+        seen.add(name)
+    if repeated:
+        listed = ", ".join(repeated[:_NAMED]) + (", ..." if len(repeated) > _NAMED else "")
+        raise BlockError(
+            f"{path}: {what} {listed} is there more than once (spaces count as underscores); give "
+            "each its own name, or export it once"
+        )
