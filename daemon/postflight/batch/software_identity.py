@@ -6,7 +6,7 @@ import functools
 import hashlib
 import platform
 from collections.abc import Mapping, Sequence
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import ModuleType
 from typing import Final
@@ -15,16 +15,49 @@ import daemon
 import drivers
 import processing
 
-LIBRARIES: Final = ("llvmlite", "numba", "numpy", "opencv-python-headless", "pyproj", "scipy")
-"""Distributions whose code computes pixels, figures or coordinates of products."""
+LIBRARIES: Final = (
+    "llvmlite",
+    "numba",
+    "numpy",
+    "opencv-python-headless",
+    "pyproj",
+    "rasterio",
+    "scipy",
+    "tifffile",
+)
+"""Distributions whose code computes pixels, figures or coordinates, or reads and writes files.
+
+`rasterio`, which reads height models, may be missing.
+"""
 
 _SOURCES: Final = (".py", ".toml")
-_RELATED: Final = {
-    daemon: ("configuration", "mission", "orientation", "planning", "products"),
-    drivers: ("timescales",),
+RELATED: Final = {
+    daemon: (
+        "__init__.py",
+        "configuration",
+        "mission",
+        "orientation",
+        "planning",
+        "postflight/__init__.py",
+        "postflight/batch/__init__.py",
+        "postflight/batch/level2_work.py",
+        "postflight/batch/product_key.py",
+        "postflight/batch/software_identity.py",
+        "postflight/batch/store_level2.py",
+        "products",
+    ),
+    drivers: (
+        "__init__.py",
+        "base/__init__.py",
+        "base/extras.py",
+        "cameras/__init__.py",
+        "cameras/tiff_layout.py",
+        "contract.py",
+        "timescales",
+    ),
     processing: ("",),
 }
-"""Packages that products depend on."""
+"""Folders and files that decide the bytes of products, by package."""
 
 
 @functools.cache
@@ -35,24 +68,32 @@ def software_identity() -> dict[str, str]:
     features = ",".join(sorted(name for name, on in binding.get_host_cpu_features().items() if on))
     return {
         "software": version("syntopic"),
-        "code_sha256": code_sha256(_RELATED),
+        "code_sha256": code_sha256(RELATED),
         "python": platform.python_version(),
         "cpu": f"{binding.get_host_cpu_name()}-{hashlib.sha256(features.encode()).hexdigest()[:8]}",
-        **{name: version(name) for name in LIBRARIES},
+        **{name: _version(name) for name in LIBRARIES},
     }
+
+
+def _version(name: str) -> str:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return "none"
 
 
 def code_sha256(related: Mapping[ModuleType, Sequence[str]]) -> str:
     """SHA-256 over names and contents of source files.
 
     Args:
-        related: folders of each package.
+        related: folders and files of each package.
     """
     digest = hashlib.sha256()
     for package, folders in related.items():
         root = Path(str(package.__file__)).parent
         for folder in folders:
-            for path in sorted((root / folder).rglob("*")):
+            place = root / folder
+            for path in sorted(place.rglob("*")) if place.is_dir() else (place,):
                 if path.suffix in _SOURCES:
                     digest.update(f"{root.name}/{path.relative_to(root)}\0".encode())
                     digest.update(path.read_bytes())
