@@ -11,6 +11,7 @@ import typer
 
 from daemon.cli.exit_status import status_of
 from daemon.cli.options import AsJson
+from daemon.cli.transfer import folder_of
 from daemon.terminal.console import Console, light_table
 from drivers.base.extras import require
 
@@ -29,9 +30,10 @@ Examples: `syntopic catalog build season missions/ s3://survey/2026`,
 
 BUILD_HELP = """Read the records of missions and write the catalog again.
 
-A place is a mission, a folder of missions, or one of these in an object store. Without a place, the
-places of the catalog are read again. A mission that cannot be read is listed at the end; the others
-are in the catalog. Footprints are those of the navigation in flight.
+A place is a mission, a folder of missions, or one of these in an object store. It is added to the
+places of the catalog, which are all read again; with --replace it takes their place. A mission that
+cannot be read is listed at the end; the others are in the catalog. Footprints are those of the
+navigation in flight.
 
 Examples: `syntopic catalog build season missions/`, `syntopic catalog build season`
 """
@@ -57,12 +59,17 @@ def build(
     places: Annotated[
         list[str] | None, typer.Argument(help="Missions, folders of missions, or stores.")
     ] = None,
+    replace: Annotated[
+        bool, typer.Option("--replace", help="Forget the earlier places of the catalog.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     require("catalog")
+    from daemon.mission.transfer.object_store import is_store_url
     from daemon.postflight.mission_catalog.catalog_build import build_catalog
 
-    done = build_catalog(folder, places or [])
+    found = [p if is_store_url(p) else str(folder_of(p)) for p in places or []]
+    done = build_catalog(folder, found, replaces_places=replace)
     if as_json:
         content = {
             "folder": str(folder),
@@ -85,7 +92,9 @@ def query(
     polygon: Annotated[Path | None, typer.Option(help="GeoJSON with polygons, WGS 84.")] = None,
     bbox: Annotated[
         tuple[float, float, float, float] | None,
-        typer.Option(help="West, south, east, north in degrees."),
+        typer.Option(
+            help="West, south, east, north in degrees; west > east crosses the antimeridian."
+        ),
     ] = None,
     since: Annotated[str | None, typer.Option(help="First time, ISO 8601, UTC.")] = None,
     until: Annotated[str | None, typer.Option(help="Last time, ISO 8601, UTC.")] = None,

@@ -24,12 +24,15 @@ class CatalogBuild:
     failures: tuple[str, ...]
 
 
-def build_catalog(folder: Path, places: Sequence[str]) -> CatalogBuild:
-    """Read every place and write the catalog.
+def build_catalog(
+    folder: Path, places: Sequence[str], *, replaces_places: bool = False
+) -> CatalogBuild:
+    """Read the places of a catalog and further ones, and write it.
 
     Args:
         folder: of the catalog; replaced as a whole. It must be empty, new, or a catalog.
-        places: missions, folders of missions, stores; none reads those of the catalog again.
+        places: missions, folders of missions, stores, added to those of the catalog.
+        replaces_places: they take the place of those of the catalog.
 
     Raises:
         SourceError: no place, the folder holds something else, or no mission could be read.
@@ -38,7 +41,10 @@ def build_catalog(folder: Path, places: Sequence[str]) -> CatalogBuild:
     known = read_sources(folder)
     if folder.exists() and not known and (not folder.is_dir() or any(folder.iterdir())):
         raise SourceError(f"{folder}: is not empty and no catalog; choose another folder")
-    sources = [p if is_store_url(p) else str(Path(p).resolve()) for p in places] or known
+    given = [p.rstrip("/") if is_store_url(p) else str(Path(p).resolve()) for p in places]
+    if replaces_places and not given:
+        raise SourceError("--replace needs the places that the catalog is to have")
+    sources = list(dict.fromkeys(given if replaces_places else [*known, *given]))
     if not sources:
         raise SourceError("no place is given; name a folder of missions or a store")
     if any(is_store_url(source) for source in sources):

@@ -15,6 +15,7 @@ from daemon.mission.store.durable import sync_file
 from daemon.mission.store.publication import published
 from daemon.orientation.footprints import polygon
 from daemon.orientation.stac_items import STAC_VERSION, VIEW, bbox_of
+from daemon.postflight.mission_catalog.catalog_areas import footprint_geometry
 from daemon.postflight.mission_catalog.exposure_rows import COLUMNS, MissionRows, rings_of
 
 TABLE = "exposures.parquet"
@@ -38,10 +39,9 @@ def write_catalog(folder: Path, missions: Sequence[MissionRows], sources: Sequen
     """
     import geopandas
     import pandas
-    from shapely.geometry import Polygon
 
     rows = [(values, ring) for one in missions for values, ring in one.rows]
-    geometry = [None if ring is None else Polygon(ring) for _, ring in rows]
+    geometry = [None if ring is None else footprint_geometry(ring) for _, ring in rows]
     table = geopandas.GeoDataFrame(
         {name: [values[name] for values, _ in rows] for name in COLUMNS},
         geometry=geopandas.GeoSeries(geometry, crs="EPSG:4326"),
@@ -69,9 +69,9 @@ def read_sources(folder: Path) -> list[str]:
     """Places that a catalog was built from; empty without one."""
     try:
         content = json.loads((folder / CATALOG).read_text("utf-8"))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return []
-    sources = content.get("syntopic:sources", [])
+    sources = content.get("syntopic:sources", []) if isinstance(content, dict) else []
     return [str(source) for source in sources] if isinstance(sources, list) else []
 
 

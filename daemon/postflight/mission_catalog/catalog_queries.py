@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Final, get_args
 
-from daemon import DaemonError
-from daemon.mission.foreign_files import ForeignFileError, read_regular_file
+from daemon.mission.store.level2 import Verdict
+from daemon.postflight.mission_catalog.catalog_areas import QueryError, box_area, file_area
 from daemon.postflight.mission_catalog.catalog_files import TABLE
 
-_POLYGON_MAX_BYTES = 50_000_000
-
-
-class QueryError(DaemonError):
-    """A query that cannot be answered; the message states why."""
+VERDICTS: Final = get_args(Verdict)
+_NAMES_SHOWN: Final = 10
 
 
 @dataclass(frozen=True)
@@ -40,9 +37,12 @@ def select(folder: Path, query: CatalogQuery) -> list[dict[str, Any]]:
     An exposure without a footprint, time, GSD or sun fulfils no condition on it.
 
     Raises:
-        QueryError: no catalog, or the polygon cannot be used.
+        QueryError: no catalog, or a condition that no exposure can fulfil.
     """
     import geopandas
+
+    _check(query)
+    area = _area(query)
 
     path = folder / TABLE
     if not path.is_file():
@@ -51,7 +51,13 @@ def select(folder: Path, query: CatalogQuery) -> list[dict[str, Any]]:
         table = geopandas.read_parquet(path)
     except (OSError, ValueError) as error:
         raise QueryError(f"{path}: cannot be read ({error}); build it again") from error
-    if (area := _area(query)) is not None:
+    known = sorted(set(table["mission"]))
+    if unknown := [name for name in query.missions if name not in known]:
+        more = ", ..." if len(known) > _NAMES_SHOWN else ""
+        raise QueryError(
+            f"{folder}: has no mission {unknown[0]}; it has {', '.join(known[:_NAMES_SHOWN])}{more}"
+        )
+    if area is not None:
         table = table[table.geometry.notna() & table.intersects(area)]
     if query.since is not None:
         table = table[table["utc"] >= query.since]
@@ -100,21 +106,35 @@ def parse_time(text: str) -> datetime:
     return instant.replace(tzinfo=UTC) if instant.tzinfo is None else instant.astimezone(UTC)
 
 
+def _check(query: CatalogQuery) -> None:
+    """Refuse conditions that no exposure can fulfil.
+
+    Raises:
+        QueryError: there is one.
+    """
+    for verdict in query.verdicts:
+        if verdict not in VERDICTS:
+            raise QueryError(f"--verdict {verdict}: there is none; give {', '.join(VERDICTS)}")
+    if query.since is not None and query.until is not None and query.since > query.until:
+        raise QueryError(
+            f"--since {query.since:%Y-%m-%dT%H:%M:%SZ} is after --until "
+            f"{query.until:%Y-%m-%dT%H:%M:%SZ}"
+        )
+    if query.gsd_max_m is not None and not (query.gsd_max_m > 0 and math.isfinite(query.gsd_max_m)):
+        raise QueryError(f"--gsd-max {query.gsd_max_m:g}: a GSD is a positive number of metres")
+    if query.sun_min_deg is not None and not abs(query.sun_min_deg) <= 90.0:
+        raise QueryError(
+            f"--sun-min {query.sun_min_deg:g}: give an elevation from -90 to 90 degrees"
+        )
+
+
 def _area(query: CatalogQuery) -> Any:
     """The polygon and the box in one geometry; None without both."""
-    from shapely import GEOSException, union_all
-    from shapely.geometry import box, shape
-
-    area = None if query.bbox is None else box(*query.bbox)
-    if query.polygon is None:
-        return area
-    try:
-        content = json.loads(read_regular_file(query.polygon, _POLYGON_MAX_BYTES))
-        features = content.get("features", [content])
-        shapes = [shape(one.get("geometry", one)) for one in features]
-        found = union_all([one for one in shapes if one.geom_type.endswith("Polygon")])
-    except (ForeignFileError, ValueError, KeyError, AttributeError, TypeError, GEOSException) as e:
-        raise QueryError(f"{query.polygon}: no polygon in GeoJSON can be read ({e})") from e
-    if found.is_empty or not found.is_valid:
-        raise QueryError(f"{query.polygon}: has no valid polygon in WGS 84")
-    return found if area is None else found.intersection(area)
+    box = None if query.bbox is None else box_area(query.bbox)
+    polygons = None if query.polygon is None else file_area(query.polygon)
+    if box is None or polygons is None:
+        return polygons if box is None else box
+    both = box.intersection(polygons)
+    if both.is_empty:
+        raise QueryError(f"--bbox and {query.polygon} have no area in common")
+    return both

@@ -196,11 +196,120 @@ def test_the_same_mission_at_two_places_counts_once(season: Path, tmp_path: Path
     assert done["exposures"] == 7 and "the same mission" in done["failures"][0]
 
 
+def test_a_further_place_is_added_and_replaces_only_on_request(
+    season: Path, tmp_path: Path
+) -> None:
+    other = lay_out(tmp_path / "other", "c", 2, 18.0)
+    done = run("build", str(season), f"file://{other.parent}")
+    assert (done["missions"], done["exposures"]) == (3, 9)
+    again = run("build", str(season), str(other.parent))
+    assert (again["missions"], again["exposures"], again["failures"]) == (3, 9, [])
+    assert run("build", str(season))["missions"] == 3
+    only = run("build", str(season), str(other.parent), "--replace")
+    assert (only["missions"], only["exposures"]) == (1, 2)
+    assert run("build", str(season))["missions"] == 1
+
+
+def test_a_box_across_the_antimeridian_finds_both_sides(tmp_path: Path) -> None:
+    lay_out(tmp_path / "missions", "east", 3, 179.98)
+    lay_out(tmp_path / "missions", "west", 2, -179.97)
+    lay_out(tmp_path / "missions", "across", 2, 180.0)
+    lay_out(tmp_path / "missions", "far", 2, 10.0)
+    season = tmp_path / "season"
+    run("build", str(season), str(tmp_path / "missions"))
+    both = [("across", 1), ("east", 1), ("east", 2), ("west", 1)]
+    assert numbers(season, "--bbox", "179", "46", "-179", "48") == both
+    assert numbers(season, "--bbox", "179.985", "46", "-179.99", "48") == [
+        ("across", 1), ("east", 2),
+    ]  # fmt: skip
+    # A footprint across it reaches on neither side around the earth.
+    assert numbers(season, "--bbox", "-10", "46", "20", "48") == [("far", 1)]
+    table = geopandas.read_parquet(season / "exposures.parquet")
+    across = table.geometry[table["mission"] == "across"].iloc[0]
+    assert across.geom_type == "MultiPolygon" and across.area < 1e-6
+    assert len(pyogrio.read_dataframe(season / "exposures.gpkg")) == 9
+
+
+DEEP = "[" * 100_000
+UTM = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::32633"}}
+WGS84 = {"type": "name", "properties": {"name": "urn:ogc:def:crs:OGC:1.3:CRS84"}}
+
+
+def square(west: float, south: float, size: float, **members: object) -> str:
+    ring = [(0, 0), (size, 0), (size, size), (0, size), (0, 0)]
+    coordinates = [[[west + x, south + y] for x, y in ring]]
+    return json.dumps({"type": "Polygon", "coordinates": coordinates, **members})
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        (DEEP, "nested too deeply"),
+        (square(500_000, 5_200_000, 9_000), "no degrees"),
+        (square(16, 47, 100), "no degrees"),
+        (square(16, 47, 1, crs=UTM), "EPSG::32633; GeoJSON is in WGS 84"),
+        (square(16, 47, 1, crs={"type": "link"}), "GeoJSON is in WGS 84"),
+        (square(30, 47, 1), "have no area in common"),
+        ("[]", "no polygon"),
+    ],
+)
+def test_a_polygon_that_cannot_be_meant_is_refused(
+    season: Path, tmp_path: Path, text: str, sentence: str
+) -> None:
+    (tmp_path / "p.geojson").write_text(text)
+    box = ["--bbox", "15", "46", "18", "48"] if "common" in sentence else []
+    query = ["catalog", "query", str(season), "--polygon", str(tmp_path / "p.geojson"), *box]
+    done = CliRunner().invoke(app, query)
+    assert done.exit_code != 0 and sentence in str(done.exception), repr(done.exception)
+
+
+def test_a_polygon_that_names_wgs84_is_taken(season: Path, tmp_path: Path) -> None:
+    (tmp_path / "p.geojson").write_text(square(16.995, 46.9, 0.01 + 0.19, crs=WGS84))
+    assert numbers(season, "--polygon", str(tmp_path / "p.geojson")) == [("b", 1), ("b", 2)]
+
+
+@pytest.mark.parametrize(
+    ("condition", "sentence"),
+    [
+        ("--bbox nan nan nan nan", "is not on the earth"),
+        ("--bbox 16 48 17 47", "its south is above its north"),
+        ("--bbox 16 47 190 48", "is not on the earth"),
+        ("--bbox 16 47 17 inf", "is not on the earth"),
+        ("--verdict bad", "give good, usable, refly"),
+        ("--mission z", "has no mission z; it has a, b"),
+        ("--since 2026-11-22 --until 2026-11-21", "is after --until"),
+        ("--gsd-max nan", "positive number"),
+        ("--gsd-max -1", "positive number"),
+        ("--gsd-max 0", "positive number"),
+        ("--sun-min nan", "from -90 to 90"),
+        ("--sun-min 91", "from -90 to 90"),
+    ],
+)
+def test_a_condition_that_no_exposure_can_fulfil_is_refused(
+    season: Path, condition: str, sentence: str
+) -> None:
+    done = CliRunner().invoke(app, ["catalog", "query", str(season), *condition.split()])
+    assert done.exit_code != 0 and sentence in str(done.exception), repr(done.exception)
+
+
+@pytest.mark.parametrize("text", ["[]", "7", DEEP, '{"syntopic:sources": 3}'])
+def test_a_file_that_is_no_catalog_is_not_replaced(tmp_path: Path, text: str) -> None:
+    lay_out(tmp_path / "missions", "a", 2, 16.0)
+    (tmp_path / "season").mkdir()
+    (tmp_path / "season/catalog.json").write_text(text)
+    command = ["catalog", "build", str(tmp_path / "season"), str(tmp_path / "missions")]
+    done = CliRunner().invoke(app, command)
+    assert done.exit_code != 0 and "is not empty and no catalog" in str(done.exception)
+    assert (tmp_path / "season/catalog.json").read_text() == text
+
+
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
         (("build", "{tmp}/missions", "{tmp}/missions"), "no catalog"),
         (("build", "{tmp}/new"), "no place is given"),
+        (("build", "{tmp}/season", "--replace"), "--replace needs the places"),
+        (("build", "{tmp}/season", "http://host/x"), "file:///folder"),
         (("build", "{tmp}/new", "{tmp}/nothing"), "no mission"),
         (("query", "{tmp}/missions"), "catalog build"),
         (("query", "{tmp}/season", "--since", "yesterday"), "write it as"),
