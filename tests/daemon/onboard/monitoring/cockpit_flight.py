@@ -20,7 +20,7 @@ from tests.support.browser import Browser
 EXPOSURES = ["good", "good", "usable", "good", "good", "refly", "good", "good", "good"]
 """Verdicts of the exposures; the first is a test exposure on the ground."""
 HEADS = [f"SU{k:02d}" for k in range(13)]
-MISSING = ["no position (check the antenna of the receiver)"]
+MISSING = ["no temperature of probe 1 (check the probes and their module)"]
 
 
 @contextmanager

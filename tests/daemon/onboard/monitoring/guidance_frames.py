@@ -99,17 +99,17 @@ def vector_map(folder: Path) -> Path:
 
 
 def aerial_map(folder: Path) -> Path:
-    """Fields and roads as a GeoTIFF, about 4 km x 5 km about the lines of the tests."""
+    """Fields and roads as a GeoTIFF, about 8 km x 5 km about the lines of the tests."""
     random = np.random.default_rng(7)
-    fields = random.integers((70, 100, 60), (130, 150, 100), (26, 21, 3)).astype(np.uint8)
-    ground = cv2.resize(fields, (1050, 1300), interpolation=cv2.INTER_NEAREST)
+    fields = random.integers((70, 100, 60), (130, 150, 100), (26, 40, 3)).astype(np.uint8)
+    ground = cv2.resize(fields, (2000, 1300), interpolation=cv2.INTER_NEAREST)
     for k in range(0, 1300, 200):
-        cv2.line(ground, (0, k + 60), (1050, k), (170, 165, 150), 4)
-    cv2.line(ground, (300, 0), (620, 1300), (190, 185, 170), 7)
+        cv2.line(ground, (0, k + 60), (2000, k - 50), (170, 165, 150), 4)
+    cv2.line(ground, (760, 0), (1080, 1300), (190, 185, 170), 7)
     from rasterio.transform import from_origin
 
     return geotiff(
         folder / "fields.tif",
         np.moveaxis(ground, 2, 0).copy(),
-        transform=from_origin(531_500.0, 5_216_500.0, 4.0, 4.0),
+        transform=from_origin(529_660.0, 5_216_500.0, 4.0, 4.0),
     )

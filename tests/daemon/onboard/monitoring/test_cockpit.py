@@ -55,7 +55,7 @@ MAP_SHARES = {1280: 0.65, 2000: 0.53, 390: 0.95}
 """Least share of the width of the window that the map has, by that width."""
 NIGHT = {
     *(("on-a-line", width) for width, _ in SIZES),
-    *((state, 1280) for state in ("before-arming", "between-lines", "degraded", "after-landing")),
+    *((state, 1280) for state in ("between-lines", "degraded")),
 }
 """States and widths that are pictured in the dark theme as well."""
 
@@ -184,6 +184,9 @@ def acknowledge(cockpit: Cockpit, alarm: str) -> None:
     cockpit.service.commands.clear()
     cockpit.browser.click(f"{alarm} .acknowledge")
     cockpit.service.until(lambda: [c.name for c in cockpit.service.commands] == ["acknowledge"])
+    # The answer of the service is shown for some seconds.
+    cockpit.until("document.querySelector('#answer').textContent !== ''")
+    cockpit.until("document.querySelector('#answer').textContent === ''")
 
 
 def test_a_deviation_beyond_its_limit_is_an_alarm(cockpit: Cockpit) -> None:
@@ -334,7 +337,7 @@ def test_after_landing_the_summary_stays_without_an_alarm(cockpit: Cockpit) -> N
         "document.querySelectorAll('#landing code').forEach((one) => {"
         f" one.textContent = one.textContent.replace(/\\/\\S*/, '{path}'); }})"
     )
-    check(cockpit, "after-landing", phone_tab="flight")
+    check(cockpit, "after-landing", phone_tab="flight", seen="#landing h2")
     browser.open(cockpit.service.address)
     cockpit.until("document.querySelector('#phase-button')?.innerText === 'Starting'")
     cockpit.until("document.querySelector('#lamp-link .name')?.innerText === 'Link'")
