@@ -113,6 +113,25 @@ def test_the_override_names_what_is_missing_and_is_whole(cockpit: Cockpit) -> No
     assert len(service.commands) == sent + 1, "an override without a reason was sent"
 
 
+def test_a_long_refusal_is_read_by_keys_alone(cockpit: Cockpit) -> None:
+    """Its end lies below the edge of its place: a region that scrolls takes the focus."""
+    browser, service = cockpit.browser, cockpit.service
+    service.refusal = " ".join([REFUSAL] * 4)
+    sent = len(service.commands)
+    browser.click("#phase-button")
+    service.until(lambda: len(service.commands) == sent + 1)
+    cockpit.until("document.querySelector('#ask-override').open")
+    close(cockpit, "#ask-override")
+    service.refusal = ""
+    assert browser.evaluate(
+        "(({ scrollHeight, clientHeight }) => scrollHeight > clientHeight)"
+        "(document.querySelector('#answer'))"
+    )
+    assert axe(browser) == []
+    browser.evaluate("document.querySelector('#answer').focus()")
+    assert browser.evaluate("document.activeElement.id") == "answer"
+
+
 def test_shelving_is_whole_at_each_size(cockpit: Cockpit) -> None:
     """The times of shelving are buttons of each alarm; one alarm is shelved and one is not."""
     browser = cockpit.browser
