@@ -25,6 +25,7 @@ from daemon.mission.foreign_xml import XmlError, parse_xml
 from daemon.postflight.adjustment.csv_tables import ProjectError, is_row
 from daemon.postflight.adjustment.project import CheckPoints
 from daemon.postflight.adjustment.project_file import AdjustSection, CameraSection, ProjectFile
+from daemon.postflight.importers.dbat_elements import camera_file_findings
 from daemon.postflight.importers.dbat_settings import HERE, filtered, read_settings
 from processing.bundle.network import (
     INTERIOR,
@@ -133,14 +134,36 @@ def _camera(script: Path, given: ElementTree.Element) -> ElementTree.Element:
     found = given.findall("cameras/camera")
     for file in given.findall("cameras/file"):
         path = _within(script, (file.text or "").strip())
-        found += _parsed(path).findall("cameras/camera")
+        root = _parsed(path)
+        if problems := camera_file_findings(path.name, root):
+            raise ProjectError(problems)
+        found += root.findall("cameras/camera")
     if len(found) != 1:
-        raise ProjectError([f"{script.name}: one camera can be imported"])
+        raise ProjectError(
+            [f"{script.name}: {len(found)} cameras; one can be imported: remove the others"]
+        )
+    for key, count in (("nK", 3), ("nP", 2)):
+        stated = (found[0].findtext(key) or str(count)).strip()
+        if stated != str(count):
+            raise ProjectError(
+                [
+                    f"{script.name}: <{key}> is {stated}; {count} is read: state {count}, and hold "
+                    "further coefficients with <K3>false</K3> and the like"
+                ]
+            )
     return found[0]
 
 
 def _loaded(script: Path, camera: ElementTree.Element) -> dict[str, float]:
     """Calibrated values of a camera in place of its nominal ones."""
+    calibrated = (camera.findtext("calibrated") or "yes").strip()
+    if calibrated != "yes":
+        raise ProjectError(
+            [
+                f"{script.name}: <calibrated> is {calibrated}, and the initial values of io are "
+                "loaded from the camera: begin with default, or state yes"
+            ]
+        )
     values: dict[str, float] = {}
     for key, names in (("cc", ("f_mm",)), ("pp", ("xp_mm", "yp_mm")), ("P", ("p1", "p2"))):
         if text := camera.findtext(key):
@@ -150,7 +173,9 @@ def _loaded(script: Path, camera: ElementTree.Element) -> dict[str, float]:
                     [f"{script.name}: <{key}> has {len(numbers)} values; {len(names)} are right"]
                 )
             values |= dict(zip(names, numbers, strict=True))
-    radial = [float(v) for v in (camera.findtext("K") or "0").split(",")]
+    radial = [float(v) for v in (camera.findtext("K") or "0,0,0").split(",")]
+    if len(radial) < 3:
+        raise ProjectError([f"{script.name}: <K> has {len(radial)} coefficients; three are read"])
     if len(radial) > 3 and any(radial[3:]):
         raise ProjectError([f"{script.name}: <K> has {len(radial)} coefficients; three are read"])
     values |= dict(zip(("k1", "k2", "k3"), radial[:3], strict=False))
@@ -293,7 +318,8 @@ def _tables(
         if not element.text:
             raise ProjectError([f"{script.name}: no file of {what}"])
         columns = [c.strip() for c in (element.get("format") or "").split(",")]
-        constant = {k: v for k, v in element.attrib.items() if k not in ("format", "units")}
+        known = ("format", "units") if what == "prior_eo" else ("format",)
+        constant = {k: v for k, v in element.attrib.items() if k not in known}
         unknown = [c for c in (*columns, *constant) if c not in (*needed, *optional)]
         absent = [c for c in needed if c not in (*columns, *constant)]
         if unknown or absent or len(set(columns)) < len(columns):

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Final, TypeVar
 
 from daemon.postflight.adjustment.csv_tables import ProjectError
+from daemon.postflight.importers.dbat_elements import REMARK, ignored, script_findings
 
 T = TypeVar("T")
 
@@ -39,6 +40,8 @@ _PARAMETERS: Final[Mapping[str, tuple[str, ...]]] = {
     "P2": ("p2",),
 }
 """Interior parameters by DBAT's name."""
+_PARTS: Final = ("io", "eo", "op")
+"""Interior and exterior orientation, object points; others are refused by `script_findings`."""
 _STEPS: Final = frozenset(
     ("check_ray_count", "spatial_resection", "forward_intersection", "bundle_adjustment")
 )
@@ -59,7 +62,8 @@ def read_settings(script: str, root: ElementTree.Element) -> DbatSettings:
     Raises:
         ProjectError: with a sentence for each element that is not honoured.
     """
-    problems = [
+    problems = script_findings(script, root)
+    problems += [
         f"{script}: input <{child.tag}> is not read; remove it, or adjust in DBAT"
         for child in root.findall("input/*")
         if child.tag not in _INPUTS
@@ -75,14 +79,15 @@ def read_settings(script: str, root: ElementTree.Element) -> DbatSettings:
         problems.append(f"{script}: base_dir {base} is not read; use {HERE} or a folder in it")
     free: list[str] | None = None
     is_loaded, notes = False, []
+    has_prior = root.find("input/prior_eo") is not None
     for operation in root.findall("operations/operation"):
-        children = [child for child in operation if child.tag != "c"]
+        children = [child for child in operation if child.tag != REMARK]
         name = (operation.text or "").strip().rstrip(">")
         if not children and name and name not in _STEPS:
             problems.append(f"{script}: operation {name} is not read")
         for child in children:
             if child.tag == "set_initial_values":
-                is_loaded |= _is_loaded(script, child, problems)
+                is_loaded |= _is_loaded(script, child, problems, has_prior=has_prior)
             elif child.tag == "set_bundle_estimate_params":
                 free = _free(script, child, problems)
             elif child.tag == "set_datum":
@@ -95,38 +100,59 @@ def read_settings(script: str, root: ElementTree.Element) -> DbatSettings:
                 problems.append(f"{script}: operation <{child.tag}> is not read")
     if problems:
         raise ProjectError(problems)
+    if harmless := ignored(root):
+        notes.append(f"ignored: {', '.join(harmless)}")
     every = [name for name in _PARAMETERS["all"] if name != "b2"]
     return DbatSettings(tuple(every if free is None else free), is_loaded, tuple(notes))
 
 
-def _is_loaded(script: str, element: ElementTree.Element, problems: list[str]) -> bool:
+def _values(part: ElementTree.Element) -> dict[str, str]:
+    """Values by the names in a part; text in the part itself is that of all."""
+    named = {child.tag: (child.text or "").strip() for child in part if child.tag != REMARK}
+    return named or {"all": (part.text or "").strip()}
+
+
+def _is_loaded(
+    script: str, element: ElementTree.Element, problems: list[str], *, has_prior: bool
+) -> bool:
     """Whether interior orientation begins with the values of the camera file."""
     loaded = False
     for part in element:
-        values = [child.text for child in part] or [part.text]
-        texts = {(value or "").strip() for value in values}
-        if part.tag == "c":
+        if part.tag not in _PARTS:
             continue
-        if part.tag not in ("io", "eo", "op") or texts - {"default", "loaded"} or len(texts) > 1:
-            problems.append(f"{script}: initial values of {part.tag}: {texts} are not read")
+        values = _values(part)
+        if not _is_all(values, ("default", "loaded")):
+            problems.append(f"{script}: initial values of {part.tag}: {values} are not read")
         elif part.tag == "io":
-            loaded = texts == {"loaded"}
+            loaded = values["all"] == "loaded"
+        elif part.tag == "eo" and (values["all"] == "loaded") != has_prior:
+            problems.append(
+                f"{script}: initial values of eo are {values['all']!r}, and <prior_eo> is "
+                + ("there, which is used: write loaded" if has_prior else "not there: add it")
+            )
     return loaded
+
+
+def _is_all(values: Mapping[str, str], allowed: Sequence[str]) -> bool:
+    return set(values) == {"all"} and values["all"] in allowed
 
 
 def _free(script: str, element: ElementTree.Element, problems: list[str]) -> list[str]:
     free: dict[str, bool] = dict.fromkeys(_PARAMETERS["all"], False)
     for part in element:
-        for child in part:
-            value = (child.text or "").strip()
-            if part.tag == "io" and child.tag in _PARAMETERS and value in ("true", "false"):
-                free |= dict.fromkeys(_PARAMETERS[child.tag], value == "true")
-            elif part.tag == "c" or child.tag == "c":
-                continue
-            elif part.tag == "io" or child.tag != "all" or value not in ("true", "default"):
-                problems.append(
-                    f"{script}: estimation of {part.tag} {child.tag} {value!r} is not read"
-                )
+        if part.tag not in _PARTS:
+            continue
+        values = _values(part)
+        if part.tag != "io":
+            if not _is_all(values, ("true", "default")):
+                listed = ", ".join(f"{name} {value!r}" for name, value in values.items())
+                problems.append(f"{script}: estimation of {part.tag} {listed} is not read")
+            continue
+        for name, value in values.items():
+            if name in _PARAMETERS and value in ("true", "false"):
+                free |= dict.fromkeys(_PARAMETERS[name], value == "true")
+            else:
+                problems.append(f"{script}: estimation of io {name} {value!r} is not read")
     return [name for name, is_free in free.items() if is_free]
 
 
