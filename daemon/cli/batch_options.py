@@ -92,11 +92,18 @@ class ExecutorOptions:
 
         Raises:
             MissingExtraError: dask is not installed.
-            ConfigurationError: an address off this machine without TLS, or processes of this
-                machine.
+            ConfigurationError: an address off this machine without TLS, processes of this
+                machine, or TLS options without a scheduler.
         """
+        from daemon.postflight.batch.cluster_address import given_tls_options
+
+        given = given_tls_options(self.tls_ca, self.tls_certificate, self.tls_key)
         if self.scheduler is not None:
             self.cluster()
+        elif given:
+            raise ConfigurationError(
+                [f"{given} is for a cluster; give its address: --scheduler tls://HOST:8786"]
+            )
 
     def cluster(self) -> BatchExecutor:
         """The executor on the cluster of `scheduler`.
@@ -135,6 +142,7 @@ class ExecutorOptions:
         Raises:
             ConfigurationError: more processes than memory, or a cluster that cannot be used.
         """
+        self.check()
         if self.scheduler is not None:
             from daemon.postflight.batch.capacity import ProcessAllocation
 
@@ -203,6 +211,13 @@ class ExecutorOptions:
             available_nbytes=available,
             threads=self.threads,
         )
+        if self.threads is not None and self.threads > cores:
+            Console(stderr=True, soft_wrap=True).print(
+                f"--threads {self.threads}: this machine has {cores} cores; more threads than "
+                f"cores only wait for each other. Give --threads {cores} or fewer",
+                style="yellow",
+                highlight=False,
+            )
         count = self.processes
         if count is None:
             return plan

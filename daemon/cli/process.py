@@ -125,7 +125,12 @@ def process(
             recomputes=again,
         )
         with nullcontext() if dry_run else source.writing():
-            numbers = only or folder.numbers()
+            present = folder.numbers()
+            numbers = only or present
+            if dry_run and (absent := sorted(set(numbers) - set(present))):
+                raise ConfigurationError(
+                    [f"--only {number}: {source.place} has no such exposure" for number in absent]
+                )
             found = source.survey(source.placed(work), numbers, overlaps_of(folder, work.rig))
             placed = where.place(work.memory_nbytes, len(found.pending))
             if dry_run:

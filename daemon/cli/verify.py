@@ -59,6 +59,8 @@ def verify(
     from daemon.postflight.batch.local_processes import LocalProcessExecutor
     from daemon.postflight.batch.verification_work import verified_by
 
+    where = ExecutorOptions(processes, None, scheduler, tls_ca, tls_certificate, tls_key)
+    where.check()
     with Progress(console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("verifying", total=None)
 
@@ -76,9 +78,6 @@ def verify(
             folder = Mission.open(folder_of(mission), checks_subfolders=False)
             check_all: CheckAll = check_in_threads
             if scheduler is not None:
-                where = ExecutorOptions(
-                    processes, None, scheduler, tls_ca, tls_certificate, tls_key
-                )
                 check_all = verified_by(where.cluster())
             elif processes is not None:
                 check_all = verified_by(LocalProcessExecutor(processes))

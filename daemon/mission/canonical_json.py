@@ -62,13 +62,17 @@ def parse_record(data: bytes, name: str) -> dict[str, Any]:
     """Parse one JSON object from untrusted bytes; `name` is used in the error message.
 
     Raises:
-        RecordError: too large, not UTF-8, not JSON, a key given twice, NaN, or not an object.
+        RecordError: too large, not UTF-8, not JSON, a key given twice, NaN, infinity (also as
+            1e400), or not an object.
     """
     if len(data) > RECORD_MAX_BYTES:
         raise RecordError([f"{name}: {len(data)} bytes; a record has at most {RECORD_MAX_BYTES}"])
     try:
         content = json.loads(
-            data.decode("utf-8"), object_pairs_hook=_unique_keys, parse_constant=_no_constant
+            data.decode("utf-8"),
+            object_pairs_hook=_unique_keys,
+            parse_constant=_no_constant,
+            parse_float=_finite,
         )
     except RecursionError as error:
         raise RecordError([f"{name}: nested too deeply to be a record"]) from error
@@ -116,6 +120,13 @@ def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         ((twice, _),) = Counter(key for key, _ in pairs).most_common(1)
         raise ValueError(f"the key {twice[:60]!r} is given twice")
     return content
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"{text[:60]} is beyond the numbers of a record")
+    return value
 
 
 def _no_constant(name: str) -> float:

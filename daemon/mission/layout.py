@@ -38,6 +38,7 @@ MISSION_FORMAT = 2
 DISCARDED = ".discarded"
 """In L0: what recovery set aside because it was never reported as stored."""
 
+_SCHEME = re.compile(r"[a-z][a-z0-9+.-]*")
 _EXPOSURE_FOLDER = re.compile(r"[0-9]{6,12}")
 
 
@@ -123,7 +124,7 @@ class Mission:
                 anything but plain files and folders: what a link or a pipe leads to is not ours.
         """
         if not path.is_dir():
-            raise MissionError(f"{path}: no such folder; give the path of a mission")
+            raise MissionError(_no_folder(path))
         if not (path / "L0").is_dir():
             raise MissionError(f"{path}: has no folder L0; a mission keeps its exposures there")
         if (
@@ -332,6 +333,21 @@ def exposure_name(number: int) -> str:
     if number < 1:
         raise MissionError(f"exposure {number}: exposures are counted from 1")
     return f"{number:06d}"
+
+
+def _no_folder(path: Path) -> str:
+    """Why there is no folder: `Path` makes "s3:/bucket/a" of an address."""
+    scheme, separator, rest = str(path).partition(":/")
+    if not separator or not _SCHEME.fullmatch(scheme):
+        return f"{path}: no such folder; give the path of a mission"
+    rest = rest.lstrip("/")
+    if scheme == "file":
+        return f"file:///{rest}: this command works on folders; give the path: /{rest}"
+    return (
+        f"{scheme}://{rest}: this command works on folders. Copy the mission into a folder with "
+        "the store's own client, and check the copy: syntopic verify FOLDER. `syntopic process`, "
+        "`verify` and `catalog` read a store; `transfer` writes into one"
+    )
 
 
 def is_exposure_name(name: str) -> bool:

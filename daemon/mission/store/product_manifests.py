@@ -34,6 +34,7 @@ UNCOMPARED_KEYS: Final = frozenset({"timings_s", "duration_s"})
 _FORMAT: Final = 1
 _KEY_CHARACTERS: Final = 64
 _BLOCK_BYTES: Final = 1 << 20
+_DURATION_MAX_S: Final = 1e7
 
 Parts = Sequence[bytes | memoryview]
 
@@ -173,6 +174,18 @@ def provenance_of(mission: Mission, number: int, key: str) -> dict[str, Any]:
         return parse_record(path.read_bytes(), path.name)
     except (OSError, RecordError):
         return {}
+
+
+def duration_of(provenance: Mapping[str, Any]) -> float | None:
+    """Duration of a computation in s; None where a sidecar has none that can be right.
+
+    Args:
+        provenance: content of a sidecar.
+    """
+    duration_s = provenance.get("duration_s")
+    if isinstance(duration_s, bool) or not isinstance(duration_s, int | float):
+        return None
+    return duration_s if 0 <= duration_s <= _DURATION_MAX_S else None
 
 
 @contextmanager

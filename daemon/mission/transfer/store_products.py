@@ -22,6 +22,7 @@ from daemon.mission.store.product_manifests import (
     Parts,
     ProductFile,
     ProductManifest,
+    duration_of,
     manifest_of,
     parse_manifest,
     parts_sha256,
@@ -242,9 +243,9 @@ def stored_reports(store: ObjectStore, keys: Mapping[int, str]) -> dict[int, dic
     def report(number: int) -> dict[str, Any]:
         key = keys[number]
         provenance = stored_provenance(store, number, key)
-        durations = {name: provenance[name] for name in UNCOMPARED_KEYS if name in provenance}
+        timings = {name: provenance[name] for name in UNCOMPARED_KEYS if name in provenance}
         own = _record(store, f"{product_folder(number, key)}/{REPORT_FILE}")
-        return {**own, "duration_s": 0.0, **durations}
+        return {**own, **timings, "duration_s": duration_of(provenance) or 0.0}
 
     return dict(zip(keys, answers(report, keys), strict=True))
 

@@ -81,6 +81,10 @@ def cluster_address(
                     f"tls://{parts.netloc} with --tls-ca, --tls-certificate and --tls-key"
                 ]
             )
+        if given := given_tls_options(ca, certificate, key):
+            raise ConfigurationError(
+                [f"{given} has no effect on {url}, which is without TLS; give tls://{parts.netloc}"]
+            )
         return address
     problems = [
         f"{url} needs {option} FILE"
@@ -105,6 +109,18 @@ def cluster_address(
             ]
         ) from error
     return address
+
+
+def given_tls_options(ca: Path | None, certificate: Path | None, key: Path | None) -> str:
+    """Names of the TLS options that were given; empty without one.
+
+    Args:
+        ca: certificate of the authority.
+        certificate: of this side.
+        key: of the certificate.
+    """
+    options = (("--tls-ca", ca), ("--tls-certificate", certificate), ("--tls-key", key))
+    return ", ".join(option for option, path in options if path is not None)
 
 
 def certificate_problem(address: ClusterAddress) -> str:

@@ -275,12 +275,14 @@ def survey(
             inputs = {}  # the action states why
         duration_s = next(
             (
-                product_manifests.provenance_of(mission, number, known).get("duration_s")
+                product_manifests.duration_of(
+                    product_manifests.provenance_of(mission, number, known)
+                )
                 for known in product_manifests.committed_keys(mission, number)
             ),
             None,
         )
-        if isinstance(duration_s, int | float):
+        if duration_s is not None:
             durations_s.append(duration_s)
         if not work.recomputes and product_manifests.is_complete(mission, number, key):
             complete[number] = key
@@ -298,8 +300,8 @@ def report_of(mission: Mission, number: int, key: str) -> dict[str, Any]:
         RecordError: the report is damaged.
     """
     report = level2.read_report(mission.level2(number)) or {}
-    duration_s = product_manifests.provenance_of(mission, number, key).get("duration_s", 0.0)
-    return {**report, "duration_s": duration_s}
+    provenance = product_manifests.provenance_of(mission, number, key)
+    return {**report, "duration_s": product_manifests.duration_of(provenance) or 0.0}
 
 
 def identity_differences(expected: Mapping[str, str], found: Mapping[str, str]) -> str:

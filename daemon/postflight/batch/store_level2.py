@@ -19,6 +19,7 @@ from typing import Any, Final
 
 from daemon.mission.canonical_json import RecordError
 from daemon.mission.layout import Mission
+from daemon.mission.store.product_manifests import duration_of
 from daemon.mission.transfer import store_products
 from daemon.mission.transfer.object_store import ObjectStore
 from daemon.mission.transfer.store_mission import (
@@ -226,9 +227,6 @@ def _expected_s(store: ObjectStore, found: store_products.StoredProducts) -> flo
     records = store_products.answers(
         lambda one: store_products.stored_provenance(store, *one), known
     )
-    durations = [
-        record["duration_s"]
-        for record in records
-        if isinstance(record.get("duration_s"), int | float)
-    ]
+    found_s = [duration_of(record) for record in records]
+    durations = [duration_s for duration_s in found_s if duration_s is not None]
     return sum(durations) / len(durations) if durations else None

@@ -89,7 +89,8 @@ def _fetch_processed(store: ObjectStore, folder: Path) -> None:
     newest: dict[int, tuple[float, str]] = {}
     for number, key in products.committed():
         finished_s = stored_provenance(store, number, key).get("finished_unix_s", 0)
-        newest[number] = max(newest.get(number, (-1.0, "")), (float(finished_s), key))
+        instant_s = float(finished_s) if isinstance(finished_s, int | float) else 0.0
+        newest[number] = max(newest.get(number, (-1.0, "")), (instant_s, key))
     for number, (_, key) in newest.items():
         report = f"{product_folder(number, key)}/{REPORT_FILE}"
         entry = store.find(report)
