@@ -9,7 +9,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Final
 
-from daemon.postflight.importers.exif_tags import TagsError
+from daemon.postflight.importers.exif_tags import ImageTags, TagsError
 from daemon.postflight.importers.multispectral_tags import ImagesError
 
 SUFFIXES: Final = (".jpg", ".jpeg", ".tif", ".tiff")
@@ -18,6 +18,10 @@ _OTHER_IMAGES: Final = (
     *(".heic", ".heif", ".png", ".webp", ".jp2", ".mp4", ".mov"),
 )
 _FILES_MAX: Final = 100_000
+_PLACES: Final = ((273, 279), (324, 325))
+"""StripOffsets and StripByteCounts, TileOffsets and TileByteCounts."""
+_JPEG_AT: Final = 513
+"""JPEGInterchangeFormat: of a TIFF that holds a JPEG as a whole."""
 _START_OF_SCAN: Final = b"\xff\xda"
 _END_OF_IMAGE: Final = b"\xff\xd9"
 
@@ -79,6 +83,37 @@ def check_complete(path: Path, *, is_jpeg: bool) -> None:
             f"{path.name}: ends before its image does; copy it from the camera's card again, or "
             "move it out of the folder"
         )
+
+
+def check_strips(path: Path, tags: ImageTags) -> None:
+    """Whether the strips or tiles of a TIFF lie within the file.
+
+    Args:
+        path: the file.
+        tags: its tags; those of a JPEG are not looked at.
+
+    Raises:
+        TagsError: the file ends early, or has no strips.
+
+    Source: TIFF 6.0, sections 3 and 15.
+    """
+    if tags.kind != "tiff" or _JPEG_AT in tags.image:
+        return
+    size = path.stat().st_size
+    for offsets, counts in _PLACES:
+        at, length = tags.image.get(offsets), tags.image.get(counts)
+        if isinstance(at, tuple) and isinstance(length, tuple) and len(at) == len(length):
+            end = max(a + n for a, n in zip(at, length, strict=True))
+            if end > size:
+                raise TagsError(
+                    f"{path.name}: ends before its image does ({size} of {end:.0f} bytes); copy it "
+                    "from the camera's card again, or move it out of the folder"
+                )
+            return
+    raise TagsError(
+        f"{path.name}: has no pixels (StripOffsets or TileOffsets); copy it from the camera's card "
+        "again, or move it out of the folder"
+    )
 
 
 def _of(folder: Path) -> list[Path]:

@@ -28,9 +28,11 @@ from daemon.postflight.importers.exif_tags import ImageTags, TagsError, read_tag
 from daemon.postflight.importers.multispectral_tags import ImagesError
 from daemon.postflight.importers.photograph_files import (
     check_complete,
+    check_strips,
     other_images,
     photograph_paths,
 )
+from daemon.postflight.importers.photograph_positions import implausible_positions, same_place
 from daemon.postflight.importers.xmp import XmpError, read_xmp
 from processing.rig import Cone, Lens, Rig, Sensor, load_rig
 
@@ -44,6 +46,7 @@ _ABOVE_TAKEOFF: Final = "RelativeAltitude"
 NO_HEIGHT_M: Final = 0.0
 """Height of all photographs where none states one."""
 _NOMINAL_PITCH_MM: Final = 1e-3
+_NAMED: Final = 5
 
 
 @dataclass(frozen=True)
@@ -51,7 +54,8 @@ class Photograph:
     """One file: camera, size, provisional focal length in pixels, place or None.
 
     `above_takeoff_m` is RelativeAltitude of XMP, else NaN. `height_source` is the tag that the
-    height of the place comes from, empty where all heights are taken as zero.
+    height of the place comes from, empty where all heights are taken as zero. `position_problem`
+    is why a position of EXIF is not used.
     """
 
     path: Path
@@ -69,6 +73,7 @@ class Photograph:
     above_takeoff_m: float = math.nan
     height_source: str = "GPSAltitude"
     orientation: int = 1
+    position_problem: str = ""
 
 
 @dataclass(frozen=True)
@@ -152,6 +157,7 @@ def read_photographs(
         try:
             tags = read_tags(path)
             check_complete(path, is_jpeg=tags.kind == "jpeg")
+            check_strips(path, tags)
             found.append(_photograph(path, tags, given))
         except TagsError as error:
             problems.append(str(error))
@@ -162,13 +168,15 @@ def read_photographs(
             f"the folder holds photographs of {len(kinds)} cameras or settings ({counted}; ...); "
             f"{_CAMERAS_MAX} are estimated at most. A zoom lens needs one focal length for all"
         )
-    found = _with_heights(found)
+    found = _with_heights(_with_plausible_positions(found))
     placed = sum(one.position is not None for one in found)
     if not problems and placed < POSITIONS_MIN:
+        unused = [one for one in found if one.position_problem][:_NAMED]
         problems.append(
             f"{folder}: {placed} of {len(found)} photographs have a position in EXIF (GPSLatitude, "
-            "GPSLongitude with GPSLatitudeRef N or S, GPSLongitudeRef E or W); "
+            "GPSLongitude with GPSLatitudeRef N or S, GPSLongitudeRef E or W) that can be used; "
             f"{POSITIONS_MIN} are needed to place a block"
+            + "".join(f". {one.path.name}: {one.position_problem}" for one in unused)
         )
     if problems:
         raise ImagesError(problems)
@@ -257,6 +265,15 @@ def _with_height_of_xmp(
     with suppress(XmpError):
         place = (*place[:2], xmp.number("AbsoluteAltitude"))
     return place, above
+
+
+def _with_plausible_positions(photographs: list[Photograph]) -> list[Photograph]:
+    """Positions that cannot be of the block are not used; the photographs state why."""
+    problems = implausible_positions([one.position for one in photographs])
+    return [
+        replace(one, position=None, position_problem=problems[k]) if k in problems else one
+        for k, one in enumerate(photographs)
+    ]
 
 
 def _with_heights(photographs: list[Photograph]) -> list[Photograph]:
@@ -417,6 +434,14 @@ def _notes(photographs: Sequence[Photograph], heads: Sequence[str]) -> tuple[str
             f"{len(without)} photographs have no position: {', '.join(without[:5])}"
             f"{', ...' if len(without) > 5 else ''}."
         )
+    unused = [one for one in photographs if one.position_problem]
+    notes += [
+        f"{one.path.name}: {one.position_problem}. It is not used." for one in unused[:_NAMED]
+    ]
+    if len(unused) > _NAMED:
+        notes.append(f"{len(unused) - _NAMED} further positions are not used for such reasons.")
+    if caution := same_place([one.position for one in photographs]):
+        notes.append(caution)
     sources = {one.height_source for one in photographs if one.position is not None}
     if _ABOVE_TAKEOFF in sources:
         notes.append(
