@@ -29,7 +29,8 @@ The project is written by hand or by `syntopic import dbat`.
 
 Prints sigma0, redundancy, residuals by kind, interior orientation with standard deviations, and
 check points against their predicted accuracy. With --out the adjusted project, coordinates and
-residuals are written as tables. Parameters that cannot be determined are named. The format is
+residuals are written as tables. Parameters that cannot be determined are named. With sigma0 beyond
+20 the block is inconsistent: likely mistakes are named, and the exit status is 1. The format is
 described in docs/reference/formats.md.
 
 Examples: `syntopic adjust project.toml`,
@@ -112,6 +113,7 @@ def adjust(
     from daemon.postflight.adjustment.project_writer import write_results
     from daemon.postflight.adjustment.protocol import write_protocol
     from daemon.postflight.adjustment.summary import print_report, report_of
+    from daemon.postflight.adjustment.variance_factors import variance_factor_cautions
     from processing.bundle.adjust import adjust as adjusted
     from processing.bundle.network import NetworkError
     from processing.bundle.point_joining import joined_points, named_points
@@ -191,8 +193,10 @@ def adjust(
         seconds=time.perf_counter() - begun,
         peak_mib=_peak_mib(),
     )
+    report["cautions"] = [*given.cautions, *report["cautions"]]
     if result.sigma0 > SUSPICIOUS_SIGMA0:
-        report["cautions"] += likely_mistakes(given.network, result.sigma0)
+        explained = likely_mistakes(given.network, result.sigma0)
+        report["cautions"] += explained or variance_factor_cautions(result)
     if out is not None:
         write_results(out, given, result, report)
     if covariance is not None:
@@ -206,7 +210,7 @@ def adjust(
         print_report(console, report)
         if out is not None:
             console.print(f"Results: {out}", soft_wrap=True)
-    if result.problems:
+    if result.problems or result.sigma0 > SUSPICIOUS_SIGMA0:
         raise typer.Exit(ExitStatus.PROBLEM)
 
 

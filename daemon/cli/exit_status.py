@@ -59,7 +59,7 @@ PROBLEMS: Final = {
     "calibrate": "the input does not determine the calibration",
     "calibrate thermal": "the flights change nothing",
     "calibrate validity": "a sensor was displaced, or the mission cannot be read",
-    "adjust": "the adjustment did not converge, or the project is inconsistent",
+    "adjust": "the adjustment did not converge, or the project is inconsistent (sigma0 beyond 20)",
     "force-ip": "the head does not answer, or keeps its address",
     "demo": "an exposure was lost, or the emulator or the service ended",
     "sim": "the emulator did not start",

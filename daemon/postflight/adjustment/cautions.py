@@ -10,6 +10,10 @@ from scipy import stats
 
 from daemon.postflight.adjustment.contradictions import SUSPICIOUS_SIGMA0
 from daemon.postflight.adjustment.separate_blocks import separate_blocks
+from daemon.postflight.adjustment.variance_factors import (
+    fine_positions,
+    variance_factor_cautions,
+)
 from processing.bundle.adjust import Adjustment
 from processing.bundle.adjustment_results import PointDifferences, exposures_of
 from processing.bundle.data_snooping import observation_name
@@ -76,6 +80,9 @@ def cautions_of(result: Adjustment, checks: PointDifferences) -> list[str]:
             f"sigma0 is {result.sigma0:.5g}: image coordinates may be of another unit, y may point "
             "down, a sigma may be of another unit, or blunders are in the observations (--reject)"
         )
+    else:
+        found += variance_factor_cautions(result)
+    found += fine_positions(result)
     found += _largest_residual(result)
     found += _weak_orientations(result) or _check_points(checks)
     groups = separate_blocks(result.network)

@@ -13,6 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from daemon.postflight.adjustment.exchanged_columns import exchanged_by_shape
 from processing import ProcessingError
 from processing.bundle.adjust import Adjustment, AdjustmentSettings, adjust
 from processing.bundle.data_snooping import names_of
@@ -146,6 +147,8 @@ def contradicting_control(network: Network, sigma0: float | None) -> list[str]:
     if len(known) < _MIN_CONTROL:
         return []
     given, found = points.xyz_m[known], result.state.points[known]
+    if exchanged := exchanged_by_shape(given, found):
+        return exchanged
     fitted = _fit_of_most(found, given)
     if fitted is None:
         return []

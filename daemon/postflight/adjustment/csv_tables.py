@@ -22,6 +22,7 @@ UNUSED = "unused"
 _SEPARATORS = {";": "semicolons", "\t": "tabulators"}
 _MAX_BYTES = 2_000_000_000
 _MAX_PROBLEMS = 30
+_MAX_LISTED = 10
 
 
 class ProjectError(ProblemList, DaemonError, ValueError):
@@ -38,6 +39,8 @@ class CsvTable:
     lines: list[int]
     header: int = 1
     problems: list[str] = field(default_factory=list)
+    remarks: list[int] = field(default_factory=list)
+    """Lines after the header that begin with # and contain a comma: rows that were left out."""
 
     def has(self, column: str) -> bool:
         return column in self.columns
@@ -69,9 +72,7 @@ class CsvTable:
         found = []
         for row, line in zip(self.rows, self.lines, strict=True):
             try:
-                value = float(row[at]) if row[at] else default
-                if row[at] and not math.isfinite(value):
-                    raise ValueError
+                value = _number(row[at]) if row[at] else default
             except ValueError:
                 self.add_problem(line, f"{column} is {row[at]!r}; a number is right")
                 value = default
@@ -89,10 +90,29 @@ class CsvTable:
         values = zip(unused, found.numbers(column), strict=True)
         return [math.inf if off else value for off, value in values]
 
+    def remark_sentences(self) -> list[str]:
+        """A sentence where remarks after the header may be rows that were left out."""
+        if not self.remarks:
+            return []
+        listed = ", ".join(str(line) for line in self.remarks[:_MAX_LISTED])
+        more = ", ..." if len(self.remarks) > _MAX_LISTED else ""
+        return [
+            f"{self.file}: {len(self.remarks)} lines that begin with # contain a comma and are "
+            f"left out as remarks (line {listed}{more}); quote a name that begins with #"
+        ]
+
     def add_problem(self, line: int, what: str) -> None:
         problem = f"{self.file}:{line}: {what}"
         if len(self.problems) < _MAX_PROBLEMS and problem not in self.problems:
             self.problems.append(problem)
+
+
+def _number(cell: str) -> float:
+    """A finite decimal number in ASCII digits; float() reads 1_000 and full-width digits too."""
+    value = float(cell)
+    if not math.isfinite(value) or not cell.isascii() or "_" in cell:
+        raise ValueError(cell)
+    return value
 
 
 def read_table(path: Path, needed: Sequence[str], known: Sequence[str]) -> CsvTable:
@@ -104,8 +124,8 @@ def read_table(path: Path, needed: Sequence[str], known: Sequence[str]) -> CsvTa
         known: columns it may have in addition.
 
     Raises:
-        ProjectError: no such file, columns that are missing or not known, or a remark that looks
-            like a row.
+        ProjectError: no such file, columns that are missing, not known or named twice, or a remark
+            that looks like a row.
     """
     try:
         text = read_regular_file(path, _MAX_BYTES).decode("utf-8-sig")
@@ -117,6 +137,7 @@ def read_table(path: Path, needed: Sequence[str], known: Sequence[str]) -> CsvTa
     rows: list[list[str]] = []
     lines: list[int] = []
     problems: list[str] = []
+    remarks: list[int] = []
     header = 1
     for number, line in enumerate(text.splitlines(), 1):
         bare = line.strip()
@@ -129,6 +150,8 @@ def read_table(path: Path, needed: Sequence[str], known: Sequence[str]) -> CsvTa
                     f"{path.name}:{number}: {name!r} looks like a name, and # begins a remark: "
                     "write a space after the # of a remark, or rename it"
                 )
+            elif columns and "," in bare:
+                remarks.append(number)
             continue
         cells = [cell.strip() for cell in next(csv.reader([bare]))]
         if not columns:
@@ -142,6 +165,9 @@ def read_table(path: Path, needed: Sequence[str], known: Sequence[str]) -> CsvTa
                 )
             missing = [c for c in needed if c not in columns]
             foreign = [c for c in columns if c not in needed and c not in known]
+            repeated = list(dict.fromkeys(c for c in columns if c and columns.count(c) > 1))
+            if repeated:
+                problems.append(f"{path.name}:{number}: columns {repeated} are named twice")
             if missing:
                 problems.append(f"{path.name}:{number}: columns {missing} are missing")
             if foreign:
@@ -164,7 +190,7 @@ def read_table(path: Path, needed: Sequence[str], known: Sequence[str]) -> CsvTa
         problems.append(f"{path.name}: empty; its first line names the columns {list(needed)}")
     if problems:
         raise ProjectError(problems)
-    return CsvTable(path.name, columns, rows, lines, header)
+    return CsvTable(path.name, columns, rows, lines, header, remarks=remarks)
 
 
 def is_row(remark: str, columns: Sequence[str]) -> bool:
@@ -177,7 +203,9 @@ def is_row(remark: str, columns: Sequence[str]) -> bool:
     Returns:
         True where a name that begins with # was probably meant.
     """
-    return len(columns) > 1 and remark[1:2].isalnum() and remark.count(",") == len(columns) - 1
+    first = remark.lstrip("#")[:1]
+    has_name = bool(first) and not first.isspace()
+    return len(columns) > 1 and has_name and remark.count(",") == len(columns) - 1
 
 
 def write_table(

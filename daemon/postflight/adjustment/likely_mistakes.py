@@ -7,15 +7,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import combinations
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from daemon.postflight.adjustment.contradictions import (
+    SUSPICIOUS_SIGMA0,
     contradicting_control,
     contradicting_orientations,
     explaining,
     planted_blunders,
+)
+from daemon.postflight.adjustment.exchanged_columns import (
+    control_of_given_exposures,
+    exchanged_columns,
 )
 from daemon.postflight.adjustment.given_projections import (
     degrees_for_metres,
@@ -25,9 +32,13 @@ from daemon.postflight.adjustment.given_projections import (
 )
 from daemon.postflight.adjustment.separate_blocks import unplaced_blocks
 from processing.bundle.camera_model import perspective_mm
-from processing.bundle.initial_values import completed
-from processing.bundle.network import Network, NetworkError, no_distances, no_gnss
+from processing.bundle.network import Network, no_distances, no_gnss
 from processing.bundle.rank_diagnosis import RankDefect
+
+Array = NDArray[np.float64]
+
+_AS_GOOD: Final = 1.5
+"""Ratio of sigma0 within which two explanations are named."""
 
 _OTHER_DISTANCE: Final = 1.2
 """Ratio of principal distances from which another one is tried."""
@@ -49,7 +60,18 @@ _MIN_BASE: Final = 0.02
 
 _DATUM_DEFECTS: Final = 7
 _MAX_LISTED: Final = 5
-_MAX_PAIRS_OF: Final = 60
+_AWAY: Final = 5.0
+"""Distance over that of most from which an antenna position is another one."""
+
+_CROSSWISE: Final = 0.1
+"""Of the distance of two antennas: as near to each other's positions they are exchanged."""
+
+_LENGTH_UNITS: Final = (
+    (10.0, "centimetres"),
+    (25.4, "inches"),
+    (1000.0, "metres"),
+)
+_UNIT_EXACT: Final = 0.02
 
 
 def likely_mistakes(network: Network, sigma0: float | None) -> list[str]:
@@ -74,9 +96,10 @@ def likely_mistakes(network: Network, sigma0: float | None) -> list[str]:
         or contradicting_orientations(network, sigma0)
         or _another_principal_distance(network, sigma0)
         or _control_of_another_unit(network)
+        or exchanged_columns(network)
         or misplaced_control(network)
         or _contradicting_distances(network, sigma0)
-        or _contradicting_positions(network, sigma0)
+        or _positions_or_principal_distance(network, sigma0)
         or contradicting_control(network, sigma0)
         or planted_blunders(network, sigma0)
     )
@@ -159,25 +182,12 @@ def _is_at_one_place(network: Network) -> bool:
 def _control_of_another_unit(network: Network) -> list[str]:
     """Distances between control points against those of their intersections from the exposures."""
     points = network.points
-    given = np.asarray(np.isfinite(points.xyz_m).all(axis=1) & ~points.at_infinity)
-    weighted = np.asarray((np.nan_to_num(points.sigma_m, nan=-1.0) >= 0.0).all(axis=1))
-    control = given & weighted
-    table, images = network.image_points, network.images
-    rays = np.bincount(table.point, minlength=len(points.names))
-    own = np.flatnonzero(control & (rays >= 2))[:_MAX_PAIRS_OF]
-    rotation = network.attitudes.rotation[images.attitude].reshape(-1, 9)
-    placed = np.column_stack([network.stations.position_m[images.station], rotation])
-    oriented = np.asarray(np.isfinite(placed).all(axis=1))
-    if len(own) < _MIN_CONTROL or not oriented[table.image].all():
-        return []
-    unknown = np.where(control[:, None], np.nan, points.xyz_m)
-    try:
-        found = completed(replace(network, points=replace(points, xyz_m=unknown))).points.xyz_m
-    except NetworkError:
+    own, found = control_of_given_exposures(network)
+    if len(own) < _MIN_CONTROL:
         return []
     first, second = np.triu_indices(len(own), 1)
     apart = np.linalg.norm(points.xyz_m[own[first]] - points.xyz_m[own[second]], axis=1)
-    of_rays = np.linalg.norm(found[own[first]] - found[own[second]], axis=1)
+    of_rays = np.linalg.norm(found[first] - found[second], axis=1)
     usable = of_rays > 0.0
     if not usable.any():
         return []
@@ -203,21 +213,67 @@ def _another_principal_distance(network: Network, sigma0: float | None) -> list[
     ratio = principal_distance_ratio(network)
     if 1.0 / _OTHER_DISTANCE < ratio < _OTHER_DISTANCE:
         return []
+    found = _freed_principal_distance(network, sigma0, ratio)
+    return [] if found is None else [found[1]]
+
+
+def _freed_principal_distance(
+    network: Network, sigma0: float | None, ratio: float
+) -> tuple[float, str] | None:
+    """Sigma0 with principal distances free, and the sentence; None where these do not explain it.
+
+    Args:
+        network: as given.
+        sigma0: of the adjustment as given; None where it failed.
+        ratio: of the starting values and the given principal distances.
+    """
     cameras = tuple(
         replace(camera, f_mm=camera.f_mm * ratio, free=camera.free | {"df"})
         for camera in network.cameras
     )
     result = explaining(replace(network, cameras=cameras), sigma0)
     if result is None:
-        return []
-    found = [
-        f"{perspective_mm(camera, result.state.interior[k])[0]:.5g} mm (f_mm {given.f_mm:g})"
-        for k, (camera, given) in enumerate(zip(cameras, network.cameras, strict=True))
+        return None
+    estimated = [
+        perspective_mm(camera, result.state.interior[k])[0] for k, camera in enumerate(cameras)
     ]
-    return [
+    found = [
+        f"{f_mm:.5g} mm (f_mm {given.f_mm:g})"
+        for f_mm, given in zip(estimated, network.cameras, strict=True)
+    ]
+    sentence = (
         f"the principal distance is wrong: estimated, it is {', '.join(found)} and sigma0 is "
         f"{result.sigma0:.4g}"
+    )
+    shares = [f / given.f_mm for f, given in zip(estimated, network.cameras, strict=True)]
+    for factor, unit in _LENGTH_UNITS:
+        if all(abs(share * factor - 1.0) < _UNIT_EXACT for share in shares):
+            sentence += f": the image coordinates may be in {unit}, millimetres are right"
+        if all(abs(share / factor - 1.0) < _UNIT_EXACT for share in shares):
+            sentence += f": f_mm may be in {unit}, millimetres are right"
+    return result.sigma0, sentence
+
+
+def _positions_or_principal_distance(network: Network, sigma0: float | None) -> list[str]:
+    """Antenna positions and a principal distance that is off by little: the better one first.
+
+    A wrong principal distance moves exposures up or down as wrong heights of antennas do.
+    """
+    found = [
+        one
+        for one in (
+            _contradicting_positions(network, sigma0),
+            _freed_principal_distance(network, sigma0, 1.0)
+            if not any("df" in camera.free for camera in network.cameras)
+            else None,
+        )
+        if one is not None
     ]
+    found.sort()
+    if not found or found[0][0] > SUSPICIOUS_SIGMA0:
+        return []
+    best = found[0][0]
+    return [sentence for own, sentence in found if own < _AS_GOOD * best]
 
 
 def _contradicting_distances(network: Network, sigma0: float | None) -> list[str]:
@@ -238,29 +294,75 @@ def _contradicting_distances(network: Network, sigma0: float | None) -> list[str
     ]
 
 
-def _contradicting_positions(network: Network, sigma0: float | None) -> list[str]:
-    """By how much antenna positions are off, where the block without them is good."""
+def _contradicting_positions(network: Network, sigma0: float | None) -> tuple[float, str] | None:
+    """By how much antenna positions are off, where the block without them is good.
+
+    Args:
+        network: as given.
+        sigma0: of the adjustment as given; None where it failed.
+
+    Returns:
+        Sigma0 without them, and the sentence.
+    """
     given = network.gnss
     if not len(given.station):
-        return []
+        return None
     result = explaining(replace(network, gnss=no_gnss()), sigma0)
     if result is None:
-        return []
+        return None
     rotation = result.state.attitude[given.attitude]
-    antenna = result.state.station[given.station]
-    antenna = antenna + np.einsum("nij,nj->ni", rotation, given.lever_m)
+    lever = np.einsum("nij,nj->ni", rotation, given.lever_m)
+    antenna = result.state.station[given.station] + lever
+    beginning = (
+        "antenna positions contradict the other observations, without them sigma0 is "
+        f"{result.sigma0:.4g}: "
+    )
+    if named := _other_positions(network, antenna):
+        return result.sigma0, f"{beginning}{', '.join(named)}"
     mean = (given.position_m - antenna).mean(axis=0)
     spread = (given.position_m - antenna).std(axis=0)
     sentence = (
-        "antenna positions contradict the other observations, without them sigma0 is "
-        f"{result.sigma0:.4g}: on average they are {mean[0]:.3g}, {mean[1]:.3g}, {mean[2]:.3g} m "
+        f"{beginning}on average they are {mean[0]:.3g}, {mean[1]:.3g}, {mean[2]:.3g} m "
         f"off in X, Y, Z (standard deviations {spread[0]:.2g}, {spread[1]:.2g}, {spread[2]:.2g} m)"
     )
     if abs(mean[2]) > _CONSTANT * max(spread[2], abs(mean[0]), abs(mean[1])):
         sentence += ": are they ellipsoidal heights, and the control points' above sea level?"
     elif (spread > np.abs(mean)).any():
         sentence += ": is their unit another one, or are X and Y exchanged?"
-    return [sentence]
+    return result.sigma0, sentence
+
+
+def _other_positions(network: Network, antenna: Array) -> list[str]:
+    """Exposures whose antenna positions are farther off than those of most, and exchanged ones.
+
+    Args:
+        network: as given.
+        antenna: positions without the given ones, (n, 3) m.
+    """
+    given, names = network.gnss, network.stations.names
+    off = given.position_m - antenna
+    off = off - np.median(off, axis=0)
+    away = np.linalg.norm(off, axis=1)
+    own = np.nan_to_num(given.sigma_m, posinf=0.0).max(axis=1)
+    limit = _AWAY * max(float(np.median(away)), float(np.median(own)))
+    wrong = [int(k) for k in np.argsort(-away) if away[k] > limit]
+    if not wrong or len(wrong) > len(away) / 2:
+        return []
+    found = [
+        f"{names[given.station[k]]} is {away[k]:.3g} m farther off than most"
+        for k in wrong[:_MAX_LISTED]
+    ]
+    if len(wrong) > _MAX_LISTED:
+        found.append(f"{len(wrong) - _MAX_LISTED} others too")
+    for a, b in combinations(wrong[:_MAX_LISTED], 2):
+        crosswise = max(
+            float(np.linalg.norm(given.position_m[a] - antenna[b])),
+            float(np.linalg.norm(given.position_m[b] - antenna[a])),
+        )
+        if crosswise <= max(limit, _CROSSWISE * float(np.linalg.norm(antenna[a] - antenna[b]))):
+            pair = sorted((names[given.station[a]], names[given.station[b]]))
+            found.append(f"{pair[0]} and {pair[1]} are exchanged")
+    return found
 
 
 def _mirrored(network: Network, sigma0: float | None) -> list[str]:

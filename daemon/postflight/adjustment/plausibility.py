@@ -53,8 +53,8 @@ def check_observations(table: CsvTable, columns: Sequence[str], names: Sequence[
     check_rows(table)
     check_sigmas(table, columns)
     for column in columns:
-        for value, line in zip(table.sigmas(column), table.lines, strict=True):
-            if np.isnan(value):
+        for value, line in zip(table.text(column), table.lines, strict=True):
+            if not value:
                 table.add_problem(line, f"{column} is empty; a sigma, or {UNUSED}, is right")
     first: dict[str, int] = {}
     for name, line in zip(names, table.lines, strict=True):
@@ -67,14 +67,18 @@ def check_observations(table: CsvTable, columns: Sequence[str], names: Sequence[
         first.setdefault(name, line)
 
 
-def check_rows(table: CsvTable) -> None:
+def check_rows(table: CsvTable, *, is_needed: bool = False) -> None:
     """Report a table that has names of columns only.
 
     Args:
         table: problems are added to it.
+        is_needed: whether no project is without it.
     """
+    advice = f"add a row for each of the {table.columns[0]}s"
+    if not is_needed:
+        advice = "remove the table from [files] if it has none"
     if not table.rows:
-        table.add_problem(table.header, "no rows; remove the table from [files] if it has none")
+        table.add_problem(table.header, f"no rows; {advice}")
 
 
 def check_image_points(

@@ -7,7 +7,7 @@ network and found by `processing.bundle.initial_values`.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -25,15 +25,23 @@ from daemon.postflight.adjustment.plausibility import (
     check_observations,
     check_rows,
 )
-from daemon.postflight.adjustment.project_file import (
-    CameraSection,
-    ProjectFile,
-    read_project_file,
+from daemon.postflight.adjustment.project_camera import camera_of
+from daemon.postflight.adjustment.project_file import ProjectFile, read_project_file
+from daemon.postflight.adjustment.repeated_measurements import (
+    check_repeated_images,
+    repeated_points,
+)
+from daemon.postflight.adjustment.sigma_bounds import (
+    check_coordinates,
+    check_degrees,
+    check_distance_sigmas,
+    check_image_sigmas,
+    check_metres,
+    extent_m,
 )
 from processing.bundle.adjust import AdjustmentSettings
 from processing.bundle.curvature_refraction import RayModel
 from processing.bundle.network import (
-    INTERIOR,
     Attitudes,
     CameraModel,
     Distances,
@@ -50,9 +58,7 @@ from processing.bundle.network import (
     no_gnss,
     no_measured_attitudes,
 )
-from processing.bundle.self_calibration import parts_of, with_self_calibration
 from processing.geometry.rotation import rotation_matrix
-from processing.rig import RigError, find_rig, shipped_rigs
 
 Array = NDArray[np.float64]
 
@@ -73,13 +79,14 @@ class CheckPoints:
 
 @dataclass(frozen=True)
 class Project:
-    """A network, the settings of its adjustment, and its check points."""
+    """A network, the settings of its adjustment, its check points, and what is suspicious."""
 
     name: str
     file: ProjectFile
     network: Network
     settings: AdjustmentSettings
     checks: CheckPoints
+    cautions: tuple[str, ...] = ()
 
 
 def read_project(path: Path) -> Project:
@@ -91,7 +98,7 @@ def read_project(path: Path) -> Project:
     file = read_project_file(path)
     folder = path.parent
     problems: list[str] = []
-    cameras = tuple(_camera(section, folder, problems) for section in file.camera)
+    cameras = tuple(camera_of(section, folder, problems) for section in file.camera)
     heads = tuple(head_of(section) for section in file.head)
     images = _read(folder, file.files.images, ("image", "camera"), ("exposure", "head", *ANGLES))
     exposures = _optional(
@@ -105,6 +112,7 @@ def read_project(path: Path) -> Project:
         ("x_mm", "y_mm", "column_px", "row_px", "sx_um", "sy_um"),
     )
     build = _TableIndex(images, exposures, seen, points, problems)
+    check_rows(images, is_needed=True)
     for table in (exposures, points):
         if table is not None:
             check_rows(table)
@@ -147,7 +155,9 @@ def read_project(path: Path) -> Project:
         free_datum=a.free_datum,
         datum_names=a.datum_names,
     )
-    return Project(file.name, file, network, settings, build.checks())
+    remarks = [sentence for table in build.tables for sentence in table.remark_sentences()]
+    cautions = (*remarks, *build.cautions)
+    return Project(file.name, file, network, settings, build.checks(), cautions)
 
 
 class _TableIndex:
@@ -159,6 +169,7 @@ class _TableIndex:
     ) -> None:  # fmt: skip
         self.tables = [t for t in (images, exposures, seen, points) if t is not None]
         self.problems = problems
+        self.cautions: list[str] = []
         self._images, self._exposures, self._seen, self._points = images, exposures, seen, points
         self.image_names = images.names("image")
         listed = exposures.names("exposure") if exposures is not None else []
@@ -184,6 +195,11 @@ class _TableIndex:
         self.image_at = {name: k for k, name in enumerate(self.image_names)}
         self.point_at = {name: k for k, name in enumerate(self.point_names)}
 
+    @property
+    def extent_m(self) -> float:
+        """Of exposures and object points."""
+        return extent_m(self._exposures, self._points)
+
     def index(
         self, table: CsvTable, column: str, at: dict[str, int], what: str
     ) -> NDArray[np.int64]:
@@ -203,6 +219,7 @@ class _TableIndex:
             at = self.index(table, "exposure", self.exposure_at, "exposure")
             position[at] = np.array([table.numbers(c) for c in XYZ]).T.reshape(-1, 3)
             held[at] = self._held(table, "position")
+            check_coordinates(table, XYZ)
         return Stations(tuple(self.exposure_names), position, held)
 
     def attitudes(self) -> Attitudes:
@@ -264,6 +281,7 @@ class _TableIndex:
                     table.add_problem(
                         table.lines[k], "a sigma is negative; 0 holds, empty leaves free"
                     )
+            check_coordinates(table, XYZ)
             # A coordinate that is not known is no control, whatever sigma it has.
             sigma[: len(given)] = np.where(np.isfinite(given), sigma[: len(given)], np.nan)
         return Points(tuple(self.point_names), xyz, sigma, with_coordinates)
@@ -300,13 +318,19 @@ class _TableIndex:
 
     def check(self, network: Network, file: ProjectFile) -> None:
         """Report what cannot be right although it can be read."""
-        for table in self.tables:
-            if table.problems:
-                return
-        check_image_points(self._seen, network.image_points, network.images, network.cameras)
+        if self.problems or any(table.problems for table in self.tables):
+            return
+        check_image_sigmas(self._seen)
+        seen, at_infinity = network.image_points, network.points.at_infinity
+        check_repeated_images(self._seen, seen, at_infinity)
+        self.cautions += repeated_points(self._seen, seen)
+        check_image_points(self._seen, seen, network.images, network.cameras)
         if not self._seen.problems:
-            check_format(self._seen, network.image_points, network.images, file.camera)
+            check_format(self._seen, seen, network.images, file.camera)
         if self._points is not None:
+            known = [k for k, r in enumerate(self._roles) if r in ("control", "direction")]
+            known = [k for k in known if not network.points.at_infinity[k]]
+            check_metres(self._points, SIGMAS, self.extent_m, known)
             check_control(self._points, self._roles, network.points.xyz_m[: len(self._roles)])
 
     def _from_pixels(self, file: ProjectFile, image: NDArray[np.int64], px: Array) -> Array:
@@ -340,60 +364,6 @@ class _TableIndex:
         return np.array(found, dtype=bool)
 
 
-def _camera(section: CameraSection, folder: Path, problems: list[str]) -> CameraModel:
-    camera = CameraModel(
-        section.name,
-        section.f_mm,
-        section.xp_mm,
-        section.yp_mm,
-        section.model,
-        np.array([getattr(section, name) for name in INTERIOR]),
-        frozenset(section.free),
-        dict(section.sigma),
-        pixel_mm=None if section.pixel_um is None else section.pixel_um * 1e-3,
-    )
-    try:
-        rig = None
-        if section.rig is not None:
-            shipped = section.rig in shipped_rigs()
-            named = section.rig if shipped else str(within(folder, section.rig, "camera.rig"))
-            rig = find_rig(named)
-        camera = with_self_calibration(
-            camera,
-            section.parameters,
-            () if rig is None else parts_of(rig),
-            master_cone="" if rig is None else rig.master_cone,
-            interior=section.interior,
-            base_mm=section.base_mm,
-        )
-    except RigError as error:
-        problems += list(error.problems)
-    except ValueError as error:
-        problems.append(str(error))
-    return _with_selected_parameters(camera, section, problems)
-
-
-def _with_selected_parameters(
-    camera: CameraModel, section: CameraSection, problems: list[str]
-) -> CameraModel:
-    """Without the parameters that were dropped, and with the values of terms that are known."""
-    names = {t.name for t in camera.terms}
-    foreign = [n for n in section.without if n not in names and n not in camera.free]
-    foreign += [n for n in section.terms if n not in names]
-    if foreign:
-        problems.append(f"camera {camera.name}: {foreign} are not parameters of its set")
-    terms = tuple(
-        replace(t, value=section.terms.get(t.name, t.value))
-        for t in camera.terms
-        if t.name not in section.without
-    )
-    left = {t.name for t in terms}
-    gauges = tuple(g for g in camera.gauges if set(g) <= left)
-    return replace(
-        camera, free=camera.free - frozenset(section.without), terms=terms, gauges=gauges
-    )
-
-
 def _rotation(angles_deg: Array) -> Array:
     return rotation_matrix(*np.radians(angles_deg))
 
@@ -419,6 +389,7 @@ def _distances(folder: Path, file: ProjectFile, build: _TableIndex) -> Distances
         return no_distances()
     build.tables.append(table)
     check_distances(table)
+    check_distance_sigmas(table)
     return Distances(
         build.index(table, "point_a", build.point_at, "point"),
         build.index(table, "point_b", build.point_at, "point"),
@@ -445,6 +416,8 @@ def _gnss(folder: Path, file: ProjectFile, build: _TableIndex) -> Gnss:
             for name, own in zip(table.text("exposure"), levers, strict=True)
         ],
     )
+    check_coordinates(table, XYZ)
+    check_metres(table, SIGMAS, max(build.extent_m, extent_m(table)))
     station = build.index(table, "exposure", build.exposure_at, "exposure")
     attitude = np.array([build.attitude_at.get(n, -1) for n in table.text("exposure")])
     for row in np.flatnonzero((attitude < 0) & (levers != 0.0).any(axis=1)):
@@ -490,6 +463,7 @@ def _bearings(folder: Path, file: ProjectFile, build: _TableIndex) -> MeasuredAt
         table.add_problem(table.header, "sigma_deg, or sx_deg, sy_deg and sz_deg; not both")
     names = [f"the attitude of exposure {name}" for name in table.text("exposure")]
     check_observations(table, tuple(dict.fromkeys(own)), names)
+    check_degrees(table, tuple(dict.fromkeys(own)))
     angles = np.array([table.numbers(c) for c in ANGLES]).T.reshape(-1, 3)
     return MeasuredAttitudes(
         build.index(table, "exposure", build.attitude_at, "attitude of exposure"),

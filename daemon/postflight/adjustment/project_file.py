@@ -5,13 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from daemon.mission.foreign_files import ForeignFileError, read_regular_file
 from daemon.postflight.adjustment.csv_tables import ProjectError
 from processing.bundle.critical_values import TestName
 from processing.bundle.free_datum import FreeDatum
-from processing.bundle.network import Model
+from processing.bundle.network import INTERIOR, Model
 from processing.bundle.robust_weights import WeightFunction
 from processing.bundle.self_calibration import SetName
 from processing.rig.problem_sentences import findings_of, line_finder, sentences
@@ -43,7 +43,7 @@ class AdjustSection(_ProjectSection):
     gnss: Literal["none", "shift", "linear"] = "none"
     earth_radius_m: float | None = Field(default=None, gt=1e6)
     refraction: bool = False
-    ground_m: float = 0.0
+    ground_m: float = Field(default=0.0, ge=-12_000.0, le=20_000.0)
 
     @model_validator(mode="after")
     def _one_limit(self) -> AdjustSection:
@@ -104,6 +104,13 @@ class CameraSection(_ProjectSection):
     rig: str | None = None
     without: tuple[str, ...] = ()
     terms: dict[str, float] = {}
+
+    @field_validator("free")
+    @classmethod
+    def _known_parameters(cls, free: tuple[str, ...]) -> tuple[str, ...]:
+        if foreign := [name for name in free if name not in INTERIOR]:
+            raise ValueError(f"{foreign} are not among {', '.join(INTERIOR)}")
+        return free
 
 
 class AdjustmentHeadSection(_ProjectSection):

@@ -5,9 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,50 +14,17 @@ from typer.testing import CliRunner
 from daemon.cli import app
 from daemon.configuration.model import ConfigurationError
 from daemon.postflight.adjustment.csv_tables import ProjectError, read_table, write_table
-from daemon.postflight.adjustment.project import CheckPoints
-from daemon.postflight.adjustment.project_file import AdjustSection, CameraSection, ProjectFile
-from daemon.postflight.adjustment.project_writer import RESIDUAL_COLUMNS, write_project
+from daemon.postflight.adjustment.project_writer import RESIDUAL_COLUMNS
 from daemon.postflight.adjustment.reliability_report import OBSERVATION_COLUMNS
-from processing.bundle.network import Distances
-from tests.processing.bundle.simulated_networks import aerial
+from tests.daemon.postflight.small_adjustment_block import adjusted_report as _report
+from tests.daemon.postflight.small_adjustment_block import changed_cell as _cell
+from tests.daemon.postflight.small_adjustment_block import write_small_block
 
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A small block with GNSS positions and a distance."""
-    simulated = aerial(seed=3, sigma_mm=1e-3, points=40, gnss_sigma_m=0.05)
-    length = float(np.linalg.norm(simulated.points[10] - simulated.points[11]))
-    network = replace(
-        simulated.network,
-        distances=Distances(np.array([10]), np.array([11]), np.array([length]), np.array([0.01])),
-    )
-    folder = tmp_path_factory.mktemp("mistakes") / "block"
-    file = ProjectFile(
-        format=1,
-        name="block",
-        adjust=AdjustSection(),
-        camera=(CameraSection(name="c", f_mm=70.0),),
-    )
-    nothing = np.zeros((0, 3))
-    write_project(folder, file, network, CheckPoints((), nothing, nothing))
-    return folder
-
-
-def _cell(row: int, column: str, change: Callable[[str], str]) -> Callable[[str], str]:
-    """Change a cell of a table; rows count from 0 after the names of columns, -1 is every row."""
-
-    def changed(text: str) -> str:
-        lines = text.splitlines()
-        header = next(k for k, line in enumerate(lines) if not line.startswith("#"))
-        at = lines[header].split(",").index(column)
-        for k in range(header + 1, len(lines)):
-            if row in (-1, k - header - 1):
-                cells = lines[k].split(",")
-                cells[at] = change(cells[at])
-                lines[k] = ",".join(cells)
-        return "\n".join(lines) + "\n"
-
-    return changed
+    return write_small_block(tmp_path_factory.mktemp("mistakes") / "block")
 
 
 def _scaled(factor: float) -> Callable[[str], str]:
@@ -95,9 +60,21 @@ MISTAKES = {
     "no image points": ("image_points.csv", _emptied, "no rows"),
     "no image sigma": ("image_points.csv", _cell(4, "sx_um", lambda _: "0"), "sx_um is 0;"),
     "no GNSS sigma": ("gnss.csv", _cell(1, "sz_m", lambda _: "-0.1"), "sz_m is -0.1;"),
-    "no distance sigma": ("distances.csv", _cell(0, "sigma_m", lambda _: "0"), "sigma_m is 0;"),
-    "to itself": ("distances.csv", _cell(0, "point_b", lambda _: "p10"), "from p10 to itself"),
-    "no distance": ("distances.csv", _cell(0, "distance_m", lambda _: "0"), "distance_m is 0;"),
+    "no distance sigma": (
+        "distances.csv",
+        _cell(0, "sigma_m", lambda _: "0"),
+        "sigma_m is 0;",
+    ),
+    "to itself": (
+        "distances.csv",
+        _cell(0, "point_b", lambda _: "p10"),
+        "from p10 to itself",
+    ),
+    "no distance": (
+        "distances.csv",
+        _cell(0, "distance_m", lambda _: "0"),
+        "distance_m is 0;",
+    ),
     "identical": ("points.csv", _copied, "has the coordinates of "),
     "semicolons": (
         "points.csv",
@@ -110,7 +87,11 @@ MISTAKES = {
         _cell(0, "x_m", lambda v: v.replace(".", ",")),
         "write decimals with points",
     ),
-    "remark": ("image_points.csv", _cell(3, "image", lambda v: f"#{v}"), "looks like a name"),
+    "remark": (
+        "image_points.csv",
+        _cell(3, "image", lambda v: f"#{v}"),
+        "looks like a name",
+    ),
 }
 
 
@@ -169,15 +150,9 @@ def test_sigmas_of_another_unit_fail_the_global_test(written, tmp_path) -> None:
     path.write_text(change(path.read_text()))
     report = json.loads(CliRunner().invoke(app, ["adjust", str(folder), "--json"]).stdout)
     assert report["global_test"]["passed"] is False
-    (caution,) = report["cautions"]
-    assert "a sigma may be of another unit" in caution
-
-
-def _report(folder: Path, *options: str) -> dict[str, Any]:
-    outcome = CliRunner().invoke(app, ["adjust", str(folder), "--json", *options])
-    assert outcome.exception is None, outcome.output
-    report: dict[str, Any] = json.loads(outcome.stdout)
-    return report
+    first, second, *_ = report["cautions"]
+    assert "a sigma may be of another unit" in first
+    assert second.startswith("image x: the variance factor is ")
 
 
 @pytest.mark.parametrize(
