@@ -103,7 +103,7 @@ def test_a_file_and_a_folder_are_hashed(tmp_path: Path, monkeypatch: pytest.Monk
     for name in ("__init__.py", "one.py", "two.py", "folder/three.py"):
         (tmp_path / "pack" / name).write_text("")
     monkeypatch.syspath_prepend(tmp_path)
-    import pack  # type: ignore[import-not-found]
+    import pack  # type: ignore[import-not-found]  # written above
 
     related = {pack: ("one.py", "folder")}
     hashes = [code_sha256(related)]
