@@ -36,11 +36,15 @@ class Note:
 
 @dataclass(frozen=True)
 class Attempt:
-    """One computation of an exposure by a process, and how it ended."""
+    """One computation of an exposure by a process, and how it ended.
+
+    `cause` is the index of the note that explains the end, where it is not of the process.
+    """
 
     number: int
     process: int
     end: str
+    cause: int = -1
 
 
 class NoteFile:
@@ -76,9 +80,9 @@ def read_notes(path: Path) -> list[Note]:
 def attempts_of(notes: Sequence[Note]) -> list[Attempt]:
     """The computations of a run in the order of their begin.
 
-    An attempt without an end of its own is explained by the kill of its process, by the kill of a
-    scheduler after its begin, or by an interruption of the command after it; otherwise its end is
-    "unexplained".
+    An attempt without an end of its own is explained by the kill of its process, or by the first
+    kill of a scheduler or interruption of the command while it was the last one of its process;
+    otherwise its end is "unexplained".
 
     Args:
         notes: in their order.
@@ -89,8 +93,14 @@ def attempts_of(notes: Sequence[Note]) -> list[Attempt]:
             continue
         later = notes[index + 1 :]
         end = _own_end(note, later)
-        if end not in NOT_COMPUTED:
-            found.append(Attempt(note.number, note.process, end or _other_end(note, later)))
+        if end in NOT_COMPUTED:
+            continue
+        if end:
+            found.append(Attempt(note.number, note.process, end))
+        else:
+            other, offset = _other_end(note, later)
+            cause = -1 if offset < 0 else index + 1 + offset
+            found.append(Attempt(note.number, note.process, other, cause))
     return found
 
 
@@ -102,11 +112,14 @@ def repeated(attempts: Iterable[Attempt]) -> dict[int, list[Attempt]]:
     return {number: list(them) for number, them in of.items() if len(them) > 1}
 
 
-def violations(attempts: Sequence[Attempt]) -> list[str]:
+def violations(attempts: Sequence[Attempt], workers: int) -> list[str]:
     """What the kills and failed writes of a run do not explain, one sentence each.
+
+    A kill of the scheduler costs at most what was in work: one exposure for each worker.
 
     Args:
         attempts: of the run.
+        workers: their number.
     """
     sentences = []
     for number, them in sorted(repeated(attempts).items()):
@@ -124,6 +137,14 @@ def violations(attempts: Sequence[Attempt]) -> list[str]:
         for process, count in lost.items()
         if count > 1
     ]
+    in_work = Counter(
+        (a.end, a.cause) for a in attempts if a.end in (SCHEDULER_KILLED, STOPPED) and a.cause >= 0
+    )
+    sentences += [
+        f"{end}, note {cause}: cost {count} exposures; {workers} workers had at most {workers}"
+        for (end, cause), count in in_work.items()
+        if count > workers
+    ]
     return sentences
 
 
@@ -137,8 +158,14 @@ def _own_end(begun: Note, later: Iterable[Note]) -> str:
     return ""
 
 
-def _other_end(begun: Note, later: Iterable[Note]) -> str:
-    events = {note.event for note in later if note.event != WORKER_KILLED}
-    if any(note.event == WORKER_KILLED and note.process == begun.process for note in later):
-        return WORKER_KILLED
-    return next((end for end in (SCHEDULER_KILLED, STOPPED) if end in events), "unexplained")
+def _other_end(begun: Note, later: Sequence[Note]) -> tuple[str, int]:
+    """What ended the attempt in place of its process, and the index of that note in `later`."""
+    for offset, note in enumerate(later):
+        if note.event == WORKER_KILLED and note.process == begun.process:
+            return WORKER_KILLED, offset
+    for offset, note in enumerate(later):
+        if note.event == BEGUN and note.process == begun.process:
+            break  # the process computed something else: nothing had ended it
+        if note.event in (SCHEDULER_KILLED, STOPPED):
+            return note.event, offset
+    return "unexplained", -1

@@ -5,7 +5,9 @@ worker processes of a dask cluster, in turn and without faults. Then a copy is p
 cluster while workers and the scheduler are killed at random and calls of the store fail. This
 program starts the scheduler again, as systemd would; `syntopic worker` starts its own processes
 again. At the end all products are compared, none was committed twice, and every computation that
-was repeated is explained by a kill or a failed write; otherwise the status is 1.
+was repeated is explained by a kill or a failed write. Otherwise the status is 1, as it is where
+the cluster without kills is slower than the limit, where fewer parts were killed than planned, and
+where an exposure failed.
 
 With `--hold-s` the program ends after so many seconds with status 75; the same command continues.
 """
@@ -23,7 +25,7 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
@@ -389,7 +391,7 @@ def with_kills(
         )
     attempts, noted = attempts_of(read_notes(path)), events_of(path)
     runs = [json.loads(one.read_text()) for one in sorted(options.folder.glob("killed-*.json"))]
-    problems = attempt_notes.violations(attempts)
+    problems = attempt_notes.violations(attempts, options.workers)
     if compared(copy) != compared(plain):
         problems.append("products differ from those of two processes")
     again = {
@@ -412,6 +414,32 @@ def with_kills(
     }
 
 
+def shortfalls(
+    calm: Mapping[str, Any], killed: Mapping[str, Any], planned: Mapping[str, int]
+) -> list[str]:
+    """What was measured and does not hold, or was not done as planned, one sentence each.
+
+    Args:
+        calm: result of `without_kills`.
+        killed: result of `with_kills`.
+        planned: kills by their name in `killed`.
+    """
+    problems = []
+    if calm["ratio"] > calm["bound"]:
+        problems.append(
+            f"without kills the cluster took {calm['ratio']} of the time of two processes; the "
+            f"limit is {calm['bound']}"
+        )
+    problems += [
+        f"{name}: {killed[name]} of {count} planned"
+        for name, count in planned.items()
+        if killed[name] < count
+    ]
+    if failed := len(killed["failures"]):
+        problems.append(f"{failed} exposures failed: {killed['failures'][0]}")
+    return problems
+
+
 def unfinished(mission: Mission) -> int:
     """Exposures without a manifest."""
     return sum(not product_manifests.committed_keys(mission, n) for n in mission.numbers())
@@ -426,7 +454,10 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=8)
     parser.add_argument("--kills", type=int, default=50)
     parser.add_argument("--scheduler-kills", type=int, default=2)
-    parser.add_argument("--rounds", type=int, default=3, help="runs in turn without kills")
+    parser.add_argument(
+        "--rounds", type=int, choices=range(1, 100), default=3, metavar="N",
+        help="runs in turn without kills",
+    )  # fmt: skip
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--side", type=int, default=144, help="pixels of a frame's side")
     parser.add_argument(
@@ -448,6 +479,7 @@ def main() -> None:
     print(json.dumps(calm), file=sys.stderr)
     plain = Mission.open(options.folder / "plain-0" / pristine.id)
     killed = with_kills(pristine, plain, options, hold)
+    planned = {"worker_kills": options.kills, "scheduler_kills": options.scheduler_kills}
     output: dict[str, Any] = {
         "machine": machine(),
         "load": os.getloadavg()[0],
@@ -456,9 +488,10 @@ def main() -> None:
         "seed": options.seed,
         "without_kills": calm,
         "with_kills": killed,
+        "problems": [*killed["problems"], *shortfalls(calm, killed, planned)],
     }
     print(json.dumps(output))
-    if killed["problems"]:
+    if output["problems"]:
         sys.exit(1)
 
 
