@@ -29,6 +29,7 @@ FOLDERS = (
 MODULES = (
     *("daemon/mission/canonical_json.py", "daemon/mission/catalog/catalog.py"),
     *("daemon/mission/store/health.py", "daemon/mission/store/file_tree.py"),
+    "daemon/mission/store/product_manifests.py",
     *("daemon/mission/transfer/transfer.py", "daemon/mission/transfer/transfer_manifest.py"),
     *("daemon/postflight/landing_job.py", "processing/pipelines/live_triangulation.py"),
 )
@@ -71,6 +72,7 @@ NOT_ON_PAGE = {
     "daemon/onboard/monitoring/web/page_files.py": "a header of HTTP",
     "daemon/onboard/preflight/kernel_counters.py": ON_CONSOLE,
     "daemon/onboard/preflight/network_diagnosis.py": ON_CONSOLE,
+    "daemon/onboard/preflight/service_file.py": CONFIGURATION,
     "daemon/onboard/preflight/system_check.py": ON_CONSOLE,
     "daemon/onboard/service/message_dispatcher.py": "an error of the service's own code",
     "daemon/onboard/triangulation/live_record.py": "text of a file",
@@ -108,6 +110,7 @@ PARTS = (
     r"^(boresight|attitude) about the|^lever arm along the",
     r"^(boresight|attitude|time offset|principal distance)( about.*)? per (hour|K)$",
     r"^no disk of Syntopic$|^SU11 is at SU11; mount the right one",
+    r"^compute it again: syntopic process",
     r" exposures and SU11 frames are verified$|^SU11; nothing is wrong$",
 )
 """Parts of sentences; the sentences themselves are in `COMPOSED`, or elsewhere in the tests."""
@@ -121,10 +124,12 @@ NO_SENTENCES = (
     r"^flight plan of format 1|^seals of logs by|^may be added to until|^mission laid out",
     r"(closed by repair at|is open:).*if the newest|^flight log, |^format 1: the removal",
     r"^the next record, the last|^record of a mission laid|^frame without a hash",
-    r"^capture record of format",
+    r"^capture record of format|^As the client has it|is being computed by another process$",
 )
 """Refusals and remarks that only a command prints, and SQL."""
 COMPOSED = (
+    "L2/000001/LEFT.tif: differs from its manifest; compute it again: syntopic process MISSION "
+    "--again --only 1",
     "SU07 at 10.0.0.7: exposure_time_us = 4000.0 is refused (ExposureTime = 4000.0 is refused: "
     "SU11); choose a time that the head has\nSU07 at 10.0.0.7: gain_db is 3; the head has no gain "
     "in dB; it has Gain without a unit; set gain_db = 0, or gain_unit to dB or factor as its "
