@@ -7,12 +7,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from daemon.postflight.batch.control_groups import group_free_nbytes
 from processing.rig import Rig
 
 PROCESS_NBYTES: Final = 300_000_000
 """Interpreter, libraries and kernels of one process."""
-FRAMES_FACTOR: Final = 5
-"""Memory of one exposure in work, in sizes of its raw frames (benchmarks/records/memory.json)."""
+FRAMES_FACTOR: Final = 6.2
+"""Memory of one exposure in work, in sizes of its raw frames, those included.
+
+Source: benchmarks/records/bench-shared-cells.json: `ultracam-x`, with its calibrations, occupies
+2,416 MiB in addition to its frames of 432 MB.
+"""
 MEMORY_SHARE: Final = 0.8
 """Of the available memory; the rest is for the page cache that the disk is written through."""
 
@@ -29,7 +34,7 @@ class ProcessAllocation:
 def exposure_nbytes(rig: Rig) -> int:
     """Memory of a process with one exposure of this rig in work."""
     frames = sum(2 * sensor.width_px * sensor.height_px for sensor in rig.sensors)
-    return PROCESS_NBYTES + FRAMES_FACTOR * frames
+    return PROCESS_NBYTES + round(FRAMES_FACTOR * frames)
 
 
 def plan_processes(
@@ -67,25 +72,13 @@ def usable_cores() -> int:
 
 
 def available_memory_nbytes() -> int:
-    """Memory available to new work: of the machine, or of the control group if that is less.
+    """Memory available to new work: of the machine, or of a control group if that is less.
 
-    Source: proc(5), MemAvailable; Linux kernel documentation, Control Group v2, memory.max.
+    Source: proc(5), MemAvailable.
     """
     fields = dict(
         line.split(":", 1) for line in Path("/proc/meminfo").read_text("ascii").splitlines()
     )
     machine = int(fields["MemAvailable"].split()[0]) * 1024
-    group = _group_free_nbytes(Path("/sys/fs/cgroup"))
+    group = group_free_nbytes()
     return machine if group is None else min(machine, group)
-
-
-def _group_free_nbytes(folder: Path) -> int | None:
-    try:
-        limit = int((folder / "memory.max").read_text("ascii"))
-        used = int((folder / "memory.current").read_text("ascii"))
-        statistics = dict(
-            line.split() for line in (folder / "memory.stat").read_text("ascii").splitlines()
-        )
-    except (OSError, ValueError):
-        return None
-    return max(0, limit - used + int(statistics.get("inactive_file", 0)))
