@@ -21,8 +21,12 @@ from processing.bundle.adjustment_results import (
     exposures_of,
     image_residuals_mm,
 )
+from processing.bundle.correlations import high_correlations
 
 Array = NDArray[np.float64]
+
+_MAX_CORRELATIONS = 10_000
+"""Of two kinds of unknowns; a large block has more, of neighbouring exposures."""
 
 _LARGEST = 50
 _GRAD = 400.0 / 360.0
@@ -129,7 +133,7 @@ def _lines(result: Adjustment, checks: CheckPoints, report: Mapping[str, Any]) -
     if report["left_out"]:
         yield "Object points that their rays do not fix: " + ", ".join(report["left_out"])
     yield from _section(f"12 Correlations beyond {report['correlations']['limit']}")
-    yield from _correlations(report)
+    yield from _correlations(result)
     yield from _section("13 Reliability")
     yield from _reliability(report["reliability"])
     yield from _section("14 Residuals by area of the ground")
@@ -246,15 +250,17 @@ def _residuals(result: Adjustment) -> Iterator[str]:
     )
 
 
-def _correlations(report: Mapping[str, Any]) -> Iterator[str]:
-    groups = report["correlations"]["groups"]
+def _correlations(result: Adjustment) -> Iterator[str]:
+    groups = high_correlations(result, listed=_MAX_CORRELATIONS)
     if not groups:
         yield "none"
     for g in groups:
-        where = "the same owner" if g["is_of_one"] else "different owners"
-        yield f"{g['first_kind']} and {g['second_kind']} of {where}: {g['count']}"
-        for c in g["largest"]:
-            yield f"  {c['first']}, {c['second']}: {c['value']:.4f}"
+        where = "the same owner" if g.is_of_one else "different owners"
+        yield f"{g.first_kind} and {g.second_kind} of {where}: {g.count}"
+        for c in g.largest:
+            yield f"  {c.first}, {c.second}: {c.value:.4f}"
+        if g.count > len(g.largest):
+            yield f"  {g.count - len(g.largest)} smaller ones are not listed"
 
 
 def _reliability(reliability: Mapping[str, Any]) -> Iterator[str]:

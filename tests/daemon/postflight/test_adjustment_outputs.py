@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 from daemon.cli import app
 from daemon.configuration.model import ConfigurationError
 from daemon.postflight.adjustment.csv_tables import read_table
+from tests.daemon.postflight.small_adjustment_block import adjusted_report, write_small_block
 
 CAMCAL = Path(__file__).parents[2] / "processing/bundle/data/dbat-camcal/camcaldemo.xml"
 
@@ -75,6 +76,29 @@ def test_the_protocol_holds_the_published_figures_and_every_image_and_point(writ
     assert "k2, camera Olympus Camedia C4040Z k3: -0.97" in of["12"]
     assert "station 17 Z, station 19 Z: 0.92" in of["12"]
     assert all(len(line) == len(line.rstrip()) for line in text.splitlines())
+
+
+def test_the_protocol_names_all_correlations_beyond_the_limit(tmp_path) -> None:
+    """A block that control points alone hold: the report names 20 of each two kinds."""
+    folder = write_small_block(tmp_path / "block")
+    path = folder / "project.toml"
+    lines = path.read_text().splitlines()
+    kept = [line for line in lines if not line.startswith(("gnss =", "distances ="))]
+    path.write_text("\n".join(kept) + "\n")
+    points = folder / "points.csv"
+    few = [
+        line.replace(",control,", ",tie,") if line.startswith(("p3,", "p4,", "p5,", "p6,", "p7,"))
+        else line
+        for line in points.read_text().splitlines()
+    ]  # fmt: skip
+    points.write_text("\n".join(few) + "\n")
+    report = adjusted_report(folder, "--protocol", str(tmp_path / "protocol.txt"))
+    groups = report["correlations"]["groups"]
+    assert any(g["count"] > len(g["largest"]) for g in groups)
+    sections = (tmp_path / "protocol.txt").read_text().split("\n\n")
+    (listed,) = [s for s in sections if s.startswith("12 Correlations beyond 0.9")]
+    assert len(listed.splitlines()) == 2 + sum(1 + g["count"] for g in groups)
+    assert "not listed" not in listed
 
 
 def test_correlations_and_areas_are_in_the_report(written) -> None:
