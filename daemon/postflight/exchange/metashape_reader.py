@@ -74,8 +74,9 @@ def read_metashape(path: Path) -> Block:
     try:
         return _block_of(path, chunks[0])
     except (KeyError, TypeError, ValueError, AttributeError) as error:
+        found = f"it has no {error}" if isinstance(error, KeyError) else str(error)
         raise BlockError(
-            f"{path}: not Metashape's camera file ({error!r}); give the file of its Export Cameras"
+            f"{path}: not Metashape's camera file: {found}; give the file of its Export Cameras"
         ) from error
 
 
@@ -365,5 +366,5 @@ def _orthogonal(rotation: Array, what: str) -> None:
 def _numbers(text: str, count: int) -> Array:
     values: Sequence[float] = [float(v) for v in text.split()]
     if len(values) != count or not np.isfinite(values).all():
-        raise ValueError(f"{len(values)} numbers; {count} finite ones are needed")
+        raise ValueError(f"{text.strip()[:60]!r} where {count} finite numbers are needed")
     return np.array(values)
