@@ -31,6 +31,8 @@ Array = NDArray[np.float64]
 
 BUNDLE_MAX_BYTES = 2_000_000_000
 COUNT_MAX = 50_000_000
+REACH_MAX_PX = 1e6
+"""Distance of a measurement from the middle of its image that no camera has."""
 _MARK = "# Bundle file v0.3"
 
 
@@ -127,7 +129,7 @@ def _block(
     if not found:
         raise BlockError(f"{path}: no oriented image; there is nothing to import")
     distinct = list(dict.fromkeys(cameras))
-    size = _size(seen)
+    size = _size(path, seen)
     centre = ((size[0] - 1) / 2.0, (size[1] - 1) / 2.0)
     # Rays of Bundler are -p: with y down and z forward the polynomial is the same.
     models = tuple(
@@ -157,9 +159,14 @@ def _block(
     )  # fmt: skip
 
 
-def _size(seen: list[tuple[int, int, float, float]]) -> tuple[int, int]:
+def _size(path: Path, seen: list[tuple[int, int, float, float]]) -> tuple[int, int]:
     """Columns and rows about the middle that hold all measurements."""
     reach = np.abs(np.array([(x, y) for *_, x, y in seen]).reshape(-1, 2)).max(axis=0, initial=1.0)
+    if reach.max() > REACH_MAX_PX:
+        raise BlockError(
+            f"{path}: a measurement is {reach.max():g} px from the middle of its image; "
+            f"{REACH_MAX_PX:g} px are the limit: correct it, or export the file again"
+        )
     return 2 * int(np.ceil(reach[0])) + 2, 2 * int(np.ceil(reach[1])) + 2
 
 

@@ -197,6 +197,12 @@ def test_indices_are_whole_numbers(scene, tmp_path) -> None:
     refused(path, "bundler", tmp_path, "point 0: image 1.5; whole numbers from 0 to 8")
 
 
+def test_a_measurement_far_from_every_image(scene, tmp_path) -> None:
+    path = bal(scene, tmp_path / "in")
+    edit(path, line(2, replaced(2, "1e308")))
+    refused(path, "bal", tmp_path, r"a measurement is 1e\+308 px from the middle of its image")
+
+
 @pytest.mark.parametrize(("value", "sentence"), [("0.0", "is 0 px"), ("-900.0", "is -900 px")])
 def test_a_principal_distance_of_bal_is_positive(scene, tmp_path, value, sentence) -> None:
     path = bal(scene, tmp_path / "in")
