@@ -19,6 +19,7 @@ OWN = {package.__name__: package for package in RELATED}
 DECIDE_NO_BYTES = {
     "daemon.postflight.batch.batch_run": "order and retries",
     "daemon.postflight.batch.capacity": "number of processes",
+    "daemon.postflight.batch.control_groups": "number of processes",
     "daemon.postflight.batch.executor": "interface of executors",
     "daemon.postflight.batch.in_process": "threads of one process",
     "lz4": "flight logs, which no product is computed from",
