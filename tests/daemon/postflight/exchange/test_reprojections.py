@@ -8,7 +8,7 @@ import pytest
 
 from daemon.postflight.exchange.block import BlockError
 from daemon.postflight.exchange.block_project import import_block
-from tests.daemon.postflight.exchange.test_import_block import K1, K2, bal, colmap, block_scene
+from tests.daemon.postflight.exchange.test_import_block import K1, K2, bal, block_scene, colmap
 
 
 def _with_measurements(path: Path, x: float, y: float) -> Path:
