@@ -68,7 +68,7 @@ def read_bingo(folder: Path) -> Block:
     measurements = only_file(folder, BINGO_PATTERNS, "<name>_bingo.txt")
     measured = bingo_measurements(measurements, cameras)
     oriented = named_orientations(path, order, unit)
-    block, median_px = _measured_block(folder, cameras, oriented, measured, system, {})
+    block, median_px = measured_block(folder, cameras, oriented, measured, system, {})
     if median_px > _OTHER_TRIED_PX:
         _refuse_other_angles(folder, path, (order, unit, median_px), cameras, measured)
     return block
@@ -93,7 +93,7 @@ def _refuse_other_angles(
     for axes, in_unit in tried:
         oriented = named_orientations(path, axes, in_unit)
         try:
-            _, other_px = _measured_block(folder, cameras, oriented, measured, "", {})
+            _, other_px = measured_block(folder, cameras, oriented, measured, "", {})
         except BlockError:
             continue
         if other_px < _OTHER_BETTER * median_px:
@@ -116,7 +116,7 @@ def read_patb(folder: Path) -> Block:
     measured = _patb(only_file(folder, ("*.im",), "<name>.im"), cameras, photos)
     system = _stated(folder)[2] if (folder / "angles.txt").exists() else "not stated in the files"
     names = {number: name for number, (name, _) in photos.items()}
-    return measured_block(folder, cameras, oriented, measured, system, names)
+    return measured_block(folder, cameras, oriented, measured, system, names)[0]
 
 
 def cameras_of(folder: Path) -> dict[str, BlockCamera]:
@@ -347,19 +347,8 @@ def measured_block(
     measured: Mapping[str, Measured],
     system: str,
     names: Mapping[str, str],
-) -> Block:
-    """A block of oriented images with their measurements, and points intersected from them."""
-    return _measured_block(folder, cameras, oriented, measured, system, names)[0]
-
-
-def _measured_block(
-    folder: Path,
-    cameras: Mapping[str, BlockCamera],
-    oriented: Mapping[str, Oriented],
-    measured: Mapping[str, Measured],
-    system: str,
-    names: Mapping[str, str],
 ) -> tuple[Block, float]:
+    """A block with points intersected from its measurements, and the median misfit, px."""
     oriented = _by_names_of(measured, oriented)
     without = sorted(set(measured) - set(oriented))
     if without:

@@ -48,7 +48,7 @@ def read_pix4d(folder: Path) -> Block:
     if any(True for pattern in BINGO_PATTERNS for _ in folder.glob(pattern)):
         measurements = only_file(folder, BINGO_PATTERNS, "<name>_bingo.txt")
         measured = bingo_measurements(measurements, cameras)
-        return measured_block(folder, cameras, oriented, measured, system, {})
+        return measured_block(folder, cameras, oriented, measured, system, {})[0]
     names = list(cameras)
     camera_of = dict(photos_of(folder, cameras).values())
     unknown = sorted(set(oriented) - set(camera_of)) if len(names) > 1 else []

@@ -181,7 +181,9 @@ def test_sigmas_that_are_right_cause_no_caution(seed, tmp_path) -> None:
 
 @pytest.mark.parametrize("row", ["# 0-0,p7,19.4,17.9,1.0,1.0", "#0-0,p7,19.4,17.9,1.0"])
 def test_rows_left_out_as_remarks_are_stated_with_their_lines(row, written, tmp_path) -> None:
-    insert = lambda text: "\n".join([*text.splitlines()[:5], row, *text.splitlines()[5:], ""])  # noqa: E731
+    def insert(text: str) -> str:
+        return "\n".join([*text.splitlines()[:5], row, *text.splitlines()[5:], ""])
+
     folder = changed(written, tmp_path, {"image_points.csv": [insert]})
     (caution,) = adjusted_report(folder)["cautions"]
     assert caution.startswith("image_points.csv: 1 lines that begin with # contain a comma")

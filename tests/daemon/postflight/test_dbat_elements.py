@@ -8,10 +8,15 @@ import pytest
 
 from daemon.postflight.adjustment.csv_tables import ProjectError
 from daemon.postflight.importers.dbat import import_dbat
-from tests.daemon.postflight.test_import_dbat import SCRIPT, folder  # noqa: F401 - a fixture
+from tests.daemon.postflight.dbat_project import SCRIPT, write_dbat_project
 
 PRIOR = '<prior_eo><file format="id,x,y,z,omega,phi,kappa" units="degrees">eo.txt</file></prior_eo>'
 IO_LOADED = "<io>loaded</io>"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return write_dbat_project(tmp_path)
 
 
 def changed(path: Path, old: str, new: str) -> None:
@@ -20,7 +25,7 @@ def changed(path: Path, old: str, new: str) -> None:
     path.write_text(text.replace(old, new, 1))
 
 
-def refused(folder: Path, sentence: str) -> None:  # noqa: F811
+def refused(folder: Path, sentence: str) -> None:
     with pytest.raises(ProjectError, match=sentence) as caught:
         import_dbat(folder / "script.xml")
     assert len(caught.value.problems) == 1, caught.value.problems
@@ -58,7 +63,7 @@ def refused(folder: Path, sentence: str) -> None:  # noqa: F811
         ("<cameras>", '<cameras model="4">', "attribute model of <cameras>"),
     ],
 )
-def test_elements_and_attributes_of_a_script(folder, old, new, sentence) -> None:  # noqa: F811
+def test_elements_and_attributes_of_a_script(folder, old, new, sentence) -> None:
     import_dbat(folder / "script.xml")
     changed(folder / "script.xml", old, new)
     refused(folder, sentence)
@@ -77,26 +82,26 @@ def test_elements_and_attributes_of_a_script(folder, old, new, sentence) -> None
         ('camera_version="1.0"', 'camera_version="2.0"', "dbat_camera_version is '2.0'"),
     ],
 )
-def test_elements_and_attributes_of_a_camera(folder, old, new, sentence) -> None:  # noqa: F811
+def test_elements_and_attributes_of_a_camera(folder, old, new, sentence) -> None:
     changed(folder / "camera.xml", old, new)
     refused(folder, sentence)
 
 
-def test_radial_coefficients_are_three(folder) -> None:  # noqa: F811
+def test_radial_coefficients_are_three(folder) -> None:
     text = (folder / "camera.xml").read_text()
     begin, end = text.index("<K>"), text.index("</K>")
     (folder / "camera.xml").write_text(text[:begin] + "<K>1e-4" + text[end:])
     refused(folder, "<K> has 1 coefficients; three are read")
 
 
-def test_a_camera_that_is_not_calibrated_begins_with_its_nominal_values(folder) -> None:  # noqa: F811
+def test_a_camera_that_is_not_calibrated_begins_with_its_nominal_values(folder) -> None:
     changed(folder / "camera.xml", "<calibrated>yes", "<calibrated>no")
     changed(folder / "script.xml", IO_LOADED, "<io>default</io>")
     (camera,) = import_dbat(folder / "script.xml").network.cameras
     assert camera.f_mm == 7.5
 
 
-def test_prior_orientations_that_the_script_does_not_load_are_refused(folder) -> None:  # noqa: F811
+def test_prior_orientations_that_the_script_does_not_load_are_refused(folder) -> None:
     ids = [
         line.split(",")[0].strip()
         for line in (folder / "images/images.txt").read_text().splitlines()
@@ -110,7 +115,7 @@ def test_prior_orientations_that_the_script_does_not_load_are_refused(folder) ->
     refused(folder, "initial values of eo are 'default', and <prior_eo> is there")
 
 
-def test_remarks_plots_and_folders_of_images_are_harmless(folder) -> None:  # noqa: F811
+def test_remarks_plots_and_folders_of_images_are_harmless(folder) -> None:
     """As in the public scripts: remarks anywhere, plots with attributes, files of results."""
     plain = import_dbat(folder / "script.xml")
     path = folder / "script.xml"
@@ -133,7 +138,7 @@ def test_remarks_plots_and_folders_of_images_are_harmless(folder) -> None:  # no
     assert done.network.cameras[0].free == plain.network.cameras[0].free
 
 
-def test_a_parameter_in_the_text_of_its_part_is_that_of_all(folder) -> None:  # noqa: F811
+def test_a_parameter_in_the_text_of_its_part_is_that_of_all(folder) -> None:
     path = folder / "script.xml"
     begin, end = SCRIPT.index("<io><all>true"), SCRIPT.index("</io>\n")
     path.write_text(SCRIPT[:begin] + "<io>false" + SCRIPT[end:])

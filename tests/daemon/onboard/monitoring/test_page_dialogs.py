@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 
@@ -46,22 +47,30 @@ def cockpit(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cockpit]:
 
 def check(cockpit: Cockpit, dialog: str, sizes: tuple[tuple[int, int], ...] = SIZES) -> None:
     """Measure an open dialog at each size and in each theme."""
-    browser = cockpit.browser
-    browser.wait_for(f"document.querySelector('{dialog}').open", WITHIN_S)
-    browser.evaluate(MEASURES.read_text())
+    cockpit.browser.wait_for(f"document.querySelector('{dialog}').open", WITHIN_S)
     found = []
+    for where, faults in measured(cockpit, sizes, f"dialog{dialog.replace('#', '-')}"):
+        found += [(where, fault, faults[fault]) for fault in (*FAULTS, "axe") if faults[fault]]
+        if faults["scrolls"]:
+            found.append((where, "scrolls", True))
+    assert found == [], "\n".join(map(str, found))
+    cockpit.resize(1280, 800)
+
+
+def measured(
+    cockpit: Cockpit, sizes: tuple[tuple[int, int], ...], picture: str
+) -> Iterator[tuple[str, dict[str, Any]]]:
+    """What is measured at each size and in each theme; `axe` has the findings of axe."""
+    cockpit.browser.evaluate(MEASURES.read_text())
     for width, height in sizes:
         for theme in THEMES:
             cockpit.resize(width, height, theme)
-            where = f"{dialog} at {width}x{height} {theme or 'light'}"
-            faults = browser.evaluate("measures()")
-            found += [(where, fault, faults[fault]) for fault in FAULTS if faults[fault]]
-            found += [(where, "axe", one) for one in axe(browser)]
-            if faults["scrolls"]:
-                found.append((where, "scrolls", True))
-        save_picture(browser, f"dialog{dialog.replace('#', '-')}-{width}")
-    assert found == [], "\n".join(map(str, found))
-    cockpit.resize(1280, 800)
+            faults = cockpit.browser.evaluate("measures()")
+            yield (
+                f"{picture} at {width}x{height} {theme or 'light'}",
+                faults | {"axe": axe(cockpit.browser)},
+            )
+        save_picture(cockpit.browser, f"{picture}-{width}")
 
 
 def close(cockpit: Cockpit, dialog: str) -> None:
@@ -138,17 +147,11 @@ def test_shelving_is_whole_at_each_size(cockpit: Cockpit) -> None:
     browser.click("#tab-alarms")
     browser.click("#faults li .shelve")
     cockpit.until("document.querySelector('#faults').innerText.includes('shelved until')")
-    browser.evaluate(MEASURES.read_text())
     found = []
-    for width, height in SIZES:
-        for theme in THEMES:
-            cockpit.resize(width, height, theme)
-            where = f"{width}x{height} {theme or 'light'}"
-            faults = browser.evaluate("measures()")
-            found += [(where, fault, faults[fault]) for fault in FAULTS if faults[fault]]
-            found += [(where, "axe", one) for one in axe(browser)]
-            if faults["weakest"][1] < CONTRAST:
-                found.append((where, "contrast", faults["weakest"]))
+    for where, faults in measured(cockpit, SIZES, "shelving"):
+        found += [(where, fault, faults[fault]) for fault in (*FAULTS, "axe") if faults[fault]]
+        if faults["weakest"][1] < CONTRAST:
+            found.append((where, "contrast", faults["weakest"]))
     assert found == [], "\n".join(map(str, found))
     cockpit.resize(1280, 800)
 
