@@ -25,7 +25,8 @@ from numpy.typing import NDArray
 from benchmarks import rendered
 from benchmarks.seam_radiometry import RIG, SEED, Head, heads_of, light_of
 from daemon.cli.benchmark.measurement import machine
-from processing.radiometry.level1 import corrector_for, level1_counts_per_dn, level1_from_level0
+from processing.radiometry.corrector import corrector_for
+from processing.radiometry.level1 import level1_counts_per_dn, level1_from_level0
 from sim_hw.world.scene import open_scene
 from sim_hw.world.seeding import random_stream
 from sim_hw.world.world import World

@@ -44,7 +44,8 @@ from processing.pipelines import exposure_pipeline, stitched, stitched_stages
 from processing.pipelines.stitched import Conditions, Pipeline, PipelineSettings
 from processing.quality.report import Flag
 from processing.radiometry.calibration import RadiometryFolder
-from processing.radiometry.level1 import Corrector, corrector_for, level1_from_level0
+from processing.radiometry.corrector import Corrector, corrector_for
+from processing.radiometry.level1 import level1_from_level0
 from processing.rig import find_rig, load_rig
 
 Array = NDArray[Any]

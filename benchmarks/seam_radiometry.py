@@ -26,12 +26,8 @@ from processing.image.composition import PanComposer, pan_cell_px
 from processing.image.kernels import DEFAULT_INTERPOLATION
 from processing.pipelines.stitched import Conditions, Pipeline, PipelineSettings, Product
 from processing.radiometry.calibration import RadiometricCalibration
-from processing.radiometry.level1 import (
-    corrector_for,
-    exposed_rows,
-    level1_counts_per_dn,
-    level1_from_level0,
-)
+from processing.radiometry.corrector import corrector_for
+from processing.radiometry.level1 import exposed_rows, level1_counts_per_dn, level1_from_level0
 from processing.rig import Cone, Sensor
 from sim_hw.world import sensor_calibration
 from sim_hw.world.electronics import Electronics, SensorTruth, over_tdi_path, true_sensor

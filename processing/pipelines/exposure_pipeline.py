@@ -32,7 +32,8 @@ from processing.quality.figures.stitching import MethodFigures
 from processing.quality.report import NO_FLAGS, Flag, QualityReport, Thresholds
 from processing.quality.requirements import QualityRequirements
 from processing.quality.valid_area import ValidArea, valid_area_figures
-from processing.radiometry.level1 import Corrector, FrameStatistics, level1_from_level0
+from processing.radiometry.corrector import Corrector
+from processing.radiometry.level1 import FrameStatistics, level1_from_level0
 from processing.rig import Rig
 
 Array = NDArray[Any]

@@ -49,13 +49,9 @@ from processing.quality.signal_steps import signal_steps, step_figures
 from processing.quality.valid_area import ValidArea, area_of_rasters, grid_of
 from processing.quality.word_format import word_format_figures
 from processing.radiometry.calibration import RadiometricCalibration
+from processing.radiometry.corrector import correctors_for
 from processing.radiometry.demosaic import BAYER_BANDS, demosaic, is_bayer
-from processing.radiometry.level1 import (
-    LEVEL1_CEILING,
-    LEVEL1_FLOOR,
-    FrameStatistics,
-    correctors_for,
-)
+from processing.radiometry.level1 import LEVEL1_CEILING, LEVEL1_FLOOR, FrameStatistics
 from processing.rig import Cone, Rig, VirtualImage
 
 Array = NDArray[Any]

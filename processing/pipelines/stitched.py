@@ -76,13 +76,9 @@ from processing.quality.report import QualityReport
 from processing.quality.valid_area import Mask, area_of, gap_cells, grid_of
 from processing.quality.word_format import word_format_figures
 from processing.radiometry.calibration import RadiometricCalibration
+from processing.radiometry.corrector import correctors_for
 from processing.radiometry.demosaic import is_bayer
-from processing.radiometry.level1 import (
-    FrameStatistics,
-    correctors_for,
-    exposed_rows,
-    level1_counts_per_dn,
-)
+from processing.radiometry.level1 import FrameStatistics, exposed_rows, level1_counts_per_dn
 from processing.rig import Rig
 
 __all__ = ["Conditions", "Interpolation", "Method", "Pipeline", "PipelineSettings", "Product"]

@@ -17,8 +17,9 @@ from processing.geometry.placement import SensorPlacement, vip_mm_from_raw
 from processing.image.colour import BandRegistration
 from processing.matching.tie_points import PAN_TO_COLOUR, TiePoints
 from processing.quality.figures.image import IdentityFigures
+from processing.radiometry.corrector import Corrector
 from processing.radiometry.demosaic import is_bayer
-from processing.radiometry.level1 import Corrector, exposed_rows
+from processing.radiometry.level1 import exposed_rows
 from processing.rig import Rig, Sensor
 
 Array = NDArray[Any]

@@ -2,7 +2,8 @@
 
 The pass also takes what tests of the frame need of every pixel or line, so that no step reads the
 frame for it again. What the calibration is and where it comes from is in
-`processing.radiometry.calibration`, how defects are filled in `processing.radiometry.defects`.
+`processing.radiometry.calibration`, how it is made ready for the pass in
+`processing.radiometry.corrector`, how defects are filled in `processing.radiometry.defects`.
 
 A Level-1 word is uint16. 0 means no data: partly exposed TDI rows, and defects without a good
 neighbour in reach. Any other word is linear signal above black in units of 1 /
@@ -16,9 +17,8 @@ Source: docs/explanation/mathematics/radiometry.md#offset-and-gain, #tdi and #de
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -33,13 +33,8 @@ from processing.image.line_means import (
     line_sums,
     means_of_sums,
 )
-from processing.radiometry.calibration import (
-    RadiometricCalibration,
-    check_radiometry,
-    neutral_radiometry,
-)
-from processing.radiometry.defects import interpolate_defects, spread_defects
-from processing.radiometry.fixed_point import fixed_point, quantised
+from processing.radiometry.corrector import RESPONSE_UNIT, Corrector
+from processing.radiometry.defects import interpolate_defects
 from processing.radiometry.unclean_blocks import begin_marks, mark_line, mark_pixels
 from processing.rig import Sensor
 
@@ -49,17 +44,6 @@ LEVEL1_FLOOR: Final = 2
 LEVEL1_CEILING: Final = 65534
 SATURATED_BIT: Final = 1
 
-_RESPONSE_UNIT: Final = 16384
-"""Fixed-point word of a response of one. Integer running sums are exact, so the result does not
-depend on how many threads shared the rows."""
-_KEPT_SHIFTS: Final = 8
-"""Numbers of TDI shifts whose defects are kept: in flight they change with speed and height."""
-_AT_A_TIME: Final = 2
-"""Calibrations as floating-point maps, which are four times what is kept of them."""
-_BIAS_STEP_DN: Final = 1.0 / 32.0
-_DARK_STEP_DN_PER_S: Final = 0.5
-"""Steps of the maps: rounded to at most a sixty-fourth of a DN, where a Level-1 word is a quarter
-(12 bits); dark signal to as much in a sixteenth of a second."""
 _BANDS: Final = 39
 """Parts of a frame that threads share."""
 _UNREAD_NOISES: Final = 10.0
@@ -96,33 +80,6 @@ class FrameStatistics:
     lines: LineMeans | None = None
 
 
-@dataclass(frozen=True)
-class Corrector:
-    """A calibration made ready for the pass: maps as fixed point of 8 or 16 bits, scalars where it
-    is flat.
-
-    `bias` and `dark` count in units above their least value, `response` is one over gain; they are
-    None together, where the calibration is the same for all pixels. `defects` are (row, column) of
-    the defects, (n, 2) int32; `defects_by_shifts` keeps them as spread by so many TDI shifts, a few
-    numbers of shifts at a time.
-    """
-
-    sensor: Sensor
-    bias: Array | None
-    dark: Array | None
-    response: Array | None
-    bias_unit_dn: float
-    dark_unit_dn_per_s: float
-    min_bias_dn: float
-    min_dark_dn_per_s: float
-    flat_gain: float
-    doubling_k: float
-    reference_c: float
-    response_per_k: float
-    defects: Array
-    defects_by_shifts: dict[int, tuple[Array, Array]] = field(default_factory=dict)
-
-
 def level1_counts_per_dn(bits: int) -> float:
     """Level-1 counts of one DN: full scale is half of the range of words.
 
@@ -137,72 +94,6 @@ def level1_counts_per_dn(bits: int) -> float:
         (8.0, 0.5)
     """
     return float(2.0 ** (15 - bits))
-
-
-def correctors_for(
-    sensors: Sequence[Sensor], radiometry: Mapping[str, RadiometricCalibration]
-) -> dict[str, Corrector]:
-    """Make the calibrations of several sensors ready, some at a time: reading them takes seconds.
-
-    Args:
-        sensors: whose frames are corrected.
-        radiometry: by sensor name; a sensor without one is taken as neutral. Read in threads.
-
-    Returns:
-        Correctors by sensor name.
-
-    Raises:
-        CalibrationError: as `corrector_for`.
-    """
-    with ThreadPoolExecutor(_AT_A_TIME, thread_name_prefix="calibration") as pool:
-        correctors = pool.map(
-            lambda sensor: corrector_for(sensor, radiometry.get(sensor.name)), sensors
-        )
-        return dict(zip((sensor.name for sensor in sensors), correctors, strict=True))
-
-
-def corrector_for(sensor: Sensor, calibration: RadiometricCalibration | None) -> Corrector:
-    """Make a calibration ready for the pass.
-
-    Args:
-        sensor: whose frames are corrected.
-        calibration: of the sensor; None takes the neutral one.
-
-    Returns:
-        Maps as fixed point, or scalars where all pixels have the same calibration.
-
-    Raises:
-        CalibrationError: the maps are not of the sensor's size, or out of range.
-    """
-    calibration = calibration or neutral_radiometry(sensor)
-    check_radiometry(f"radiometry of {sensor.name}", calibration, sensor=sensor)
-    maps = (calibration.bias_dn, calibration.dark_dn_per_s, calibration.gain)
-    flat = all(float(np.min(m)) == float(np.max(m)) for m in maps)
-    bias = dark = response = None
-    least_bias, bias_unit = float(calibration.bias_dn.flat[0]), 0.0
-    least_dark, dark_unit = float(calibration.dark_dn_per_s.flat[0]), 0.0
-    if not flat:
-        good = calibration.defect == 0
-        bias, least_bias, bias_unit = quantised(calibration.bias_dn, good, _BIAS_STEP_DN)
-        dark, least_dark, dark_unit = quantised(
-            calibration.dark_dn_per_s, good, _DARK_STEP_DN_PER_S
-        )
-        response = fixed_point(1.0 / calibration.gain, 1.0 / _RESPONSE_UNIT)
-    return Corrector(
-        sensor=sensor,
-        bias=bias,
-        dark=dark,
-        response=response,
-        bias_unit_dn=bias_unit,
-        dark_unit_dn_per_s=dark_unit,
-        min_bias_dn=least_bias,
-        min_dark_dn_per_s=least_dark,
-        flat_gain=float(calibration.gain.flat[0]),
-        doubling_k=calibration.doubling_k,
-        reference_c=calibration.reference_c,
-        response_per_k=calibration.response_per_k,
-        defects=np.argwhere(calibration.defect != 0).astype(np.int32),
-    )
 
 
 def level1_from_level0(
@@ -225,7 +116,7 @@ def level1_from_level0(
     +1) are partly exposed and become no data, and a defect spoils N more rows.
 
     Args:
-        corrector: from `corrector_for`.
+        corrector: from `processing.radiometry.corrector.corrector_for`.
         raw: the frame, shape (height, width), uint16, DN.
         temperature_c: of the sensor; None takes the calibration's reference temperature.
         exposure_time_s: of the frame; the dark signal grows with it.
@@ -249,6 +140,8 @@ def level1_from_level0(
         12 bits, black 64 DN, gain 1.25: 164 DN become (164 - 64) * 1.25 * 8 = 1000 counts.
 
         >>> from dataclasses import replace
+        >>> from processing.radiometry.calibration import neutral_radiometry
+        >>> from processing.radiometry.corrector import corrector_for
         >>> from processing.rig import find_rig
         >>> sensor = replace(find_rig("ultracam-x-mini").sensor("SU00"), width_px=64, height_px=48)
         >>> neutral = neutral_radiometry(sensor)
@@ -309,7 +202,7 @@ def level1_from_level0(
             np.float32(corrector.bias_unit_dn),
             np.float32(corrector.dark_unit_dn_per_s * dark_time_s / (shifts + 1)),
             np.float32(offset_dn),
-            np.float32(by_gain * _RESPONSE_UNIT * (shifts + 1)),
+            np.float32(by_gain * RESPONSE_UNIT * (shifts + 1)),
             shifts,
             0 if sensor.tdi_row_sign < 0 else shifts,
             sensor.full_scale_dn,
@@ -322,7 +215,7 @@ def level1_from_level0(
             marks,
         )
     if len(corrector.defects):
-        mask, places = _spread(corrector, shifts)
+        mask, places = corrector.spread_defects(shifts)
         period = 1 if sensor.colour_filter_array == "none" else 2
         changes = np.empty(len(places), np.int32)
         interpolate_defects(out, mask, places, period, changes)
@@ -340,19 +233,6 @@ def level1_from_level0(
         unread / compared if least > 0 else None,
         means_of_sums(by_row, by_column, first) if by_row.size else None,
     )
-
-
-def _spread(corrector: Corrector, shifts: int) -> tuple[Array, Array]:
-    """Defects after so many shifts, kept for the next frame; pipelines at work share them."""
-    sensor, known = corrector.sensor, corrector.defects_by_shifts
-    found = known.get(shifts)
-    if found is None:
-        shape = (sensor.height_px, sensor.width_px)
-        found = spread_defects(corrector.defects, shape, shifts, sensor.tdi_row_sign)
-        if len(known) >= _KEPT_SHIFTS:
-            known.clear()
-        known[shifts] = found
-    return found
 
 
 def min_raw_value(sensor: Sensor) -> int:

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.radiometry.calibration import RadiometricCalibration
-from processing.radiometry.level1 import corrector_for, level1_counts_per_dn, level1_from_level0
+from processing.radiometry.corrector import corrector_for
+from processing.radiometry.level1 import level1_counts_per_dn, level1_from_level0
 from processing.rig import Sensor
 
 

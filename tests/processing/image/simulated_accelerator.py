@@ -20,13 +20,8 @@ from processing.image.accelerator.pixel_kernels import pixel_kernels
 from processing.image.kernels import INTERPOLATIONS, Interpolation
 from processing.image.lattice import OUTSIDE
 from processing.radiometry.calibration import RadiometricCalibration, neutral_radiometry
-from processing.radiometry.level1 import (
-    CPU_PASSES,
-    Corrector,
-    corrector_for,
-    level1_from_level0,
-    min_raw_value,
-)
+from processing.radiometry.corrector import Corrector, corrector_for
+from processing.radiometry.level1 import CPU_PASSES, level1_from_level0, min_raw_value
 from processing.radiometry.unclean_blocks import unknown_blocks
 from processing.rig import Sensor, find_rig
 

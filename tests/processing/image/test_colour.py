@@ -14,7 +14,8 @@ from processing.image.colour import (
     nominal_registration,
     register_band,
 )
-from processing.radiometry.level1 import corrector_for, level1_from_level0
+from processing.radiometry.corrector import corrector_for
+from processing.radiometry.level1 import level1_from_level0
 from processing.rig import find_rig
 from tests.processing.synthetic_exposure import Exposure, expose
 

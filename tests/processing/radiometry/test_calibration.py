@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from processing.radiometry.calibration import CalibrationError, load_radiometry, neutral_radiometry
-from processing.radiometry.level1 import corrector_for
+from processing.radiometry.corrector import corrector_for
 from processing.rig import find_rig
 
 SHAPE = (12, 16)

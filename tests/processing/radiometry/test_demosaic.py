@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from processing.matching.patches import INTERPOLATION, match_patches
 from processing.radiometry.calibration import neutral_radiometry
+from processing.radiometry.corrector import corrector_for
 from processing.radiometry.demosaic import demosaic
-from processing.radiometry.level1 import corrector_for, level1_from_level0
+from processing.radiometry.level1 import level1_from_level0
 from processing.rig import find_rig
 
 Array = NDArray[np.float64]

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from processing.image.line_means import line_means
 from processing.radiometry.calibration import RadiometricCalibration, neutral_radiometry
+from processing.radiometry.corrector import corrector_for
 from processing.radiometry.defects import spread_defects
 from processing.radiometry.level1 import (
     LEVEL1_FLOOR,
-    corrector_for,
     exposed_rows,
     level1_counts_per_dn,
     level1_from_level0,

@@ -10,7 +10,8 @@ import pytest
 from processing.image.composition import PanComposer
 from processing.image.resampling import WEIGHT_STEP_PX, WEIGHT_UNIT, resample
 from processing.radiometry.calibration import neutral_radiometry
-from processing.radiometry.level1 import corrector_for, level1_from_level0
+from processing.radiometry.corrector import corrector_for
+from processing.radiometry.level1 import level1_from_level0
 from processing.radiometry.unclean_blocks import BLOCK_PX, unknown_blocks
 from processing.rig import find_rig
 
