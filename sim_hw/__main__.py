@@ -49,6 +49,7 @@ def parser() -> argparse.ArgumentParser:
         help="plan a fault, see docs/reference/results/faults.md; may be repeated",
     )
     add("--scenario", type=Path, help="a file with faults")
+    add("--read-faults", action="store_true", help="read further faults from stdin, one in a line")
     add("--pps", action="store_true", help="a pulse per second as well")
     add("--receiver", choices=RECEIVERS, default="ublox", help="kind of the receiver")
     add("--probe", choices=PROBES, default="modbus", help="kind of the thermometer")
@@ -122,6 +123,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         has_pps=given.pps,
         is_frozen=given.still,
         has_digests=given.digests,
+        reads_faults=given.read_faults,
         probe=given.probe,
     )
     return simulate(settings, world, clock)

@@ -51,6 +51,7 @@ class Emulator:
     def __init__(self, arguments: Sequence[str]) -> None:
         self.process = subprocess.Popen(
             [sys.executable, "-m", "sim_hw", *arguments, "--parent", str(os.getpid())],
+            stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
             start_new_session=True,
@@ -67,6 +68,12 @@ class Emulator:
             self.end()
             raise
         raise EmulatorError(f"the emulator ended with status {self.process.wait(10)}; see above")
+
+    def add_fault(self, text: str) -> None:
+        """Plan a fault, NAME@TIME[:DEVICE][,DURATION], of an emulator with `--read-faults`."""
+        assert self.process.stdin is not None
+        self.process.stdin.write(f"{text}\n")
+        self.process.stdin.flush()
 
     def end(self) -> None:
         """Close all devices."""

@@ -127,6 +127,13 @@ class Channel(Generic[T]):
                 if armed.planned.at_s is not None:
                     armed.begins_ns = now_ns + round(armed.planned.at_s * NS_PER_S)
 
+    def add(self, planned: Iterable[PlannedFault], now_ns: int) -> None:
+        """Plan further faults, their seconds counted from `now_ns`."""
+        with self._lock:
+            for fault in planned:
+                begins_ns = None if fault.at_s is None else now_ns + round(fault.at_s * NS_PER_S)
+                self._armed.append(_ArmedFault(fault, begins_ns))
+
     def pulse(self, count: int, now_ns: int) -> None:
         """The trigger unit gives pulse `count`."""
         with self._lock:

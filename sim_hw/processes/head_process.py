@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.rig import Cone, Sensor
+from sim_hw.faults.channel import for_device
 from sim_hw.faults.plan import PlannedFault
 from sim_hw.gige.gige_head import NO_PULSE, ExposureRequest, FrameSize, GigeHead, HeadIdentity
 from sim_hw.gige.head_faults import WireFaults
@@ -84,6 +85,14 @@ class PulseMessage:
 class FaultClockStart:
     """Sent to a worker: every device answers; the seconds of the faults count from this time."""
 
+    mono_ns: int
+
+
+@dataclass(frozen=True)
+class AddedFaults:
+    """Sent to a worker: further faults of any heads, their seconds counted from this time."""
+
+    planned: tuple[PlannedFault, ...]
     mono_ns: int
 
 
@@ -319,6 +328,10 @@ def _serve(pipe: Connection, heads: Sequence[RenderedHead], stopping: threading.
         if isinstance(pulse, FaultClockStart):
             for head in heads:
                 head.head.channel.begin(pulse.mono_ns)
+            continue
+        if isinstance(pulse, AddedFaults):
+            for head in heads:
+                head.head.channel.add(for_device(pulse.planned, head.sensor.name), pulse.mono_ns)
             continue
         if not isinstance(pulse, PulseMessage):
             return

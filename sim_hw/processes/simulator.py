@@ -20,16 +20,17 @@ from dataclasses import asdict, dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 from sim_hw import SimulatorError
 from sim_hw.devices.pps_source import PpsSource
 from sim_hw.devices.pulse_bus import Firing, PulseBus
 from sim_hw.faults.channel import BytesDamage, Channel, for_device
 from sim_hw.faults.faulty_line import FaultyWire, FaultyWorldClock
-from sim_hw.faults.plan import read_plan
+from sim_hw.faults.plan import FaultPlanError, read_plan
 from sim_hw.processes.discrete_event_rig import PROBES_NAME, RECEIVER_NAME, TRIGGER_NAME, devices_of
 from sim_hw.processes.head_process import (
+    AddedFaults,
     FaultClockStart,
     FirstLine,
     HeadPlan,
@@ -73,6 +74,8 @@ class SimulatorSettings:
     has_pps: bool = False
     is_frozen: bool = False
     has_digests: bool = False
+    reads_faults: bool = False
+    """Whether stdin holds faults, one in a line."""
 
 
 class Simulator:
@@ -154,6 +157,23 @@ class Simulator:
         self._reports = threading.Thread(target=self._follow_reports, name="reports", daemon=True)
         self._reports.start()
         self._begin_faults(time.monotonic_ns())
+
+    def add_fault(self, text: str) -> None:
+        """Plan a fault of a running rig, its seconds counted from now.
+
+        Args:
+            text: NAME@TIME[:DEVICE][,DURATION]
+
+        Raises:
+            FaultPlanError: it cannot be planned.
+        """
+        planned = read_plan([text], None, devices_of(self._world.rig))
+        mono_ns = time.monotonic_ns()
+        for name, channel in self._channels.items():
+            channel.add(for_device(planned, name), mono_ns)
+        with self._sending:
+            for pipe in self._pipes:
+                pipe.send(AddedFaults(planned, mono_ns))
 
     def close(self) -> None:
         """Close every device and write what truth is still open."""
@@ -386,6 +406,9 @@ def simulate(settings: SimulatorSettings, world_settings: WorldSettings, clock: 
     try:
         simulator.start()
         print(json.dumps(simulator.ready_message()), flush=True)
+        if settings.reads_faults:
+            reader = (simulator, sys.stdin, report)
+            threading.Thread(target=_read_faults, args=reader, name="faults", daemon=True).start()
         while not stopping.wait(1.0):
             pass
     except SimulatorError as error:
@@ -394,6 +417,15 @@ def simulate(settings: SimulatorSettings, world_settings: WorldSettings, clock: 
     finally:
         simulator.close()
     return 0
+
+
+def _read_faults(simulator: Simulator, lines: TextIO, report: Callable[[str], None]) -> None:
+    """Plan the fault of each line until the end of the input."""
+    for line in lines:
+        try:
+            simulator.add_fault(line.strip())
+        except (FaultPlanError, OSError) as error:
+            report(str(error))
 
 
 def describe(simulator: Simulator, report: Callable[[str], None]) -> None:

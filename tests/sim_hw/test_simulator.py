@@ -7,6 +7,7 @@ import math
 import os
 import signal
 import socket
+import struct
 import subprocess
 import sys
 import time
@@ -56,6 +57,7 @@ class Emulator:
                     *("--scene-cache", str(cache), "--exposures", "1", "--seed", "5"),
                     *("--first-address", first_address, *options),
                 ],
+                stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=errors,
                 text=True,
@@ -80,7 +82,9 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def emulator(tmp_path_factory: pytest.TempPathFactory, cache: Path) -> Iterator[Emulator]:
     out = tmp_path_factory.mktemp("sim") / "out"
-    emulator = Emulator(out, cache, "127.66.1.2", "--dc", "12", "--displace", "SU02=1.0,-0.6")
+    emulator = Emulator(
+        out, cache, "127.66.1.2", "--dc", "12", "--displace", "SU02=1.0,-0.6", "--read-faults"
+    )
     yield emulator
     if emulator.process.poll() is None:
         emulator.end()
@@ -227,6 +231,38 @@ def marks(port: serial.Serial, *, count: int) -> list[int]:
             edge_ns = message.wnR * WEEK_NS + message.towMsR * 1_000_000 + message.towSubMsR
             found.append(edge_ns)
     return found
+
+
+def test_faults_are_planned_while_it_runs(emulator: Emulator) -> None:
+    port = Path(emulator.ready["receiver"]["port"])
+    host = Controller(SimpleNamespace(address=emulator.ready["heads"]["SU30"]["address"]))
+    neighbour = Controller(SimpleNamespace(address=emulator.ready["heads"]["SU20"]["address"]))
+    stdin = emulator.process.stdin
+    assert stdin is not None
+    try:
+        assert port.exists() and answers(host)
+        stdin.write("cable-pulled@0:SU99,1\n")
+        stdin.write("cable-pulled@0:receiver,1\n")
+        stdin.write("cable-pulled@0:SU30,3\n")
+        stdin.flush()
+        wait_for(lambda: not port.exists(), "the port of the receiver to go")
+        wait_for(lambda: not answers(host), "the head to be silent")
+        assert answers(neighbour), "the fault is of one head"
+        wait_for(port.exists, "the port of the receiver to come back")
+        wait_for(lambda: answers(host), "the head to come back")
+    finally:
+        host.close()
+        neighbour.close()
+    assert "there is no device 'SU99'" in emulator.errors.read_text()
+
+
+def answers(host: Controller) -> bool:
+    host.control.settimeout(0.3)
+    try:
+        host.ask(0x80, struct.pack(">I", at.CONTROL_PRIVILEGE))
+    except TimeoutError:
+        return False
+    return True
 
 
 def test_it_ends_with_everything_on_request(emulator: Emulator) -> None:
