@@ -51,7 +51,7 @@ TICK_NS = 100_000_000
 LATCH_NS = 2 * NS_PER_S
 LATCH_SIGMA_NS = 80_000
 SUSPICION_NS = 2 * NS_PER_S
-"""A head that answers nothing for so long is lost; see `drivers.cameras.aravis.aravis_head`."""
+"""A head that answers nothing for so long is lost; see `drivers.cameras.aravis.head_session`."""
 REOPENED_SERIAL_NS = 5 * NS_PER_S
 """Longest pause before a lost serial port is tried again."""
 ANSWER_TIMEOUT_NS = NS_PER_S // 2

@@ -11,8 +11,9 @@ from typing import Any, cast
 
 import pytest
 
-from drivers.cameras.aravis.aravis_head import AravisHead, AravisHeadLostError
+from drivers.cameras.aravis.aravis_head import AravisHead
 from drivers.cameras.aravis.camera_access import ControlDeniedError
+from drivers.cameras.aravis.head_session import AravisHeadLostError
 from drivers.cameras.head_device import HeadDevice
 from drivers.cameras.v4l2.v4l2_head import V4l2Head, _Session
 from drivers.contract import DeviceError, LifeCycle, Record

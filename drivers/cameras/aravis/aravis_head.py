@@ -1,6 +1,7 @@
 """A GenICam head through Aravis: opening, acquisition, loss and reconnection.
 
-Features are in `drivers.cameras.aravis.camera`, frames in `drivers.cameras.aravis.stream`.
+Features are in `drivers.cameras.aravis.camera`, frames in `drivers.cameras.aravis.stream`, what is
+read from an opened head between frames in `drivers.cameras.aravis.head_session`.
 """
 
 from __future__ import annotations
@@ -9,11 +10,9 @@ import gc
 import threading
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import ClassVar, Final
 
-from drivers import DriverError
-from drivers.cameras.aravis.camera import AravisCamera, ClockLatch
+from drivers.cameras.aravis.camera import AravisCamera
 from drivers.cameras.aravis.camera_access import ControlDeniedError
 from drivers.cameras.aravis.frame_record import frame_record, frame_status
 from drivers.cameras.aravis.gvcp import (
@@ -26,6 +25,11 @@ from drivers.cameras.aravis.gvcp import (
     is_ip_address,
     send_action,
 )
+from drivers.cameras.aravis.head_session import (
+    PROBE_TIMEOUT_S,
+    AravisHeadLostError,
+    HeadSession,
+)
 from drivers.cameras.aravis.library import OPENING, aravis_error
 from drivers.cameras.aravis.ptp import SLAVE
 from drivers.cameras.aravis.settings import AravisSettings
@@ -37,40 +41,17 @@ from drivers.contract import (
     FrameMemory,
     FrameStatus,
     LifeCycle,
-    PtpReading,
     Sink,
     TemperatureSample,
 )
 from drivers.timescales.clock import Clock
 
 POP_TIMEOUT_S: Final = 0.1
-PROBE_TIMEOUT_S: Final = 0.2
 PROBE_ATTEMPTS: Final = 3
 COOLED_K: Final = 2.0
 """Below its limit, after which a hot head counts as cooled down."""
-LOSS_GRACE_S: Final = 2.0
-"""Time without any answer after which a head is lost; shorter pauses are tolerated."""
 CONTROL_WAIT_MARGIN_S: Final = 0.1
 TRIGGER_TIMEOUT_S: Final = 1.0
-CLOCK_DRIFT: Final = 100e-6
-"""Maximum drift of a head's clock against the host's between two latches, relative."""
-
-
-class AravisHeadLostError(DriverError):
-    """The head is lost; internal."""
-
-
-@dataclass
-class _Session:
-    """An opened head, from opening to closing or loss."""
-
-    camera: AravisCamera
-    stream: FrameStream
-    latch: ClockLatch | None = None
-    temperature_c: float | None = None
-    ptp: PtpReading | None = None
-    loss_suspected_ns: int | None = None
-    is_lost: bool = False
 
 
 class AravisHead(AravisSettings, HeadDevice):
@@ -101,7 +82,7 @@ class AravisHead(AravisSettings, HeadDevice):
     ) -> None:
         super().__init__(name, settings, memory=memory, clock=clock)
         self._control = threading.Lock()
-        self._session: _Session | None = None
+        self._session: HeadSession | None = None
         self._of_stream: Counter[str] = Counter()
         self._is_held_reported = False
         self._is_hot = False
@@ -128,21 +109,7 @@ class AravisHead(AravisSettings, HeadDevice):
         finally:
             self.emitter.sink = None
         self._state = LifeCycle.BOUND
-        geometry = session.camera.geometry
-        return {
-            **session.camera.identity,
-            "frame": f"{geometry.width_px} x {geometry.height_px} {geometry.pixel_format}",
-            "packet_size": str(session.camera.frame_settings.get("GevSCPSPacketSize", "")),
-            "link": ""
-            if session.camera.link_mbps is None
-            else f"{session.camera.link_mbps:g} Mbit/s",
-            "chunks": ", ".join(session.camera.chunks) or f"no: {session.camera.chunks_missing}",
-            "features": ", ".join(f"{k} = {v}" for k, v in session.camera.held.items()),
-            "clock": "no" if session.latch is None else f"+-{session.latch.sigma_ns / 1e3:.0f} us",
-            "temperature": ""
-            if session.temperature_c is None
-            else f"{session.temperature_c:.1f} degC",
-        }
+        return session.description()
 
     def trigger(self) -> None:
         """Software trigger or action command; from any thread. See `drivers.contract.Head`.
@@ -253,12 +220,7 @@ class AravisHead(AravisSettings, HeadDevice):
             None while it is unknown.
         """
         session = self._session
-        latch = None if session is None else session.latch
-        if latch is None:
-            return None
-        away_ns = mono_ns - latch.mono_ns
-        drift_ns = round(abs(away_ns) * CLOCK_DRIFT)
-        return latch.device_clock_ns + away_ns, latch.sigma_ns + drift_ns
+        return None if session is None else session.clock_at(mono_ns)
 
     # Opening
 
@@ -277,7 +239,7 @@ class AravisHead(AravisSettings, HeadDevice):
     def _event_for(self, error: DeviceError) -> str:
         return "held-by-another" if isinstance(error, ControlDeniedError) else "lost"
 
-    def _open(self) -> _Session:
+    def _open(self) -> HeadSession:
         """Open the head after another controller has released it. DeviceError if it does not."""
         deadline_ns = self.clock.mono_ns() + round(self.control_wait_limit_s * 1e9)
         held = self._is_controlled_by_other()
@@ -328,7 +290,7 @@ class AravisHead(AravisSettings, HeadDevice):
             return DEFAULT_HEARTBEAT_S
         return heartbeat_timeout_s(self.address, timeout_s=PROBE_TIMEOUT_S)
 
-    def _open_now(self) -> _Session:
+    def _open_now(self) -> HeadSession:
         camera = None
         with OPENING, self._control:
             try:
@@ -337,7 +299,7 @@ class AravisHead(AravisSettings, HeadDevice):
                     free = [
                         s for s in range(self._memory.slot_count) if s not in self._slots_in_use
                     ]
-                    session = _Session(camera, FrameStream(camera, self, self._memory, free))
+                    session = HeadSession(camera, FrameStream(camera, self, self._memory, free))
                     self._session = session
                 session.latch = camera.latch()
                 session.temperature_c = camera.thermometer.read_c()
@@ -386,7 +348,7 @@ class AravisHead(AravisSettings, HeadDevice):
             session.is_lost = alive is None
         self._release_device()
 
-    def _deliver(self, session: _Session, sink: Sink) -> None:
+    def _deliver(self, session: HeadSession, sink: Sink) -> None:
         next_check_ns = self.clock.mono_ns()
         while not self._closing.is_set():
             received = session.stream.pop(POP_TIMEOUT_S)
@@ -404,13 +366,13 @@ class AravisHead(AravisSettings, HeadDevice):
                 pause_s = self.latch_interval_s if healthy else 0.0
                 next_check_ns = self.clock.mono_ns() + round(pause_s * 1e9)
 
-    def _deliver_temperature(self, session: _Session, sink: Sink) -> None:
+    def _deliver_temperature(self, session: HeadSession, sink: Sink) -> None:
         """Give the head's own temperature as that of a probe, if one is named."""
         if self.temperature_probe and session.temperature_c is not None:
             now_ns = self.clock.mono_ns()
             sink(TemperatureSample(self.temperature_probe, session.temperature_c, now_ns))
 
-    def _deliver_frame(self, session: _Session, received: ReceivedFrame, sink: Sink) -> None:
+    def _deliver_frame(self, session: HeadSession, received: ReceivedFrame, sink: Sink) -> None:
         now_ns = self.clock.mono_ns()
         status = frame_status(session.camera.geometry, received)
         reason = received.reason.replace("-", "_")
@@ -440,34 +402,22 @@ class AravisHead(AravisSettings, HeadDevice):
             )
         )
 
-    def _check(self, session: _Session) -> bool:
+    def _check(self, session: HeadSession) -> bool:
         """Read clock and temperature; False while the head does not answer.
 
         Raises:
-            AravisHeadLostError: it has not answered for two seconds, or was restarted.
+            AravisHeadLostError: as `HeadSession.check_answering`.
         """
-        if is_ip_address(self.address):
-            privilege = control_privilege(self.address, timeout_s=PROBE_TIMEOUT_S)
-            now_ns = self.clock.mono_ns()
-            if privilege is None:
-                if session.loss_suspected_ns is None:
-                    session.loss_suspected_ns = now_ns
-                if now_ns - session.loss_suspected_ns > LOSS_GRACE_S * 1e9:
-                    raise AravisHeadLostError(f"it has not answered for {LOSS_GRACE_S:g} s")
-                return False
-            session.loss_suspected_ns = None
-            if privilege == 0:
-                raise AravisHeadLostError("it has been restarted")
+        if is_ip_address(self.address) and not session.check_answering(
+            self.address, self.clock.mono_ns
+        ):
+            return False
         with self._control:
-            session.latch = session.camera.latch()
-            session.temperature_c = session.camera.thermometer.read_c()
+            session.read(self.name, self.clock.mono_ns())
             self._check_temperature(session.temperature_c)
-            if session.camera.ptp is not None:
-                session.ptp = session.camera.ptp.read(self.name, self.clock.mono_ns())
-                self.counters["ptp_readings"] += 1
-                self.counters["ptp_not_slave"] += session.ptp.status != SLAVE
-            if session.latch is None and session.temperature_c is None:
-                session.camera.check_alive()
+        if session.ptp is not None:
+            self.counters["ptp_readings"] += 1
+            self.counters["ptp_not_slave"] += session.ptp.status != SLAVE
         self.counters["latches"] += session.latch is not None
         return True
 
@@ -487,7 +437,7 @@ class AravisHead(AravisSettings, HeadDevice):
                 fault=True,
             )
 
-    def _count(self, session: _Session) -> None:
+    def _count(self, session: HeadSession) -> None:
         before, now = self._of_stream, session.stream.counted()
         now["other_senders"] += session.camera.other_senders()
         now["temperatures_implausible"] += session.camera.thermometer.implausible
@@ -527,7 +477,7 @@ class AravisHead(AravisSettings, HeadDevice):
         else:
             self._close_session(session)
 
-    def _close_session(self, session: _Session) -> None:
+    def _close_session(self, session: HeadSession) -> None:
         with self._control:
             if not session.is_lost:
                 session.camera.stop()
