@@ -17,6 +17,9 @@ from daemon.postflight.exchange.block import Block, BlockCamera, BlockError
 
 ORTHOGONAL_TO: Final = 1e-4
 """Largest element of R R' - I with which a matrix of a file is a rotation."""
+_OFF_MIDDLE: Final = 0.05
+_IN_MIDDLE: Final = 0.01
+"""Shares of the longer side: a principal point far from the middle, and one in it."""
 _NAMED: Final = 3
 _TERMS: Final = ("skew_px", "k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "radial_r8")
 
@@ -65,6 +68,24 @@ def check_block(path: Path, block: Block) -> None:
         )
 
 
+def upward_notes(block: Block) -> tuple[str, ...]:
+    """A sentence where most images of a block without measurements look upward.
+
+    Without measurements nothing else shows rotations that were written in the other direction, or
+    for axes x right, y down, z forward.
+    """
+    is_level = block.frame is not None or block.is_metric
+    if len(block.points.image) or not is_level:
+        return ()
+    upward = sum(-float(image.rotation[2, 2]) > 0.0 for image in block.images)
+    if 2 * upward <= len(block.images):
+        return ()
+    return (
+        f"{upward} of {len(block.images)} images look upward: if they do not, the rotations are "
+        "those of axes x right, y down, z forward, or the angles have another order or unit",
+    )
+
+
 def project_name(name: str) -> str:
     """Name of an image in the project: its tables have no spaces in names."""
     return name.replace(" ", "_")
@@ -96,6 +117,7 @@ def _check_camera(path: Path, camera: BlockCamera) -> None:
             f"{where}: its principal point is {model.cx_px:g}, {model.cy_px:g} px; it is finite: "
             "correct it"
         )
+    _refuse_exchanged_size(where, camera)
     wrong = [name for name in _TERMS if not math.isfinite(getattr(model, name))]
     if wrong:
         raise BlockError(f"{where}: its {', '.join(wrong)} are not finite; correct them")
@@ -103,6 +125,20 @@ def _check_camera(path: Path, camera: BlockCamera) -> None:
         raise BlockError(
             f"{where}: its pixel size is {camera.pitch_mm:g} mm; it is finite and positive: "
             "correct it"
+        )
+
+
+def _refuse_exchanged_size(where: str, camera: BlockCamera) -> None:
+    """Refuse a principal point in the middle of an image whose columns and rows are exchanged."""
+    size = np.array([camera.width_px, camera.height_px])
+    centre = np.array([camera.model.cx_px, camera.model.cy_px])
+    off = float(np.abs(centre - (size - 1) / 2.0).max())
+    exchanged = float(np.abs(centre - (size[::-1] - 1) / 2.0).max())
+    if off > _OFF_MIDDLE * size.max() and exchanged < _IN_MIDDLE * size.max():
+        raise BlockError(
+            f"{where}: its principal point {centre[0]:.1f}, {centre[1]:.1f} px is the middle of "
+            f"{size[1]} x {size[0]} px, and its size is {size[0]} x {size[1]} px: columns and rows "
+            "are exchanged in one of them; correct the camera"
         )
 
 

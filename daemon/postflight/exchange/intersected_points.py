@@ -32,6 +32,14 @@ MISFIT_SHARE: Final = 0.01
 a share of the longer side."""
 
 
+class OtherConventionError(BlockError):
+    """Rays that do not meet, with the median misfit; infinite where none was computed."""
+
+    def __init__(self, message: str, median_px: float) -> None:
+        super().__init__(message)
+        self.median_px = median_px
+
+
 @dataclass(frozen=True)
 class Measured:
     """One image: what names its camera (a name, or a focal length), and its points in mm."""
@@ -58,7 +66,9 @@ def intersected(
     """Points seen in two images or more, from the rays of all, and the median misfit in px.
 
     Raises:
-        BlockError: rays that do not meet, or meet behind the cameras.
+        BlockError: no point is measured in two images.
+        OtherConventionError: rays that do not meet, or meet behind the cameras, or measurements
+            outside of their image.
     """
     seen: dict[str, list[_Ray]] = {}
     for k, one in enumerate(measured.values()):
@@ -71,10 +81,11 @@ def intersected(
         is_outside = (np.abs(pixels - middle) > middle + 1.0).any(axis=1)
         for row, point in enumerate(one.points):
             if is_outside[row] or not np.isfinite(directions[row]).all():
-                raise BlockError(
+                raise OtherConventionError(
                     f"{folder}: point {point} of image {images[k].name} lies outside of the image "
-                    f"({xy_mm[row, 0]:g}, {xy_mm[row, 1]:g} mm); are coordinates in mm, and "
-                    f"{CAMERAS_FILE} right?"
+                    f"({xy_mm[row, 0]:g}, {xy_mm[row, 1]:g} mm); are coordinates in mm from the "
+                    f"middle of the image, and {CAMERAS_FILE} right?",
+                    math.inf,
                 )
             seen.setdefault(point, []).append(_Ray(k, pixels[row], directions[row]))
     names: list[str] = []
@@ -100,10 +111,11 @@ def intersected(
     median_px = float(np.median(misfits))
     limit_px = MISFIT_SHARE * max(max(c.width_px, c.height_px) for c in cameras)
     if not median_px < limit_px or 2 * behind > len(names):
-        raise BlockError(
+        raise OtherConventionError(
             f"{folder}: the rays miss each other by {median_px:.0f} px (median), and {behind} of "
             f"{len(names)} points lie behind the cameras. Order or unit of the angles, the "
-            "direction of y (up), or the coordinate system of the orientation is another one"
+            "direction of y (up), or the coordinate system of the orientation is another one",
+            math.inf if 2 * behind > len(names) else median_px,
         )
     return BlockPoints(
         np.array(xyz),

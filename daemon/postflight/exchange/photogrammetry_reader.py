@@ -11,8 +11,10 @@ Geomatics documents it; PATB image coordinates, photo and focal length, then poi
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path, PurePath
 from typing import Final
 
@@ -25,7 +27,13 @@ from daemon.postflight.exchange.block import (
     BlockError,
     BlockImage,
 )
-from daemon.postflight.exchange.intersected_points import Measured, intersected
+from daemon.postflight.exchange.coordinate_unit import NOT_STATED, is_in_metres
+from daemon.postflight.exchange.intersected_points import (
+    Measured,
+    OtherConventionError,
+    intersected,
+)
+from daemon.postflight.exchange.other_readings import TRIED_PX, Reading, refuse_other_reading
 from daemon.postflight.exchange.photogrammetry import ANGLES, CAMERAS_FILE, UNITS, Unit
 from daemon.postflight.exchange.text_lines import lines_of, numbers_of, only_file
 from processing.geometry.forward_distortion import (
@@ -35,13 +43,14 @@ from processing.geometry.rotation import rotation_from_angles
 
 Array = NDArray[np.float64]
 
-_OTHER_TRIED_PX: Final = 1.0
-"""Median misfit above which other orders and units of the angles are tried."""
-_OTHER_BETTER: Final = 0.5
-"""Share of it below which another order or unit is the right one."""
 _FOCAL_WITHIN: Final = 1e-3
 _END: Final = "-99"
 _ORTHOGONAL_TO: Final = 1e-5
+_FULL_UNITS: Final[Mapping[str, float]] = {
+    "deg": UNITS["deg"],
+    "gon": UNITS["gon"],
+    "rad": math.pi / 180.0,
+}
 _ORDERS: Final = {"omega-phi-kappa": "XYZ", "phi-omega-kappa": "YXZ"}
 BINGO_PATTERNS: Final = ("*bingo*.txt", "*.dat")
 
@@ -68,40 +77,33 @@ def read_bingo(folder: Path) -> Block:
     measurements = only_file(folder, BINGO_PATTERNS, "<name>_bingo.txt")
     measured = bingo_measurements(measurements, cameras)
     oriented = named_orientations(path, order, unit)
-    block, median_px = measured_block(folder, cameras, oriented, measured, system, {})
-    if median_px > _OTHER_TRIED_PX:
-        _refuse_other_angles(folder, path, (order, unit, median_px), cameras, measured)
-    return block
+    readings = angle_readings(path, order, unit)
+    is_metric = is_in_metres(folder, system)
+    return measured_block(
+        folder, cameras, oriented, measured, system, {}, readings, is_metric=is_metric
+    )
 
 
-def _refuse_other_angles(
-    folder: Path,
-    path: Path,
-    stated: tuple[str, Unit, float],
-    cameras: Mapping[str, BlockCamera],
-    measured: Mapping[str, Measured],
-) -> None:
-    """Refuse a stated order and unit with which the rays meet worse than with others.
-
-    The rays of images that look down with small angles meet within pixels with a wrong unit, too.
-    """
-    order, unit, median_px = stated
-    (other_unit,) = (one for one in UNITS if one != unit)
-    (other_order,) = (one for one in _ORDERS.values() if one != order)
-    tried = ((order, other_unit), (other_order, unit), (other_order, other_unit))
+def angle_readings(
+    path: Path, order: str, unit: str, *, header: Sequence[str] = ()
+) -> list[Reading]:
+    """Orientations of a file in the other orders and units of angles."""
     called = {axes: name for name, axes in _ORDERS.items()}
-    for axes, in_unit in tried:
-        oriented = named_orientations(path, axes, in_unit)
-        try:
-            _, other_px = measured_block(folder, cameras, oriented, measured, "", {})
-        except BlockError:
-            continue
-        if other_px < _OTHER_BETTER * median_px:
-            raise BlockError(
-                f"{folder / 'angles.txt'}: with {called[order]} in {unit} the rays miss each other "
-                f"by {median_px:.2f} px (median), with {called[axes]} in {in_unit} by "
-                f"{other_px:.2f} px; state order and unit of {path.name} as they are"
-            )
+
+    def rotations(axes: str, in_unit: str) -> dict[str, Array]:
+        found = named_orientations(path, axes, in_unit, header=header)
+        return {key: one.rotation for name, one in found.items() for key in (name, _stem(name))}
+
+    return [
+        Reading(
+            f"{called[axes]} in {in_unit}",
+            f"state order and unit of {path.name} as they are, not {called[order]} in {unit}",
+            partial(rotations, axes, in_unit),
+        )
+        for axes in sorted(called, key=lambda one: one != order)
+        for in_unit in _FULL_UNITS
+        if (axes, in_unit) != (order, unit)
+    ]
 
 
 def read_patb(folder: Path) -> Block:
@@ -116,7 +118,10 @@ def read_patb(folder: Path) -> Block:
     measured = _patb(only_file(folder, ("*.im",), "<name>.im"), cameras, photos)
     system = _stated(folder)[2] if (folder / "angles.txt").exists() else "not stated in the files"
     names = {number: name for number, (name, _) in photos.items()}
-    return measured_block(folder, cameras, oriented, measured, system, names)[0]
+    is_metric = is_in_metres(folder, system)
+    return measured_block(
+        folder, cameras, oriented, measured, system, names, (), is_metric=is_metric
+    )
 
 
 def cameras_of(folder: Path) -> dict[str, BlockCamera]:
@@ -185,7 +190,7 @@ def _stated(folder: Path) -> tuple[str, Unit, str]:
 
 
 def named_orientations(
-    path: Path, axes: str, unit: Unit, *, header: Sequence[str] = ()
+    path: Path, axes: str, unit: str, *, header: Sequence[str] = ()
 ) -> dict[str, Oriented]:
     """Name, place and three angles in each line, the first one the header where there is one."""
     rows = lines_of(path)
@@ -198,7 +203,7 @@ def named_orientations(
         if len(words) != 7:
             raise BlockError(f"{path}: line {number}: {len(words)} columns; 7 are right")
         values = numbers_of(path, number, words[1:])
-        angles = np.radians(np.array(values[3:]) / UNITS[unit])
+        angles = np.radians(np.array(values[3:]) / _FULL_UNITS[unit])
         rotation = rotation_from_angles(axes, angles.tolist())
         _add(found, path, number, words[0], np.array(values[:3]), np.asarray(rotation))
     return found
@@ -347,8 +352,16 @@ def measured_block(
     measured: Mapping[str, Measured],
     system: str,
     names: Mapping[str, str],
-) -> tuple[Block, float]:
-    """A block with points intersected from its measurements, and the median misfit, px."""
+    readings: Iterable[Reading],
+    *,
+    is_metric: bool,
+) -> Block:
+    """A block with points intersected from its measurements.
+
+    Raises:
+        BlockError: images without orientation, or rays that do not meet; it names the reading in
+            which they do.
+    """
     oriented = _by_names_of(measured, oriented)
     without = sorted(set(measured) - set(oriented))
     if without:
@@ -373,14 +386,22 @@ def measured_block(
     )
     if not images:
         raise BlockError(f"{folder}: no image has measurements")
-    points, median_px = intersected(folder, tuple(cameras.values()), images, measured)
+    every = tuple(cameras.values())
+    try:
+        points, median_px = intersected(folder, every, images, measured)
+    except OtherConventionError as error:
+        refuse_other_reading(folder, every, images, measured, error.median_px, readings)
+        raise
+    if median_px > TRIED_PX:
+        refuse_other_reading(folder, every, images, measured, median_px, readings)
     notes.append(
         f"points are intersected from the orientations, which they fit with a median of "
         f"{median_px:.2f} px"
     )
     name = folder.resolve().name
-    block = Block(name, tuple(cameras.values()), images, points=points, notes=tuple(notes))
-    return block, median_px
+    if not is_metric:
+        notes.insert(0, NOT_STATED)
+    return Block(name, every, images, points=points, notes=tuple(notes), is_metric=is_metric)
 
 
 def _by_names_of(
@@ -389,5 +410,9 @@ def _by_names_of(
     """Orientations by the names of the measurements, which may have no suffix of a file."""
     if set(measured) <= set(oriented):
         return oriented
-    by_stem = {PurePath(name).stem: one for name, one in oriented.items()}
+    by_stem = {_stem(name): one for name, one in oriented.items()}
     return by_stem if len(by_stem) == len(oriented) else oriented
+
+
+def _stem(name: str) -> str:
+    return PurePath(name).stem

@@ -12,9 +12,11 @@ from typing import Final
 
 from daemon.postflight.exchange.block import Block, BlockCamera, BlockError, BlockImage
 from daemon.postflight.exchange.colmap import CENTRE_PX
+from daemon.postflight.exchange.coordinate_unit import NOT_STATED, is_in_metres, stated_system
 from daemon.postflight.exchange.photogrammetry import CAMERAS_FILE
 from daemon.postflight.exchange.photogrammetry_reader import (
     BINGO_PATTERNS,
+    angle_readings,
     bingo_measurements,
     cameras_of,
     measured_block,
@@ -44,11 +46,16 @@ def read_pix4d(folder: Path) -> Block:
         folder, ("*external_camera_parameters.txt",), "calibrated_external_camera_parameters.txt"
     )
     oriented = named_orientations(path, "XYZ", "deg", header=_HEADER)
-    system = "that of the Pix4D project"
+    stated = stated_system(folder)
+    is_metric = is_in_metres(folder, stated)
+    system = stated.split('"')[1] if is_metric and '"' in stated else "that of the Pix4D project"
     if any(True for pattern in BINGO_PATTERNS for _ in folder.glob(pattern)):
         measurements = only_file(folder, BINGO_PATTERNS, "<name>_bingo.txt")
         measured = bingo_measurements(measurements, cameras)
-        return measured_block(folder, cameras, oriented, measured, system, {})[0]
+        readings = angle_readings(path, "XYZ", "deg", header=_HEADER)
+        return measured_block(
+            folder, cameras, oriented, measured, system, {}, readings, is_metric=is_metric
+        )
     names = list(cameras)
     camera_of = dict(photos_of(folder, cameras).values())
     unknown = sorted(set(oriented) - set(camera_of)) if len(names) > 1 else []
@@ -61,8 +68,14 @@ def read_pix4d(folder: Path) -> Block:
         BlockImage(name, names.index(camera_of.get(name, names[0])), k, one.centre_m, one.rotation)
         for k, (name, one) in enumerate(oriented.items())
     )
-    notes = (f"coordinate system: {system}",)
-    return Block(folder.resolve().name, tuple(cameras.values()), images, notes=notes)
+    notes = (*(() if is_metric else (NOT_STATED,)), f"coordinate system: {system}")
+    return Block(
+        folder.resolve().name,
+        tuple(cameras.values()),
+        images,
+        notes=notes,
+        is_metric=is_metric,
+    )
 
 
 def _with_cam(folder: Path, camera: BlockCamera) -> BlockCamera:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pyproj import CRS
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
@@ -102,7 +103,7 @@ def test_an_imported_block_adjusts_to_the_truth(scene, tmp_path, program, write)
     done = RUN.invoke(
         app,
         ["import", "block", str(path), "--from", program, "--out", str(out), "--image-sigma",
-         "0.3", "--position-sigma", "0.05", "0.05", "0.05", "--json"],
+         "0.3", "--position-sigma", "0.05", "0.05", "0.05", "--metric", "--json"],
     )  # fmt: skip
     assert done.exit_code == 0, done.output + str(done.exception)
     content = json.loads(done.stdout)
@@ -134,15 +135,27 @@ def turned(path: Path, write) -> None:
 @pytest.mark.parametrize(
     ("wrong", "sentence"),
     [
-        (lambda row: [row[0], row[1], str(-float(row[2]))], "rays miss each other|lie behind"),
-        (lambda row: [row[0], row[2], row[1]], "rays miss each other|outside of the image"),
-        (lambda row: [row[0], str(-float(row[1])), row[2]], "rays miss each other|lie behind"),
-        (lambda row: [row[0], *(str(float(v) * 250) for v in row[1:])], "outside of the image"),
-        (lambda row: [row[0], *(str(float(v) * 0.25) for v in row[1:])], "rays miss each other"),
+        (lambda row: [row[0], row[1], str(-float(row[2]))], "with y of the measurements reversed"),
+        (lambda row: [row[0], row[2], row[1]], "with x and y of the measurements exchanged"),
+        (lambda row: [row[0], str(-float(row[1])), row[2]], "with x of the measurements reversed"),
+        (
+            lambda row: [row[0], *(str(-float(v)) for v in row[1:])],
+            "with x and y of the measurements reversed",
+        ),
+        (lambda row: [row[0], *(str(float(v) * 250) for v in row[1:])], "measurements in px"),
+        (lambda row: [row[0], *(str(float(v) * 1000) for v in row[1:])], "measurements in um"),
+        (lambda row: [row[0], *(str(float(v) + 3) for v in row[1:])], "outside of the image"),
+        (
+            lambda row: [row[0], *(str(float(v) * 0.25) for v in row[1:])],
+            "the rays miss each other",
+        ),
         (lambda row: [*row, "0.004"], "4 columns"),
         (lambda row: [row[0], row[1], "nan"], "finite number"),
     ],
-    ids=["y down", "exchanged", "x left", "pixels", "another pixel size", "accuracy", "nan"],
+    ids=[
+        *("y down", "exchanged", "x left", "both", "pixels", "micrometres", "another origin"),
+        *("another pixel size", "accuracy", "nan"),
+    ],
 )
 def test_measurements_of_another_convention_are_refused(scene, tmp_path, wrong, sentence) -> None:
     folder = bingo(scene, tmp_path / "in")
@@ -151,21 +164,109 @@ def test_measurements_of_another_convention_are_refused(scene, tmp_path, wrong, 
         read_bingo(folder)
 
 
+def angles_written(folder: Path, old: str, new: str) -> None:
+    text = (folder / "angles.txt").read_text()
+    assert old in text
+    (folder / "angles.txt").write_text(text.replace(old, new))
+
+
 @pytest.mark.parametrize(
     ("old", "new", "sentence"),
     [
-        ("unit: gon", "unit: deg", "rays miss each other|lie behind"),
+        ("unit: gon", "unit: deg", "with phi-omega-kappa in gon they miss"),
         ("unit: gon", "unit: rad", "unit 'rad'"),
         (ANGLES, ANGLES.replace("phi, omega", "kappa, omega"), "omega-phi-kappa or"),
+        (
+            ANGLES,
+            "omega, phi, kappa of R = Rx(omega) Ry(phi) Rz(kappa), grid from camera",
+            "with phi-omega-kappa in gon they miss",
+        ),
+        ("EPSG:32633", "EPSG:2263", "are in US survey foot, and metres are read"),
+        ("EPSG:32633", "EPSG:4326", "are in degree, and metres are read"),
+        ("EPSG:32633", "EPSG:32633+6360", "are in US survey foot, metre, and metres are read"),
     ],
 )
 def test_angles_of_another_unit_or_order_are_refused(scene, tmp_path, old, new, sentence) -> None:
     folder = bingo(scene, tmp_path / "in")
-    text = (folder / "angles.txt").read_text()
-    assert old in text
-    (folder / "angles.txt").write_text(text.replace(old, new))
+    angles_written(folder, old, new)
     with pytest.raises(BlockError, match=sentence):
         read_bingo(folder)
+
+
+def orientations(path: Path, change) -> None:
+    """Change place and angles of each line with seven words."""
+    rows = []
+    for row in map(str.split, path.read_text().splitlines()):
+        is_pose = len(row) == 7 and row[1] != "X"
+        if is_pose:
+            row = [row[0], *(f"{v:.9f}" for v in change(np.array(row[1:], float)))]
+        rows.append(" ".join(row))
+    path.write_text("\n".join(rows) + "\n")
+
+
+def other_order(row: np.ndarray, given: str, taken: str) -> list[float]:
+    turn = Rotation.from_euler(given, row[3:], degrees=True)
+    return [*row[:3], *turn.as_euler(taken, degrees=True)]
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (lambda row: [row[1], row[0], *row[2:]], "with X and Y of the places exchanged"),
+        (lambda row: [*row[:3], *np.radians(row[3:])], "with omega-phi-kappa in rad they miss"),
+        (lambda row: [*row[:3], *(row[3:] / 0.9)], "with omega-phi-kappa in gon they miss"),
+        (lambda row: other_order(row, "XYZ", "YXZ"), "with phi-omega-kappa in deg they miss"),
+        (
+            lambda row: [*row[:3], *Rotation.from_euler("XYZ", row[3:], degrees=True).inv()
+                         .as_euler("XYZ", degrees=True)],
+            "with transposed rotations they miss",
+        ),
+    ],
+    ids=["northing first", "radians", "gon", "order", "transposed"],
+)  # fmt: skip
+def test_orientations_of_pix4d_of_another_convention(scene, tmp_path, change, sentence) -> None:
+    folder = pix4d(scene, tmp_path / "in")
+    (path,) = folder.glob("*external*.txt")
+    orientations(path, change)
+    with pytest.raises(BlockError, match=sentence):
+        read_pix4d(folder)
+
+
+def test_matrices_of_patb_that_are_transposed_are_named(scene, tmp_path) -> None:
+    folder = patb(scene, tmp_path / "in")
+    rows = grouped((folder / "block.ori").read_text())
+    text = ""
+    for first, *two in rows:
+        turn = np.array(" ".join(two).split(), float).reshape(3, 3).T.ravel()
+        text += first + "\n"
+        text += " ".join(f"{v:.12f}" for v in turn[:5]) + "\n"
+        text += " ".join(f"{v:.12f}" for v in turn[5:]) + "\n"
+    (folder / "block.ori").write_text(text)
+    with pytest.raises(BlockError, match="with transposed rotations they miss each other by 0"):
+        read_patb(folder)
+
+
+@pytest.mark.parametrize(
+    ("code", "is_metric", "word"),
+    [
+        ("EPSG:32633", True, "UTM_Zone_33N"),
+        (None, False, "do not state the unit of coordinates"),
+    ],
+)
+def test_the_coordinate_system_of_pix4d_states_the_unit(
+    scene, tmp_path, code, is_metric, word
+) -> None:
+    folder = pix4d(scene, tmp_path / "in")
+    if code is not None:
+        (folder / "block_wkt.prj").write_text(CRS(code).to_wkt("WKT1_ESRI"))
+    for measurements in (True, False):
+        if not measurements:
+            (folder / "block_bingo.txt").unlink()
+        block = read_pix4d(folder)
+        assert block.is_metric is is_metric and any(word in note for note in block.notes)
+    (folder / "block_wkt.prj").write_text(CRS("EPSG:2263").to_wkt("WKT1_ESRI"))
+    with pytest.raises(BlockError, match="are in US survey foot"):
+        read_pix4d(folder)
 
 
 @pytest.mark.parametrize(
@@ -177,6 +278,7 @@ def test_angles_of_another_unit_or_order_are_refused(scene, tmp_path, old, new, 
         ("block.ori", "\n", " 1.0\n", "records of 5, 5 and 4 numbers"),
         ("cameras.txt", "X20 6.0", "X20 -6.0", "f, pixel size and sides are positive"),
         ("cameras.txt", "1600 1200", "1600", "6 columns; 7 are right"),
+        ("cameras.txt", "1600 1200", "1200 1600", r"outside of the image .*cameras.txt right\?"),
     ],
 )
 def test_damaged_files_of_patb_are_refused(scene, tmp_path, file, old, new, sentence) -> None:

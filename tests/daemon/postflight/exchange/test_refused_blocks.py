@@ -325,7 +325,7 @@ def test_the_unit_of_angles_is_seen_where_rays_meet_within_the_limit(tmp_path) -
     import_block(folder, "bingo", tmp_path / "good")
     edit(folder / "angles.txt", lambda text: text.replace("unit: gon", "unit: deg"))
     refused(
-        folder, "bingo", tmp_path, r"phi-omega-kappa in deg the rays .*phi-omega-kappa in gon by 0"
+        folder, "bingo", tmp_path, r"as read .* with phi-omega-kappa in gon .* by 0\.\d+ px; state"
     )
 
 
@@ -386,6 +386,20 @@ def test_inpho_projects_with_other_units_keys_and_states(tmp_path, old, new, sen
     assert len(import_block(path, "inpho", tmp_path / "good").block.images) == 2
     path.write_text(INPHO.replace(old, new, 1))
     refused(path, "inpho", tmp_path, sentence)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "is_noted"),
+    [
+        ("   1 0 0\n", "   1 0 0\n", False),
+        ("   1 0 0\n   0 1 0\n   0 0 1\n", "   1 0 0\n   0 -1 0\n   0 0 -1\n", True),
+    ],
+)
+def test_images_that_look_upward_are_stated(tmp_path, old, new, is_noted) -> None:
+    path = tmp_path / "a.prj"
+    path.write_text(INPHO.replace(old, new))
+    notes = import_block(path, "inpho", tmp_path / "p").block.notes
+    assert any("2 of 2 images look upward" in note for note in notes) is is_noted
 
 
 def test_the_command_ends_in_one_sentence(scene, tmp_path) -> None:
