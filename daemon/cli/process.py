@@ -159,6 +159,8 @@ def _run(
 
     outcome, console, executor = BatchOutcome(), Console(stderr=True), placed.executor
     complete = len(found.complete)
+    if source.note:
+        console.print(source.note, highlight=False)
     if found.pending:
         console.print(
             f"{len(found.pending)} exposures to compute, {complete} complete; "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -106,6 +107,9 @@ def transfer(
             report = _to_store(mission, target, show, remove_source=remove_source)
         else:
             report = _to_disk(mission, folder_of(target), show, remove_source=remove_source)
+    uploads = None if isinstance(report.target, Path) else report.uploads
+    if uploads is not None and uploads.sentence:
+        Console(stderr=True, soft_wrap=True).print(uploads.sentence, highlight=False)
     if as_json:
         typer.echo(
             json.dumps(
@@ -118,6 +122,7 @@ def transfer(
                     "frames": report.verified.frames,
                     "source_removed": report.source_removed,
                     "sealed_utc": report.sealed_utc,
+                    **({} if uploads is None else {"unfinished_uploads": asdict(uploads)}),
                 }
             )
         )

@@ -48,6 +48,7 @@ Source: Amazon S3 API Reference, Error responses.
 """
 _DENIED = re.compile(r"status code: (40[13]\b|400 Bad Request:?$)")
 """Answers that name no code, as those to HEAD; obstore reports some of them as general errors."""
+_NO_UPLOAD: Final = "NoSuchUpload"
 _URL = re.compile(r"([a-z0-9]+)://([^/?#@]+)(/[^?#]*)?")
 
 T = TypeVar("T")
@@ -248,7 +249,8 @@ class ObjectStore:
                     )  # fmt: skip
                 return
             except obstore.exceptions.BaseError as error:
-                if _is_final(error):
+                # An upload that was aborted elsewhere is begun again.
+                if _is_final(error) and _NO_UPLOAD not in str(error):
                     raise self._refused(name, error) from error
                 there = self.find(name)
                 if there is not None and there.nbytes == nbytes:

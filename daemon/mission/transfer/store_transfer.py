@@ -11,13 +11,14 @@ import os
 from collections.abc import Iterator
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
 from daemon.mission.layout import Mission
 from daemon.mission.store.file_tree import FileEntry, FileTree
 from daemon.mission.transfer.object_store import PART_BYTES, ObjectStore, StoredObject
+from daemon.mission.transfer.s3_uploads import UnfinishedUploads, abort_unfinished
 from daemon.mission.transfer.store_products import is_processed
 from daemon.mission.transfer.store_verification import check_store_copy, read_store_manifest
 from daemon.mission.transfer.transfer import (
@@ -47,7 +48,10 @@ WORKERS = 4
 
 @dataclass(frozen=True)
 class StoreTransferReport:
-    """Result of a transfer to a store; counts as in `daemon.mission.transfer.transfer`."""
+    """Result of a transfer to a store; counts as in `daemon.mission.transfer.transfer`.
+
+    `uploads` are those that earlier runs did not finish.
+    """
 
     target: str
     copied: int
@@ -56,6 +60,7 @@ class StoreTransferReport:
     verified: VerifyReport
     source_removed: bool
     sealed_utc: str = ""
+    uploads: UnfinishedUploads = field(default_factory=UnfinishedUploads)
 
 
 def transfer_to_store(
@@ -171,6 +176,9 @@ class _StoreCopying:
             },
         )
         self._target.replace_small(MANIFEST_FILE, note.to_bytes())
+        uploads = abort_unfinished(
+            self._target.url, lambda name: name in note.files or is_processed(name)
+        )
         done = self._copy_all(present)
         for name in removed:
             self._target.delete(name)
@@ -190,7 +198,7 @@ class _StoreCopying:
         present_before = sum(was_present for _, was_present in done.values())
         return StoreTransferReport(
             self._target.url, len(done) - present_before, present_before, self._nbytes,
-            self._verified, remove, manifest.sealed_utc,
+            self._verified, remove, manifest.sealed_utc, uploads,
         )  # fmt: skip
 
     def confirm_sealed(self, manifest: TransferManifest, *, remove: bool) -> StoreTransferReport:

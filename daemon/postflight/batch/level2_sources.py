@@ -12,8 +12,9 @@ from daemon.mission.exposure_batch import ExposureFailure
 from daemon.mission.layout import Mission
 from daemon.mission.store.level2 import recover_level2
 from daemon.mission.transfer.object_store import is_store_url
+from daemon.mission.transfer.s3_uploads import abort_unfinished
 from daemon.mission.transfer.store_mission import StoredMission, open_stored
-from daemon.mission.transfer.store_products import PROCESSED, stored_reports
+from daemon.mission.transfer.store_products import PROCESSED, is_processed, stored_reports
 from daemon.planning.overlaps import Overlaps
 from daemon.postflight.batch.batch_run import BatchOutcome
 from daemon.postflight.batch.level2_work import (
@@ -31,13 +32,14 @@ AnyLevel2Work: TypeAlias = Level2Work | StoreLevel2Work
 class Level2Source(Protocol):
     """A mission and the place of its products.
 
-    `mission` is a folder here, without the frames of a mission in a store; `place` and `products`
-    are for messages.
+    `mission` is a folder here, without the frames of a mission in a store; `place`, `products` and
+    `note`, what was found before the run, are for messages.
     """
 
     mission: Mission
     place: str
     products: str
+    note: str
 
     def placed(self, work: Level2Work) -> AnyLevel2Work:
         """The work that reads and publishes there."""
@@ -64,6 +66,7 @@ class FolderSource:
     def __init__(self, mission: Mission) -> None:
         self.mission = mission
         self.place, self.products = str(mission.path), str(mission.level2_root)
+        self.note = ""
 
     def placed(self, work: Level2Work) -> AnyLevel2Work:
         return work
@@ -94,6 +97,7 @@ class StoreSource:
         self.mission, self._stored = mission, stored
         self.place = stored.store.url
         self.products = f"{stored.store.url}/{PROCESSED}/L2"
+        self.note = ""
 
     def placed(self, work: Level2Work) -> AnyLevel2Work:
         return StoreLevel2Work(self.place, work)
@@ -112,6 +116,7 @@ class StoreSource:
 
     @contextmanager
     def writing(self) -> Iterator[None]:
+        self.note = abort_unfinished(self.place, is_processed).sentence
         yield
 
 
