@@ -1,9 +1,9 @@
 """Tie points across exposures: features of one image found in every other that overlaps it.
 
 Prediction by direct georeferencing and the height that earlier matches of the same point gave;
-correlation and least squares as in `processing.matching.patches`. Images flown the other way or
-crosswise are turned by quarters first, oblique ones brought to where the other stood and looked, by
-the plane of the ground. Views from too far apart are not matched.
+correlation and least squares as in `processing.matching.patches`, which find a shift. Images that
+differ by more than that and quarter turns (crab, tilts, oblique views) are first brought to where
+the other stood and looked, by the plane of the ground. Views from too far apart are not matched.
 """
 
 from __future__ import annotations
@@ -28,8 +28,9 @@ Indices = NDArray[np.int64]
 Picture = NDArray[np.float32]
 Carry = Callable[[Array], Array]
 
-_OBLIQUE_COSINE: Final = math.cos(math.radians(20.0))
-"""Looking farther from the vertical, an image differs from its neighbour by more than a turn."""
+_SAME_SHAPE: Final = 2e-3
+"""Rotation, stretch or shear between two images below which a shift fits: 0.02 px at the edge of a
+window. A turn by 2 degrees that is left in it moves a match by 0.07 px."""
 _SIMILAR_VIEW_COSINE: Final = math.cos(math.radians(35.0))
 """Views farther apart show other sides of objects on the ground."""
 
@@ -317,6 +318,18 @@ def _plane_homography(
     return np.asarray(px_from_ray @ there[1].T @ seen @ here[1] @ ray_from_px)
 
 
+def _shape_beyond_quarters(image: VirtualImage, homography: Array, quarters: int) -> float:
+    """Largest element by which a homography differs locally from quarter turns, at the corners."""
+    turn = np.linalg.matrix_power(np.array([[0.0, 1.0], [-1.0, 0.0]]), quarters)
+    corners = [
+        (x, y, 1.0) for x in (0.0, image.width_px - 1.0) for y in (0.0, image.height_px - 1.0)
+    ]
+    at = np.array(corners) @ homography.T
+    with np.errstate(all="ignore"):
+        local = homography[:2, :2] - at[:, :2, None] / at[:, 2, None, None] * homography[2, :2]
+        return float(np.abs(turn @ (local / at[:, 2, None, None]) - np.eye(2)).max())
+
+
 def rectified(
     there: Picture,
     image: VirtualImage,
@@ -337,11 +350,12 @@ def rectified(
         The image, and functions of pixels (n, 2) from the other image into it and back.
     """
     height, width = there.shape
-    if min(own[1][2, 2], other[1][2, 2]) < _OBLIQUE_COSINE:
-        from_here = _plane_homography(image, own, other, ground_m)
+    quarters = quarter_rotations(own[1], other[1])
+    from_here = _plane_homography(image, own, other, ground_m)
+    if not _shape_beyond_quarters(image, from_here, quarters) <= _SAME_SHAPE:
         to_here = np.asarray(np.linalg.inv(from_here))
         seen = cv2.warpPerspective(
-            there, from_here, (width, height), flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP,
+            there, from_here, (width, height), flags=cv2.INTER_LANCZOS4 | cv2.WARP_INVERSE_MAP,
             borderMode=cv2.BORDER_CONSTANT, borderValue=math.nan,
         )  # fmt: skip
         return (
@@ -349,7 +363,6 @@ def rectified(
             partial(apply_projective, to_here),
             partial(apply_projective, from_here),
         )
-    quarters = quarter_rotations(own[1], other[1])
     rotated = np.ascontiguousarray(np.rot90(there, quarters))
     return (
         rotated,
