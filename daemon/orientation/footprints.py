@@ -16,6 +16,7 @@ import numpy as np
 
 from daemon.configuration.model import MountSection
 from daemon.mission.exposure import NavigationRecord
+from daemon.orientation.antimeridian import Ring, polygon
 from daemon.orientation.exterior_orientation import ExteriorOrientation
 from daemon.orientation.georeference import Georeference
 from daemon.orientation.local_frame import LocalFrame
@@ -28,8 +29,6 @@ from processing.rig import Rig
 
 ALONG_EDGE = 8
 """Points on each side of the image."""
-
-Ring = Sequence[tuple[float, float]]
 
 GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC)
 
@@ -136,14 +135,6 @@ def geojson(
         geometry = polygon(ring)
         features.append({"type": "Feature", "geometry": geometry, "properties": properties})
     return {"type": "FeatureCollection", "features": features}
-
-
-def polygon(corners: Ring | None) -> dict[str, Any] | None:
-    """A GeoJSON polygon of (longitude, latitude); None without corners."""
-    if corners is None:
-        return None
-    ring = [[round(longitude, 9), round(latitude, 9)] for longitude, latitude in corners]
-    return {"type": "Polygon", "coordinates": [[*ring, ring[0]]]}
 
 
 def rings_on_terrain(

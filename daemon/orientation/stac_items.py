@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 
 from daemon.mission.layout import Mission
+from daemon.orientation.antimeridian import Ring, bbox_of, mean_longitude, polygon
 from daemon.orientation.exterior_orientation import ExteriorOrientation
-from daemon.orientation.footprints import footprint, ground_sample_m, polygon, utc_text
+from daemon.orientation.footprints import footprint, ground_sample_m, utc_text
 from drivers.timescales.gps_time import SECOND_NS
 from drivers.timescales.leap_seconds import leap_seconds_at
 from processing.geometry.sun import sun_azimuth_rad, sun_elevation_rad
@@ -31,8 +32,6 @@ EXTENSIONS = (PROJECTION, VIEW, FILE)
 GPS_EPOCH_UNIX_S = 315_964_800
 _NADIR_DEG = 1e-6
 """Below this tilt the direction of the axis on the ground is not defined."""
-
-Ring = Sequence[tuple[float, float]]
 
 LEVEL2_ASSETS: Mapping[str, tuple[str, str, Sequence[str]]] = {
     "pan.tif": ("image/tiff", "panchromatic", ("data",)),
@@ -89,7 +88,7 @@ def stac_item(
         "proj:code": None,
         "proj:centroid": {
             "lat": round(sum(latitude for _, latitude in ring) / len(ring), 9),
-            "lon": round(sum(longitude for longitude, _ in ring) / len(ring), 9),
+            "lon": round(mean_longitude([longitude for longitude, _ in ring]), 9),
         },
         **view_of(eo),
         "view:sun_elevation": round(sun_elevation_deg, 3),
@@ -202,10 +201,3 @@ def sun_angles_deg(gps_ns: int, latitude_deg: float, longitude_deg: float) -> tu
         math.degrees(sun_elevation_rad(unix_s, *place)),
         math.degrees(sun_azimuth_rad(unix_s, *place)),
     )
-
-
-def bbox_of(rings: Sequence[Ring]) -> list[float]:
-    """West, south, east, north of rings, degrees."""
-    longitudes = [longitude for ring in rings for longitude, _ in ring]
-    latitudes = [latitude for ring in rings for _, latitude in ring]
-    return [min(longitudes), min(latitudes), max(longitudes), max(latitudes)]

@@ -19,6 +19,7 @@ from daemon.mission.exposure import Exposure
 from daemon.mission.exposure_batch import ExposureFailure
 from daemon.mission.layout import Mission
 from daemon.mission.store.frame_checks import tdi_shifts
+from daemon.orientation.antimeridian import mean_longitude
 from daemon.orientation.exterior_orientation import ExteriorOrientation, sealed_exposures
 from daemon.orientation.local_frame import LocalFrame
 from daemon.orientation.orientation_inputs import read_orientation_inputs
@@ -106,7 +107,7 @@ def block_of_mission(
         )
     latitude = np.array([eo.latitude_deg for eo in oriented])
     longitude = np.array([eo.longitude_deg for eo in oriented])
-    frame = LocalFrame(float(latitude.mean()), float(longitude.mean()))
+    frame = LocalFrame(float(latitude.mean()), mean_longitude(longitude.tolist()))
     images, missing = [], []
     for eo in oriented:
         for index, head in enumerate(heads):

@@ -10,9 +10,12 @@ import sqlite3
 import struct
 from collections.abc import Sequence
 from contextlib import closing
+from dataclasses import replace
 from datetime import UTC, datetime
+from itertools import islice
 from pathlib import Path
 
+from daemon.orientation.antimeridian import Ring, continuous
 from daemon.orientation.geodesy import CRS
 from daemon.postflight.export.gis_layers import GisFeature, GisLayer, Kind, Places
 from daemon.postflight.export.qgis_styles import style_of
@@ -98,7 +101,9 @@ def _write_layer(database: sqlite3.Connection, layer: GisLayer, stamp: str) -> N
         f'CREATE TABLE "{layer.name}" (fid INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL, '
         f"geom {layer.kind.upper()}{columns})"
     )
-    places = [place for feature in layer.features for place in feature.places]
+    # Longitudes beyond 180 degrees keep a mission across the antimeridian in one piece.
+    places = continuous([place for feature in layer.features for place in feature.places])
+    layer = _with_places(layer, places)
     box = _box(tuple(places)) if places else (None, None, None, None)
     database.execute(
         "INSERT INTO gpkg_contents VALUES (?, 'features', ?, ?, ?, ?, ?, ?, ?, ?)",
@@ -121,6 +126,13 @@ def _write_layer(database: sqlite3.Connection, layer: GisLayer, stamp: str) -> N
         "update_time) VALUES ('', '', ?, 'geom', ?, ?, '', 1, ?, '', NULL, ?)",
         (layer.name, layer.name, style_of(layer), layer.title, stamp),
     )
+
+
+def _with_places(layer: GisLayer, places: Ring) -> GisLayer:
+    """The layer with the places of all features in order."""
+    rest = iter(places)
+    features = (replace(one, places=tuple(islice(rest, len(one.places)))) for one in layer.features)
+    return replace(layer, features=tuple(features))
 
 
 def geometry_bytes(kind: Kind, feature: GisFeature) -> bytes:

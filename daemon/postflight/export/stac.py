@@ -19,17 +19,16 @@ from daemon.mission.store.durable import sync_directory
 from daemon.mission.store.level0 import read_description
 from daemon.mission.store.level2 import verdict_of
 from daemon.mission.store.publication import published
+from daemon.orientation.antimeridian import bbox_of, polygon
 from daemon.orientation.exterior_orientation import ExteriorOrientation, sealed_exposures
-from daemon.orientation.footprints import footprint, polygon
+from daemon.orientation.footprints import footprint
 from daemon.orientation.geodesy import GEOGRAPHIC, Transformer
 from daemon.orientation.orientation_inputs import OrientationError, read_orientation_inputs
 from daemon.orientation.stac_items import (
-    EXTENSIONS,
     FILE,
     PROJECTION,
     STAC_VERSION,
     ItemContext,
-    bbox_of,
     level2_assets,
     stac_item,
 )
@@ -216,7 +215,8 @@ def _orthoimage(mission: Mission, path: Path, items: Sequence[Mapping[str, Any]]
     return {
         "type": "Feature",
         "stac_version": STAC_VERSION,
-        "stac_extensions": list(EXTENSIONS),
+        # The schema of view refuses an item without a view; an orthoimage has none.
+        "stac_extensions": [PROJECTION, FILE],
         "id": f"{mission.id}-{path.stem}",
         "geometry": polygon(ring),
         "bbox": bbox_of([ring]),
@@ -287,10 +287,7 @@ def _collection(
         "license": license_id,
         "extent": {
             "spatial": {
-                "bbox": [[
-                    *(min(box[k] for box in boxes) for k in (0, 1)),
-                    *(max(box[k] for box in boxes) for k in (2, 3)),
-                ]]
+                "bbox": [bbox_of([((w, s), (e, s), (e, n), (w, n)) for w, s, e, n in boxes])]
             },
             "temporal": {"interval": [[times[0], times[-1]]]},
         },

@@ -13,8 +13,8 @@ from typing import Any
 from daemon.mission.store.direct_io import create_file
 from daemon.mission.store.durable import sync_file
 from daemon.mission.store.publication import published
-from daemon.orientation.footprints import polygon
-from daemon.orientation.stac_items import STAC_VERSION, VIEW, bbox_of
+from daemon.orientation.antimeridian import bbox_of, polygon
+from daemon.orientation.stac_items import STAC_VERSION, VIEW
 from daemon.postflight.mission_catalog.catalog_areas import footprint_geometry
 from daemon.postflight.mission_catalog.exposure_rows import COLUMNS, MissionRows, rings_of
 

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from daemon import DaemonError
 from daemon.mission.exposure_batch import ExposureFailure
 from daemon.mission.layout import Mission
+from daemon.orientation.antimeridian import mean_longitude
 from daemon.orientation.exterior_orientation import ExteriorOrientation, sealed_exposures
 from daemon.orientation.local_frame import LocalFrame
 from daemon.orientation.orientation_inputs import read_orientation_inputs
@@ -134,7 +135,7 @@ def intersect(
     used = [eo for eo in oriented if eo.name in set(images)]
     frame = LocalFrame(
         float(np.mean([eo.latitude_deg for eo in used])),
-        float(np.mean([eo.longitude_deg for eo in used])),
+        mean_longitude([eo.longitude_deg for eo in used]),
     )
     names = tuple(dict.fromkeys(points))
     network = _network(rig, used, frame, names, images, points, px, spread)

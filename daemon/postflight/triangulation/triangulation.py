@@ -22,6 +22,7 @@ from daemon.mission.layout import Mission
 from daemon.mission.store.level0 import check_tiff
 from daemon.onboard.triangulation.findings import LOST, NOT_PROCESSED
 from daemon.onboard.triangulation.measured_images import camera_temperature_c
+from daemon.orientation.antimeridian import mean_longitude
 from daemon.orientation.exterior_orientation import (
     ExteriorOrientation,
     MissingOrientation,
@@ -201,7 +202,7 @@ def block_of(
         )
     latitude = np.array([eo.latitude_deg for eo in oriented])
     longitude = np.array([eo.longitude_deg for eo in oriented])
-    frame = LocalFrame(float(latitude.mean()), float(longitude.mean()))
+    frame = LocalFrame(float(latitude.mean()), mean_longitude(longitude.tolist()))
     station = frame.from_geodetic(latitude, longitude, np.array([eo.height_m for eo in oriented]))
     rotation = np.array(
         [

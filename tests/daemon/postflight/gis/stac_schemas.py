@@ -76,13 +76,16 @@ def _extension(uri: str) -> dict[str, Any]:
         "patternProperties": {f"^(?!{prefix}:)": {}},
         "additionalProperties": False,
     }
+    # An item that names view has a field of it; the other two may be without any.
+    own = {"anyOf": [{"required": [name]} for name in FIELDS[uri]]} if prefix == "view" else {}
     return {
         "$schema": "http://json-schema.org/draft-07/schema#",
         "$id": uri,
         "type": "object",
         "properties": {
             "stac_extensions": {"type": "array", "contains": {"const": uri}},
-            "properties": fields,
+            "properties": {**fields, **own},
+            "links": {"type": "array", "items": fields},
             "assets": {"type": "object", "additionalProperties": fields},
         },
         "required": ["stac_extensions"],

@@ -74,6 +74,8 @@ def test_collection_and_items_are_valid_by_their_schemas(exported: Exported) -> 
     [
         (("properties", "view:off_nadir"), -1.0),
         (("properties", "view:off_nadr"), 1.0),
+        (("properties",), {"datetime": "2026-11-22T00:00:00Z"}),
+        (("links",), [{"rel": "root", "href": "a.json", "file:sise": 1}]),
         (("properties", "proj:epsg"), 32633),
         (("assets", "cog_pan", "file:checksum"), "00" * 32),
         (("assets", "cog_pan", "proj:shape"), [10.5, 1]),
