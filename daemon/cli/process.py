@@ -182,6 +182,7 @@ def _run(
             "failures": [failure.as_json() for failure in failures],
             "complete_before": complete,
             "executor": executor.description,
+            "dashboard": getattr(executor, "dashboard", "") or None,
             "threads": placed.threads,
             "interrupted": outcome.is_interrupted,
             **outcome.counts.as_json(),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 import socket
@@ -115,6 +116,7 @@ def test_a_cluster_whose_workers_are_killed_makes_the_same_bytes(
     os.kill(int(json.loads(newest.read_bytes())["process"]), signal.SIGKILL)
     output = json.loads(run.communicate(timeout=200)[0])
     assert run.returncode == 0 and output["failures"] == []
+    assert re.fullmatch(r"http://127\.0\.0\.1:\d+/status", output["dashboard"])
     assert [report["exposure"] for report in output["exposures"]] == list(range(1, 31))
     plain = [*command, str(other.path), "--processes", "0"]
     subprocess.run(plain, cwd=ROOT, stdout=subprocess.DEVNULL, check=True)

@@ -75,6 +75,7 @@ def test_the_bytes_do_not_depend_on_processes_and_threads(
     mission = copied(flown, tmp_path)
     output = process(mission, "--processes", "2", "--threads", "1")
     assert output["executor"] == "2 processes" and output["failures"] == []
+    assert output["dashboard"] is None
     assert compared(mission) == compared(processed)
 
 
