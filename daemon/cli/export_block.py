@@ -15,7 +15,7 @@ from daemon.configuration.model import ConfigurationError
 from daemon.terminal.console import Console
 
 if TYPE_CHECKING:
-    from daemon.postflight.exchange.mission_block import ImageKind
+    from daemon.postflight.exchange.mission_block import ImageKind, StitchedImage
     from daemon.postflight.exchange.mission_export import Program, RigChoice
     from daemon.postflight.exchange.photogrammetry import Angles, Unit
 
@@ -44,6 +44,12 @@ def block(
     images: Annotated[
         str, typer.Option(help="Images: perspective (Level-2) or raw (Level-0).")
     ] = "perspective",
+    stitched: Annotated[
+        str,
+        typer.Option(
+            help="Image of a stitched rig: pan or rgbn (Level-2), rgb or cir (Level-3, 8 bits)."
+        ),
+    ] = "pan",
     rig: Annotated[str, typer.Option(help="Rig of the heads: auto, yes or no.")] = "auto",
     database: Annotated[
         bool, typer.Option("--database", help="COLMAP's database, through pycolmap.")
@@ -76,13 +82,15 @@ def block(
     as_json: AsJson = False,
 ) -> None:
     from daemon.mission.layout import Mission
-    from daemon.postflight.exchange.mission_block import KINDS, block_of_mission
+    from daemon.postflight.exchange.mission_block import KINDS, STITCHED, block_of_mission
     from daemon.postflight.exchange.mission_export import PROGRAMS, export_block
     from daemon.postflight.exchange.photogrammetry import ANGLES, UNITS
+    from daemon.postflight.export.picture_files import left_out_of_jpeg
 
     for option, value, known in (
         ("--to", program, PROGRAMS),
         ("--images", images, KINDS),
+        ("--stitched", stitched, STITCHED),
         ("--rig", rig, ("auto", "yes", "no")),
         ("--angles", angles, (None, *ANGLES)),
         ("--unit", unit, (None, *UNITS)),
@@ -100,6 +108,7 @@ def block(
         read = block_of_mission(
             folder,
             cast("ImageKind", images),
+            stitched=cast("StitchedImage", stitched),
             crs=crs,
             trajectory_file=trajectory,
             mount_file=mount,
@@ -140,6 +149,14 @@ def block(
         console.print(
             f"{unknown} images have no accuracy of position; give --position-sigma", style="yellow"
         )
+    for camera in read.block.cameras:
+        if left_out := left_out_of_jpeg(camera.bands):
+            console.print(
+                f"{camera.name}: a JPEG has three bands, without {', '.join(left_out)}; "
+                "`syntopic export pictures` writes all bands",
+                style="yellow",
+                markup=False,
+            )
     if read.block.frame is not None:
         console.print(f"Coordinates: {read.block.frame.name}; see about.json", soft_wrap=True)
     exit_if_failed(read.failures)

@@ -27,6 +27,7 @@ from daemon.postflight.exchange.block import (
     fitted,
 )
 from daemon.postflight.exchange.opensfm import yaw_pitch_roll_deg
+from daemon.postflight.export.picture_files import left_out_of_jpeg
 from processing.geometry.forward_distortion import ForwardDistortion
 
 Array = NDArray[np.float64]
@@ -97,7 +98,9 @@ def _sensor(
         ET.SubElement(sensor, "property", name="focal_length", value=focal)
     ET.SubElement(sensor, "property", name="layer_index", value=str(number if rig else 0))
     bands = ET.SubElement(sensor, "bands")
-    for band in camera.bands:
+    # The images are JPEG, which has three bands.
+    missing = left_out_of_jpeg(camera.bands)
+    for band in (band for band in camera.bands if band not in missing):
         ET.SubElement(bands, "band", label=band.capitalize())
     ET.SubElement(sensor, "data_type").text = "uint8"
     calibration = ET.SubElement(sensor, "calibration", {"type": "frame", "class": "initial"})

@@ -7,7 +7,7 @@ the mission's mean temperature becomes pairs of rays and pixels.
 from __future__ import annotations
 
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -17,13 +17,16 @@ from numpy.typing import NDArray
 
 from daemon.mission.exposure import Exposure
 from daemon.mission.exposure_batch import ExposureFailure
-from daemon.mission.layout import Mission
+from daemon.mission.layout import Mission, exposure_name
 from daemon.mission.store.frame_checks import tdi_shifts
+from daemon.mission.store.level2 import BAND_ORDER
 from daemon.orientation.antimeridian import mean_longitude
 from daemon.orientation.exterior_orientation import ExteriorOrientation, sealed_exposures
 from daemon.orientation.local_frame import LocalFrame
 from daemon.orientation.orientation_inputs import read_orientation_inputs
 from daemon.postflight.exchange.block import Block, BlockCamera, BlockError, BlockImage
+from daemon.products.level3 import IMAGES as LEVEL3_IMAGES
+from daemon.products.level3 import level3_root
 from processing.geometry.forward_distortion import ForwardDistortion
 from processing.geometry.placement import (
     SensorPlacement,
@@ -38,6 +41,9 @@ from processing.rig import Cone, Rig, Sensor, VirtualImage
 Array = NDArray[np.float64]
 ImageKind = Literal["perspective", "raw"]
 KINDS: tuple[ImageKind, ...] = ("perspective", "raw")
+StitchedImage = Literal["pan", "rgbn", "rgb", "cir"]
+STITCHED: tuple[StitchedImage, ...] = ("pan", "rgbn", "rgb", "cir")
+"""Images of a stitched rig: PAN and colour of Level-2, pansharpened ones of Level-3 in 8 bits."""
 _GRID = 25
 """Pairs of rays and pixels along each side of a raw frame."""
 
@@ -71,6 +77,7 @@ def block_of_mission(
     mission: Mission,
     kind: ImageKind,
     *,
+    stitched: StitchedImage = "pan",
     crs: str | None = None,
     trajectory_file: Path | None = None,
     mount_file: Path | None = None,
@@ -80,7 +87,8 @@ def block_of_mission(
     """Orient the images of a mission.
 
     Args:
-        kind: perspective images of Level-2, or raw frames of Level-0.
+        kind: perspective images of Level-2 and Level-3, or raw frames of Level-0.
+        stitched: which image of a stitched rig.
         position_sigma_m: east, north, up, in place of the receiver's own accuracies.
 
     Raises:
@@ -99,8 +107,15 @@ def block_of_mission(
     )
     rig = inputs.rig
     oriented = inputs.oriented(exposures)
-    heads = _perspective_heads(rig) if kind == "perspective" else _raw_heads(rig, exposures)
-    folder = mission.level2 if kind == "perspective" else mission.level0
+    if stitched != "pan" and (kind == "raw" or rig.virtual_image is None):
+        raise BlockError(
+            f"rig {rig.name}: {stitched} is an image of stitched rigs; leave --stitched out, and "
+            "take perspective images of a rig with a virtual image"
+        )
+    heads = (
+        _perspective_heads(rig, stitched) if kind == "perspective" else _raw_heads(rig, exposures)
+    )
+    folder = _folders(mission, kind, stitched)
     if not oriented:
         raise BlockError(
             f"{mission.path}: no exposure has an attitude; give --trajectory with one that has it"
@@ -121,7 +136,8 @@ def block_of_mission(
     if not images:
         raise BlockError(
             f"{mission.path}: no {kind} image of an oriented exposure is there; run "
-            "`syntopic process` first, or choose --images raw"
+            f"`syntopic {'pansharpen' if stitched in LEVEL3_IMAGES else 'process'}` first"
+            f"{', or choose --images raw' if stitched == 'pan' else ''}"
         )
     used = sorted({image.camera for image in images})
     block = Block(
@@ -164,13 +180,36 @@ def _image(
     )
 
 
-def _perspective_heads(rig: Rig) -> list[_Head]:
-    """The stitched PAN image, or every head's own image."""
+def _folders(mission: Mission, kind: ImageKind, stitched: StitchedImage) -> Callable[[int], Path]:
+    """The folder of an exposure's images by its number."""
+    if kind == "raw":
+        return mission.level0
+    if stitched in LEVEL3_IMAGES:
+        return lambda number: level3_root(mission) / exposure_name(number)
+    return mission.level2
+
+
+def _perspective_heads(rig: Rig, stitched: StitchedImage) -> list[_Head]:
+    """A stitched image, or every head's own image."""
     if rig.virtual_image is not None:
-        name = rig.image_cone_name
+        image = rig.virtual_image
+        bands: tuple[str, ...] = ("pan",)
+        if stitched == "rgbn":
+            colour = {band for cone in rig.cones for band in cone.bands}
+            bands = tuple(band for band in BAND_ORDER if band in colour)
+            image = replace(
+                image,
+                width_px=image.colour_width_px,
+                height_px=image.colour_height_px,
+                pitch_um=image.pitch_um * float(image.colour_ratio),
+                colour_ratio=1,
+            )
+        elif stitched in LEVEL3_IMAGES:
+            bands = LEVEL3_IMAGES[stitched]
         serial = next((s.serial for s in rig.sensors if s.serial), "")
-        camera = _pinhole("pan", rig.virtual_image, ("pan",), serial, None)
-        return [_Head(camera, name, "pan.tif", np.eye(3))]
+        camera = _pinhole(stitched, image, bands, serial, None)
+        file = f"{stitched}-8.tif" if stitched in LEVEL3_IMAGES else f"{stitched}.tif"
+        return [_Head(camera, rig.image_cone_name, file, np.eye(3))]
     if not has_head_images(rig):
         raise BlockError(
             f"rig {rig.name}: its bands are registered to one of them, so that there are no "
