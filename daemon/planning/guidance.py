@@ -20,6 +20,8 @@ AHEAD_MAX_S: Final = 10.0
 """A deviation is predicted for the next exposure, at most so far ahead."""
 APPROACH_S: Final = 30.0
 """Before the start of a line by less than this the limits hold already."""
+TURNING_RAD: Final = math.radians(5.0)
+"""Banked by more, an aircraft turns onto a line: its track is not that of the next exposure."""
 
 Side = Literal["left", "right"]
 Stage = Literal["approach", "line", "passed"]
@@ -55,10 +57,10 @@ class Guidance:
     """Where the aircraft is relative to a line; figures that cannot be computed are None.
 
     `across_m` is positive to the right of the line in flight direction, `across_ahead_m` the same
-    at the next exposure if the track stays. `height_deviation_m` is positive above the planned
-    height. `to_start_m` and `to_end_m` are measured along the line, negative behind.
-    `bearing_deg` and `start_distance_m` lead straight to the start of the line. `crab_deg` is
-    heading minus track.
+    at the next exposure if the track stays (now, while the aircraft turns onto the line).
+    `height_deviation_m` is positive above the planned height. `to_start_m` and `to_end_m` are
+    measured along the line, negative behind. `bearing_deg` and `start_distance_m` lead straight to
+    the start of the line. `crab_deg` is heading minus track.
     """
 
     line: str
@@ -194,6 +196,8 @@ def guide(
     to_place_m = next((place - along_m for place in places_m if place >= along_m), None)
     to_place_s = to_place_m / along_mps if moves and to_place_m is not None else None
     ahead_s = min(to_place_s if to_place_s is not None else 0.0, AHEAD_MAX_S)
+    if along_m < 0 and abs(sample.roll_rad or 0.0) > TURNING_RAD:
+        ahead_s = 0.0
     across_ahead_m = across_m + across_mps * ahead_s
     height_deviation_m = None
     if sample.height_m is not None and planned_height_m is not None:

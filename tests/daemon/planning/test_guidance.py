@@ -38,6 +38,7 @@ def guidance(
     sample = replace(
         any_sample(0.0), latitude_deg=at[0], longitude_deg=at[1], velocity_ned_mps=velocity,
         height_m=about.pop("height_m", 1000.0), heading_rad=about.pop("heading_rad", None),
+        roll_rad=math.radians(about.pop("roll_deg", 0.0)),
     )  # fmt: skip
     given = {"is_reversed": False, "places_m": (), "planned_height_m": 1000.0, "limits": LIMITS}
     found = guide(of, sample, **(given | about))
@@ -116,6 +117,21 @@ def test_a_deviation_is_expected_before_the_next_exposure() -> None:
         20.0 + 300 * math.tan(math.radians(8.0)), abs=0.1
     )
     assert drifting.exceeded == ("across",)
+
+
+def test_the_track_of_a_turn_onto_a_line_predicts_no_deviation() -> None:
+    """Nor does the bank of a correction on the line hide one."""
+    plane = LocalPlane(START)
+    before, on_it = (tuple(plane.place(-20.0, north_m)) for north_m in (-600.0, 600.0))
+    turning = {"track_deg": 15.0, "places_m": (0.0, 900.0)}
+    assert guidance(line(), before, roll_deg=4.0, **turning).exceeded == ("across",)
+    for roll_deg in (6.0, -20.0):
+        found = guidance(line(), before, roll_deg=roll_deg, **turning)
+        assert found.across_ahead_m == found.across_m == pytest.approx(-20.0, abs=0.01)
+        assert found.exceeded == ()
+        far = tuple(plane.place(-60.0, -600.0))
+        assert guidance(line(), far, roll_deg=roll_deg, **turning).exceeded == ("across",)
+        assert guidance(line(), on_it, roll_deg=roll_deg, **turning).exceeded == ("across",)
 
 
 @pytest.mark.parametrize(
