@@ -25,6 +25,7 @@ from daemon.postflight.exchange.block import FIT_LIMIT_PX, Block, BlockCamera, B
 from daemon.postflight.exchange.block_check import check_block, project_name, upward_notes
 from daemon.postflight.exchange.bundler import read_bal, read_bundler
 from daemon.postflight.exchange.colmap import read_colmap
+from daemon.postflight.exchange.completeness import completeness_notes
 from daemon.postflight.exchange.inpho_reader import read_inpho
 from daemon.postflight.exchange.metashape_reader import read_metashape
 from daemon.postflight.exchange.opensfm import read_opensfm
@@ -106,6 +107,7 @@ def import_block(
     """
     block = READERS[program](path)
     check_block(path, block)
+    block = replace(block, notes=(*completeness_notes(path, program, block), *block.notes))
     if position_sigma_m is not None and not (block.is_metric or is_metric):
         raise BlockError(
             f"{path}: its positions are not known to be in metres ({'; '.join(block.notes)}), so "

@@ -27,6 +27,11 @@ from daemon.postflight.exchange.block import (
     BlockRig,
     fitted,
 )
+from daemon.postflight.exchange.completeness import (
+    refuse_announced,
+    refuse_other_images,
+    refuse_other_tracks,
+)
 from processing.geometry.forward_distortion import Form, ForwardDistortion
 from processing.geometry.rotation import quaternions_from_rotations, rotations_from_quaternions
 
@@ -235,6 +240,7 @@ def read_colmap(folder: Path) -> Block:
     images: list[BlockImage] = []
     index: dict[int, int] = {}
     seen: list[tuple[int, int, float, float]] = []
+    listed: list[tuple[int, int, int]] = []
     for (place, words), (where, measured) in zip(rows[::2], rows[1::2], strict=True):
         with _reading(place):
             number, camera = int(words[0]), int(words[8])
@@ -249,14 +255,19 @@ def read_colmap(folder: Path) -> Block:
             name = " ".join(words[9:])
             images.append(BlockImage(name, cameras[camera], frame, centre, rotation))
         with _reading(where):
-            for x, y, point in zip(measured[::3], measured[1::3], measured[2::3], strict=True):
+            rows_of_three = zip(measured[::3], measured[1::3], measured[2::3], strict=True)
+            for at, (x, y, point) in enumerate(rows_of_three):
                 if int(point) >= 0:
                     column, row = _finite(where, (x, y), 2)
                     seen.append((index[number], int(point), column, row))
+                    listed.append((int(point), number, at))
     if not images:
         raise BlockError(f"{folder}: images.txt names no image; there is nothing to import")
+    refuse_announced(folder / "cameras.txt", {"cameras": len(found)})
+    refuse_announced(folder / "images.txt", {"images": len(images)}, len(seen))
+    refuse_other_images(folder, "frames.txt", set(posed), set(index))
     return Block(
-        folder.name, tuple(found), tuple(images), points=_points(folder, seen),
+        folder.name, tuple(found), tuple(images), points=_points(folder, seen, listed),
         notes=("COLMAP's files state neither the frame nor the scale of their coordinates",),
         is_metric=False,
     )  # fmt: skip
@@ -371,19 +382,29 @@ def _frame_poses(folder: Path) -> dict[int, tuple[int, tuple[Array, Array]]]:
     return posed
 
 
-def _points(folder: Path, seen: Sequence[tuple[int, int, float, float]]) -> BlockPoints:
+def _points(
+    folder: Path,
+    seen: Sequence[tuple[int, int, float, float]],
+    listed: Sequence[tuple[int, int, int]],
+) -> BlockPoints:
+    """Points with their measurements; `listed` are point, image and place of each, by number."""
     at: dict[int, int] = {}
     xyz: list[list[float]] = []
+    tracks: list[tuple[int, int, int]] = []
     for place, words in _records(folder / "points3D.txt"):
         with _reading(place):
             _refuse_repeated(place, "point", int(words[0]), at)
             at[int(words[0])] = len(xyz)
             xyz.append(_finite(place, words[1:4], 3))
+            for image, index in zip(words[8::2], words[9::2], strict=True):
+                tracks.append((int(words[0]), int(image), int(index)))
+    refuse_announced(folder / "points3D.txt", {"points": len(xyz)}, len(seen))
     unknown = next((point for _, point, *_ in seen if point not in at), None)
     if unknown is not None:
         raise BlockError(
             f"{folder}: images.txt measures point {unknown}, which is not in points3D.txt"
         )
+    refuse_other_tracks(folder, listed, tracks)
     return BlockPoints(
         np.array(xyz).reshape(-1, 3),
         tuple(str(number) for number in at),

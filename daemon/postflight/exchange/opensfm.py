@@ -30,7 +30,7 @@ from daemon.postflight.exchange.block import (
     fitted,
 )
 from daemon.postflight.exchange.colmap import camera_pose, rig_pose, vision_pose
-from daemon.postflight.exchange.opensfm_tracks import TRACKS_FILE, read_tracks
+from daemon.postflight.exchange.opensfm_tracks import TRACKS_FILE, read_tracks, refuse_bare_images
 from processing.geometry.forward_distortion import ForwardDistortion
 from processing.geometry.orientation import BODY_FROM_CAMERA, ENU_FROM_NED
 from processing.geometry.rotation import (
@@ -68,30 +68,11 @@ def opensfm_texts(
     Raises:
         BlockError: a camera does not fit Brown's model, or the frame is not known.
     """
-    if block.frame is None:
-        raise BlockError(
-            "OpenSfM states the frame of its coordinates; that of this block is unknown"
-        )
-    cameras, residuals = {}, {}
-    for camera in block.cameras:
-        _, model, residuals[camera.name] = fitted(camera, ("pinhole", "brown"))
-        cameras[camera.name] = _camera_json(camera, model)
-    shots = {image.name + suffix: _shot(block, image) for image in block.images}
-    reference = {
-        "latitude": block.frame.latitude_deg,
-        "longitude": block.frame.longitude_deg,
-        "altitude": 0.0,
+    reconstruction, residuals = reconstruction_of(block, suffix)
+    texts: dict[str, Any] = {
+        "reference_lla.json": reconstruction["reference_lla"],
+        "camera_models.json": reconstruction["cameras"],
     }
-    reconstruction: dict[str, Any] = {
-        "cameras": cameras,
-        "shots": shots,
-        "points": {},
-        "biases": {},
-        "rig_cameras": {},
-        "rig_instances": {},
-        "reference_lla": reference,
-    }
-    texts: dict[str, Any] = {"reference_lla.json": reference, "camera_models.json": cameras}
     if rig is not None:
         heads, instances = _rigs(block, rig, suffix)
         reconstruction |= {"rig_cameras": heads, "rig_instances": instances}
@@ -108,6 +89,43 @@ def opensfm_texts(
         for image in block.images
     )
     return written, residuals
+
+
+def reconstruction_of(block: Block, suffix: str = "") -> tuple[dict[str, Any], dict[str, float]]:
+    """The object of `reconstruction.json`, without points and rigs.
+
+    Args:
+        block: in a known local frame.
+        suffix: of the image files' names.
+
+    Returns:
+        The object, and the largest residual of each camera's fit by its name, px.
+
+    Raises:
+        BlockError: a camera does not fit Brown's model, or the frame is not known.
+    """
+    if block.frame is None:
+        raise BlockError(
+            "OpenSfM states the frame of its coordinates; that of this block is unknown"
+        )
+    cameras, residuals = {}, {}
+    for camera in block.cameras:
+        _, model, residuals[camera.name] = fitted(camera, ("pinhole", "brown"))
+        cameras[camera.name] = _camera_json(camera, model)
+    reference = {
+        "latitude": block.frame.latitude_deg,
+        "longitude": block.frame.longitude_deg,
+        "altitude": 0.0,
+    }
+    return {
+        "cameras": cameras,
+        "shots": {image.name + suffix: _shot(block, image) for image in block.images},
+        "points": {},
+        "biases": {},
+        "rig_cameras": {},
+        "rig_instances": {},
+        "reference_lla": reference,
+    }, residuals
 
 
 def geo_text(block: Block, suffix: str) -> str:
@@ -251,6 +269,7 @@ def _block_of(file: Path, content: Any) -> Block:
     if tracks.exists():
         found = _object(content.get("points", {}), "points")
         points = read_tracks(tracks, found, images, cameras)
+        refuse_bare_images(tracks, points, images)
     else:
         notes.append(f"no {TRACKS_FILE} next to {file.name}, which has the image measurements")
     return Block(

@@ -5,6 +5,7 @@ Source: OpenSfM, `opensfm/tracking.py` and `opensfm/src/map/src/tracks_manager.c
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -16,6 +17,7 @@ from daemon.postflight.exchange.block import BlockCamera, BlockError, BlockImage
 
 TRACKS_FILE: Final = "tracks.csv"
 TRACKS_MAX_BYTES: Final = 2_000_000_000
+_NAMED: Final = 5
 _VERSION: Final = "OPENSFM_TRACKS_VERSION_v"
 _COLUMNS: Final = {0: (8,), 1: (9,), 2: (11,)}
 """Columns of each version: image, track, feature, x, y, then scale from version 1 on, colour, and
@@ -87,3 +89,26 @@ def read_tracks(
         np.array(point_of, np.int64),
         np.array(px, float).reshape(-1, 2),
     )
+
+
+def refuse_bare_images(path: Path, points: BlockPoints, images: Sequence[BlockImage]) -> None:
+    """Refuse tracks without any measurement of an image that the reconstruction has oriented.
+
+    Images of a rig are oriented by each other, and one of them may have none.
+
+    Raises:
+        BlockError: such images, by name.
+    """
+    count = np.bincount(points.image, minlength=len(images))
+    frames = Counter(image.frame for image in images)
+    bare = [
+        image.name
+        for image, measured in zip(images, count, strict=True)
+        if not measured and frames[image.frame] == 1
+    ]
+    if bare:
+        raise BlockError(
+            f"{path}: has no measurement of {len(bare)} of {len(images)} images of the "
+            f"reconstruction ({', '.join(bare[:_NAMED])}{', ...' if len(bare) > _NAMED else ''}); "
+            "it was cut, or is of another reconstruction: copy it again"
+        )

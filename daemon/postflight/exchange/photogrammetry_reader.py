@@ -394,6 +394,12 @@ def measured_block(
         raise
     if median_px > TRIED_PX:
         refuse_other_reading(folder, every, images, measured, median_px, readings)
+    single = sorted({point for one in measured.values() for point in one.points} - {*points.names})
+    if single:
+        notes.append(
+            f"{len(single)} points are measured in one image only and are left out: "
+            f"{', '.join(single[:5])}"
+        )
     notes.append(
         f"points are intersected from the orientations, which they fit with a median of "
         f"{median_px:.2f} px"
