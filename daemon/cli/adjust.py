@@ -105,13 +105,13 @@ def adjust(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
+    from daemon.mission.store.output_places import refuse_foreign_file
     from daemon.postflight.adjustment.contradictions import SUSPICIOUS_SIGMA0
-    from daemon.postflight.adjustment.covariance_file import write_covariances
-    from daemon.postflight.adjustment.csv_tables import ProjectError
+    from daemon.postflight.adjustment.covariance_file import is_covariances, write_covariances
     from daemon.postflight.adjustment.likely_mistakes import control_sentences, likely_mistakes
     from daemon.postflight.adjustment.project import read_project
-    from daemon.postflight.adjustment.project_writer import write_results
-    from daemon.postflight.adjustment.protocol import write_protocol
+    from daemon.postflight.adjustment.project_writer import refuse_existing_project, write_results
+    from daemon.postflight.adjustment.protocol import is_protocol, write_protocol
     from daemon.postflight.adjustment.summary import print_report, report_of
     from daemon.postflight.adjustment.variance_factors import variance_factor_cautions
     from processing.bundle.adjust import adjust as adjusted
@@ -127,8 +127,12 @@ def adjust(
         raise ConfigurationError(["--reject and --significance both set the limit; give one"])
     if covariance_point and covariance is None:
         raise ConfigurationError(["--covariance-point needs --covariance, the file it is for"])
-    if out is not None and (out / "project.toml").exists():
-        raise ProjectError([f"{out} holds a project already; give another folder"])
+    if out is not None:
+        refuse_existing_project(out)
+    if covariance is not None:
+        refuse_foreign_file(covariance, is_covariances, cure="give another name with --covariance")
+    if protocol is not None:
+        refuse_foreign_file(protocol, is_protocol, cure="give another name with --protocol")
     path = project / "project.toml" if project.is_dir() else project
     begun = time.perf_counter()
     given = read_project(path)

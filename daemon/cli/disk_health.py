@@ -24,8 +24,10 @@ def disk_health(
     as_json: AsJson = False,
 ) -> None:
     from daemon.mission.store import health
+    from daemon.mission.store.output_places import refuse_foreign_file
 
     path = out or health.REPORT
+    refuse_foreign_file(path, health.is_report, cure="give another name with --out")
     try:
         report = health.collect()
     except health.HealthError as error:

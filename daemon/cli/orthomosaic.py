@@ -84,6 +84,7 @@ def orthomosaic(
     )
     from daemon.postflight.orthomosaic.orthomosaic_work import OrthomosaicRequest
     from daemon.postflight.orthomosaic.rasters import IMAGES
+    from daemon.postflight.orthomosaic.work_folder import refuse_foreign_places
     from drivers.base.extras import require
 
     require("geotiff")
@@ -96,6 +97,7 @@ def orthomosaic(
     begun = time.monotonic()
     folder = Mission.open(mission)
     final = out or folder.export_dir / "orthomosaic"
+    refuse_foreign_places(final.resolve(), folder)
     request = OrthomosaicRequest(
         folder.path.absolute(), triangulation and triangulation.absolute(),
         elevation and elevation.absolute(), ground_height, gsd, crs,

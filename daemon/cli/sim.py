@@ -21,6 +21,7 @@ from daemon import DaemonError
 from daemon.cli.options import AsJson
 from daemon.configuration.schemas import SCHEMA_FILES, schema_file_name, schema_line
 from daemon.mission.store.durable import replace_file
+from daemon.mission.store.output_places import refuse_foreign_file, refuse_occupied
 from daemon.terminal.console import Console
 from drivers.base.extras import require
 from processing.rig import find_rig
@@ -36,6 +37,7 @@ Example: `syntopic sim ultracam-x-mini --out flights/sim --fault silent@60:recei
 
 
 GVCP_PORT = 3956
+_WRITTEN_BY = b"# Written by `syntopic sim`"
 
 
 class EmulatorError(DaemonError):
@@ -124,6 +126,7 @@ def sim(
 ) -> None:
     if scene is not None:
         require("geotiff")
+    refuse_foreign_flight(out)
     arguments = simulator_arguments(
         rig, out, seed=seed, dc=dc, displace=displace or [], packet_loss=packet_loss
     )
@@ -145,6 +148,18 @@ def sim(
         emulator.process.wait()
     finally:
         emulator.end()
+
+
+def refuse_foreign_flight(folder: Path) -> None:
+    """Refuse a folder with a configuration or a calibration that the emulator did not write.
+
+    Raises:
+        OutputPlaceError: it has one.
+    """
+    cure = "give another folder with --out"
+    refuse_foreign_file(folder / "service.toml", lambda head: _WRITTEN_BY in head, cure=cure)
+    if not (folder / "truth").is_dir():
+        refuse_occupied(folder / "calibration", cure=cure)
 
 
 def simulator_arguments(
@@ -207,7 +222,7 @@ def service_toml(
     host, _, port = ready["pulse_bus"].rpartition(":")
     lines = [
         schema_line("service"),
-        "# Written by `syntopic sim` for the devices it emulates.",
+        f"{_WRITTEN_BY.decode()} for the devices it emulates.",
         "[mission]",
         f"root = {_quoted(root)}",
         f"rig = {_quoted(str(Path(ready['rig_file']).resolve()))}",

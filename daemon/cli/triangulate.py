@@ -174,7 +174,8 @@ def triangulate(
         return
     from daemon.cli.adjust import _peak_mib
     from daemon.cli.triangulate_photographs import POSITION_SIGMA_M, triangulate_photographs
-    from daemon.postflight.adjustment.csv_tables import ProjectError
+    from daemon.mission.store.output_places import refuse_mission_folder
+    from daemon.postflight.adjustment.project_writer import refuse_existing_project
     from daemon.postflight.adjustment.summary import print_report, report_of
     from daemon.postflight.importers.photographs import is_photographs
     from daemon.postflight.triangulation.block_findings import findings_json
@@ -207,10 +208,8 @@ def triangulate(
     of_photographs = is_photographs(folder)
     name = "photographs" if of_photographs else set_name
     results = out or folder.export_dir / "triangulation" / name
-    if (results / "project.toml").exists():
-        raise ProjectError(
-            [f"{results} holds a triangulation already; give another folder with --out"]
-        )
+    refuse_mission_folder(results, folder, cure="give another folder with --out")
+    refuse_existing_project(results)
     if of_photographs:
         triangulate_photographs(
             folder,

@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import timedelta
+from html import escape
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -23,6 +24,7 @@ from daemon.mission.operator_decisions import manual_verdicts, read_decisions
 from daemon.mission.store.durable import make_directories, replace_file
 from daemon.mission.store.level0_folder import read_sealed
 from daemon.mission.store.level2 import read_report
+from daemon.mission.store.output_places import refuse_foreign_file
 from daemon.onboard.flight.flag_table import FLAG_TABLE
 from daemon.planning.flight_map import flight_map
 from daemon.planning.mission_coverage import coverage_of
@@ -72,8 +74,16 @@ def write_report(
         ledger: the balance sheet, where the service just emitted it.
         geometry: comparison with an emulator's truth, where there is one.
         out: another folder; nothing is written into the mission then.
+
+    Raises:
+        OutputPlaceError: `out` holds a `report.html` that is not of this mission.
+        OSError: the disk refused.
     """
     folder = Mission.open(mission)
+    path = (out or mission / "export") / REPORT_FILE
+    if out is not None:
+        title = f"<title>{escape(mission.name)}</title>".encode()
+        refuse_foreign_file(path, lambda head: title in head, cure="give another folder with --out")
     read = for_each_exposure(folder.numbers(), lambda number: _exposure(folder, number))
     exposures = [exposure for exposure, _ in read.results.values()]
     manual = manual_verdicts(read_decisions(mission))
@@ -112,7 +122,6 @@ def write_report(
         glyphs=_GLYPHS,
         time_parts=_TIME_PARTS,
     )
-    path = (out or mission / "export") / REPORT_FILE
     make_directories(path.parent)
     replace_file(path, html.encode("utf-8"))
     return WrittenReport(path, tuple(failures))

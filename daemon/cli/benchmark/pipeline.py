@@ -30,6 +30,7 @@ from daemon.cli.benchmark.measurement import interleaved, machine, spread
 from daemon.configuration.model import PlanSection
 from daemon.mission.layout import Mission
 from daemon.mission.store import direct_io, store
+from daemon.mission.store.output_places import refuse_occupied
 from daemon.orientation.exterior_orientation import mount_of
 from daemon.products.exposure_conditions import conditions_of
 from daemon.products.exposure_products import (
@@ -65,6 +66,8 @@ def benchmark_exposure(rig_name: str, rig: Rig, folder: Path) -> Path:
     """
     if (folder / "ready.json").exists():
         return folder
+    if not (folder / "scenes").is_dir():
+        refuse_occupied(folder, cure="give another folder with --folder")
     command = [sys.executable, "-m", "sim_hw.processes.exposures", rig_name, "--out", str(folder)]
     command += ["--exposures", "1", "--dc", str(DC_K)]
     master = rig.master_sensors

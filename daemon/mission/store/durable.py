@@ -214,7 +214,13 @@ def make_directories(path: Path) -> None:
 
 
 def remove_tree(path: Path) -> None:
-    """Remove a folder of files, or of folders of files; nothing happens where it is not there."""
+    """Remove a folder of files, or of folders of files; nothing happens where it is not there.
+
+    Of a link only the link is removed, not what it leads to.
+    """
+    if path.is_symlink():
+        path.unlink(missing_ok=True)
+        return
     try:
         children = list(path.iterdir())
     except FileNotFoundError:

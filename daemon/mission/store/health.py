@@ -96,6 +96,11 @@ def collect(run: Run = run_smartctl) -> dict[str, Any]:
     return {"monotonic_s": time.monotonic(), "disks": disks}
 
 
+def is_report(head: bytes) -> bool:
+    """Whether a file that begins so was written by `write_report`."""
+    return head.startswith(b'{"monotonic_s": ')
+
+
 def write_report(path: Path, report: Mapping[str, Any]) -> None:
     """Leave a report for the service, whole or not at all.
 

@@ -10,6 +10,13 @@ import numpy as np
 from daemon.mission.store.durable import new_file
 from processing.bundle.adjust import Adjustment
 
+_NAMES_BYTES = 200
+
+
+def is_covariances(head: bytes) -> bool:
+    """Whether a file that begins so was written by `write_covariances`."""
+    return head.startswith(b"PK") and b"unknowns.npy" in head[:_NAMES_BYTES]
+
 
 def write_covariances(path: Path, result: Adjustment) -> None:
     """Write the covariance matrix of the unknowns, and that of each object point.

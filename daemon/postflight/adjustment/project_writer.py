@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.mission.store.durable import new_files
+from daemon.mission.store.output_places import refuse_occupied
 from daemon.postflight.adjustment.adjusted_project import (
     initial_state,
     used_network,
@@ -63,7 +64,7 @@ def write_project(
     """Write a project that `read_project` reads back as it was.
 
     Args:
-        folder: made, if need be; an existing project is not overwritten.
+        folder: made, if need be; it must be empty.
         file: its settings, cameras and heads.
         network: observations and starting values.
         checks: independent coordinates.
@@ -76,6 +77,18 @@ def write_project(
         _write_project(part, file, network, checks, state)
 
 
+def refuse_existing_project(folder: Path) -> None:
+    """Refuse a folder for a new project that is not empty, before anything is computed.
+
+    Raises:
+        ProjectError: it holds a project.
+        OutputPlaceError: it holds something else, such as tables of the same names.
+    """
+    if (folder / PROJECT_FILE).exists():
+        raise ProjectError([f"{folder} holds a project already; give another folder with --out"])
+    refuse_occupied(folder, cure="give another folder with --out")
+
+
 @contextmanager
 def new_project(folder: Path) -> Iterator[Path]:
     """A folder to write a project's files into; they appear in `folder` when the block ends.
@@ -84,9 +97,9 @@ def new_project(folder: Path) -> Iterator[Path]:
 
     Raises:
         ProjectError: the folder holds a project.
+        OutputPlaceError: it holds something else.
     """
-    if (folder / PROJECT_FILE).exists():
-        raise ProjectError([f"{folder} holds a project already; give another folder"])
+    refuse_existing_project(folder)
     with new_files(folder, last=PROJECT_FILE) as part:
         yield part
 

@@ -28,8 +28,14 @@ Array = NDArray[np.float64]
 _MAX_CORRELATIONS = 10_000
 """Of two kinds of unknowns; a large block has more, of neighbouring exposures."""
 
+_TITLE = "BUNDLE ADJUSTMENT"
 _LARGEST = 50
 _GRAD = 400.0 / 360.0
+
+
+def is_protocol(head: bytes) -> bool:
+    """Whether a file that begins so was written by `write_protocol`."""
+    return head.startswith(f"{_TITLE} ".encode())
 
 
 def write_protocol(
@@ -49,7 +55,7 @@ def write_protocol(
 
 
 def _lines(result: Adjustment, checks: CheckPoints, report: Mapping[str, Any]) -> Iterator[str]:
-    yield f"BUNDLE ADJUSTMENT {report['name']}"
+    yield f"{_TITLE} {report['name']}"
     yield from _section("1 Summary")
     yield from _summary(result, report)
     yield from _section("2 Observations")

@@ -6,6 +6,7 @@ One folder a program, `export/block/<program>/`, replaced as a whole.
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,6 +15,7 @@ from typing import Any, Literal, get_args
 from daemon.mission.layout import Mission
 from daemon.mission.store.direct_io import create_file
 from daemon.mission.store.durable import make_directories, sync_directory, sync_file
+from daemon.mission.store.output_places import refuse_foreign_files
 from daemon.mission.store.publication import published
 from daemon.postflight.exchange.block import (
     FIT_LIMIT_PX,
@@ -101,6 +103,7 @@ def export_block(
     Raises:
         BlockError: a camera does not fit the program's models, or a rig cannot be stated.
         MissingExtraError: pycolmap is not installed.
+        OutputPlaceError: the folder holds something else, such as results of the program.
         OSError: the disk refused.
     """
     block, chosen, reason = _rigged(read, rig, program)
@@ -113,6 +116,7 @@ def export_block(
         texts, residuals = _texts(program, block, chosen)
     about = _about(read, block, program, chosen, reason, residuals)
     folder = mission.export_dir / "block" / program
+    refuse_foreign_files(folder, _own_files(texts))
     priors = 0
     with published(folder) as part:
         for name, text in {**texts, "about.json": json.dumps(about, indent=1) + "\n"}.items():
@@ -130,6 +134,15 @@ def export_block(
                 progress(done)
             sync_directory(part / "images")
     return ExportedBlock(folder, block, residuals, chosen, reason, priors, about)
+
+
+def _own_files(texts: Mapping[str, str]) -> re.Pattern[str]:
+    """Matches what an export to the program writes; tables of a rig are not in each."""
+    folders = {name.rpartition("/")[0] for name in texts}
+    tables = [rf"{re.escape(folder)}/[^/]+\.txt" for folder in folders if folder]
+    names = [re.escape(name) for name in texts]
+    others = [r"rig_(cameras|assignments)\.json", r"about\.json", r"database\.db", r"[^/]+\.cam"]
+    return re.compile("|".join([*names, *tables, *others, rf"images/.*{re.escape(SUFFIX)}"]))
 
 
 def picture_of(read: MissionBlock, block: Block, image: BlockImage) -> bytes:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +11,7 @@ from daemon.mission.exposure_batch import ExposureFailure, for_each_exposure
 from daemon.mission.layout import Mission
 from daemon.mission.store.direct_io import create_file
 from daemon.mission.store.durable import sync_file
+from daemon.mission.store.output_places import refuse_foreign_files
 from daemon.mission.store.publication import published
 from daemon.orientation.elevation import read_elevation
 from daemon.orientation.exterior_orientation import sealed_exposures
@@ -18,6 +20,9 @@ from daemon.orientation.orientation_inputs import OrientationError, read_orienta
 from daemon.postflight.export.geopackage import write_geopackage
 from daemon.postflight.export.gis_layers import GisLayer, ImagePlace, gis_layers, image_places
 from daemon.postflight.export.kmz import kmz_bytes
+
+_FILES = re.compile(r"mission\.(gpkg(-wal|-shm|-journal)?|kmz)")
+"""What is written, and what SQLite puts next to it."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +55,7 @@ def export_gis(
 
     Raises:
         OrientationError: no exposure could be oriented.
+        OutputPlaceError: the folder holds something else, such as a project of QGIS.
         TrajectoryError, GeoreferenceError: as their modules say.
     """
     read = sealed_exposures(mission)
@@ -79,6 +85,7 @@ def export_gis(
     layers = gis_layers(mission, inputs.rig, images, inputs.ground_height_m, simulated=simulated)
     folder = mission.export_dir / "gis"
     title = f"{'SIMULATED: ' if simulated else ''}{mission.id}"
+    refuse_foreign_files(folder, _FILES)
     with published(folder) as part:
         write_geopackage(part / "mission.gpkg", layers)
         sync_file(part / "mission.gpkg")

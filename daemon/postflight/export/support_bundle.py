@@ -22,6 +22,7 @@ from daemon.mission.foreign_files import ForeignFileError, read_regular_file
 from daemon.mission.layout import Mission, MissionError
 from daemon.mission.log.flight_log import logs_of, read
 from daemon.mission.store import durable
+from daemon.mission.store.output_places import refuse_foreign_file
 from daemon.mission.verification.verification import VerifyReport
 from daemon.postflight.export.redaction import REDACTED, text_without_secrets, without_secrets
 from processing.rig.rig_file import RIG_FILE_MAX_BYTES
@@ -40,6 +41,13 @@ class Bundle:
     contents: dict[str, int]
 
 
+_FIRST_FILE = "versions.json"
+
+
+def _is_bundle(head: bytes) -> bool:
+    return head.startswith(b"PK") and _FIRST_FILE.encode() in head[:100]
+
+
 def write_bundle(
     mission: Mission,
     verified: VerifyReport | None = None,
@@ -53,9 +61,11 @@ def write_bundle(
         out: another folder to write it into.
 
     Raises:
+        OutputPlaceError: `out` holds another file of this name.
         OSError: the disk refused.
     """
     path = (out or mission.export_dir) / name
+    refuse_foreign_file(path, _is_bundle, cure="give another folder with --out")
     durable.make_directories(path.parent)
     contents: dict[str, int] = {}
     with (
@@ -67,7 +77,7 @@ def write_bundle(
             bundle.writestr(name, text)
             contents[name] = len(text.encode("utf-8", "replace"))
 
-        put("versions.json", json.dumps(_versions(), indent=1))
+        put(_FIRST_FILE, json.dumps(_versions(), indent=1))
         put("mission.json", json.dumps(without_secrets(mission.about()), indent=1))
         if mission.rig_path.exists():
             text = read_regular_file(mission.rig_path, RIG_FILE_MAX_BYTES).decode(

@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from daemon import DaemonError
+from daemon.mission.store.output_places import refuse_foreign_files
 from daemon.mission.transfer.object_store import is_store_url
 from daemon.postflight.mission_catalog.catalog_files import read_sources, write_catalog
 from daemon.postflight.mission_catalog.exposure_rows import MissionRows, mission_rows
 from daemon.postflight.mission_catalog.mission_sources import SourceError, missions_at
 from drivers.base.extras import require
 from processing.rig import RigError
+
+_FILES = re.compile(
+    r"catalog\.json|exposures\.(parquet|gpkg)(-wal|-shm|-journal|\.aux\.xml)?|[^/]+/[^/]+\.json"
+)
+"""What is written, and what programs that read it put next to it."""
 
 
 @dataclass(frozen=True)
@@ -35,12 +42,14 @@ def build_catalog(
         replaces_places: they take the place of those of the catalog.
 
     Raises:
-        SourceError: no place, the folder holds something else, or no mission could be read.
+        SourceError: no place, the folder is no catalog, or no mission could be read.
+        OutputPlaceError: the folder is a catalog, and holds something else as well.
         OSError: the disk refused; the earlier catalog is kept.
     """
     known = read_sources(folder)
     if folder.exists() and not known and (not folder.is_dir() or any(folder.iterdir())):
         raise SourceError(f"{folder}: is not empty and no catalog; choose another folder")
+    refuse_foreign_files(folder, _FILES, cure="choose another folder")
     given = [p.rstrip("/") if is_store_url(p) else str(Path(p).resolve()) for p in places]
     if replaces_places and not given:
         raise SourceError("--replace needs the places that the catalog is to have")

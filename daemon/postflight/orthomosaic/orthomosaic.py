@@ -12,25 +12,26 @@ import numpy as np
 
 from daemon.mission.canonical_json import canonical_bytes
 from daemon.mission.store import durable
-from daemon.mission.store.publication import published, sweep
+from daemon.mission.store.publication import published
 from daemon.postflight.batch.batch_run import StepCompute, in_this_process
 from daemon.postflight.orthomosaic.cells import CellSurvey, cell_grid, survey
 from daemon.postflight.orthomosaic.inputs import OrthoBlock, OrthomosaicError, described_ground
 from daemon.postflight.orthomosaic.orthomosaic_work import (
     OrthomosaicRequest,
+    OrthomosaicWork,
     make_tiles,
     survey_images,
     work_of,
 )
 from daemon.postflight.orthomosaic.rasters import IMAGES, tone_curves, write_cog
 from daemon.postflight.orthomosaic.seam_file import write_seams
-from daemon.postflight.orthomosaic.tiles import TilePlan, missing_tiles, plan_tiles
+from daemon.postflight.orthomosaic.tiles import TilePlan, missing_tiles, plan_tiles, stored_nbytes
+from daemon.postflight.orthomosaic.work_folder import refuse_foreign_places, work_folder
 from processing.image.orthoimage.ground_grid import GroundGrid
 from processing.radiometry.tone_curve import curve_as_json
 
 SEAM_FILE: Final = "seams.gpkg"
 REPORT_FILE: Final = "orthomosaic.json"
-WORK_SUFFIX: Final = ".work"
 DEPTHS: Final = (16, 8)
 _BYTES_PER_SAMPLE: Final = 2
 _DISK_SHARE: Final = 3.0
@@ -74,19 +75,35 @@ def make_orthomosaic(
         The report, as in `orthomosaic.json`, with `files` and `tiles_computed` in addition.
 
     Raises:
-        OrthomosaicError: no image covers the ground, one cannot be read, or the disk is too small.
+        OutputPlaceError: the folder holds something else.
+        OrthomosaicError: no image covers the ground, one cannot be read, the disk is too small, or
+            another command makes the same orthomosaic.
         OSError: the disk refused.
     """
+    final = final.resolve()
+    refuse_foreign_places(final, block.mission)
     bands, left_out = _bands(block, settings.images)
-    work = final.with_name(final.name + WORK_SUFFIX)
-    key = f"{block.key()[:24]}-{'-'.join(bands)}-{'level' if settings.levelled else 'plain'}"
-    tiles = work / key
-    durable.make_directories(tiles)
-    sweep(final.parent)
-    for other in work.iterdir():
-        if other != tiles:
-            durable.remove_tree(other) if other.is_dir() else other.unlink()
-    work_on = work_of(request, block, bands, tiles)
+    with work_folder(final, _key(block, bands, settings)) as tiles:
+        work_on = work_of(request, block, bands, tiles)
+        return _write_files(work_on, block, final, settings, left_out, compute, progress)
+
+
+def _key(block: OrthoBlock, bands: Sequence[str], settings: OrthomosaicSettings) -> str:
+    """Name of the folder of tiles: all that they depend on."""
+    gains = "level" if settings.levelled else "plain"
+    return f"{block.key()[:24]}-{'-'.join(bands)}-{gains}"
+
+
+def _write_files(
+    work_on: OrthomosaicWork,
+    block: OrthoBlock,
+    final: Path,
+    settings: OrthomosaicSettings,
+    left_out: Sequence[str],
+    compute: StepCompute,
+    progress: Progress,
+) -> dict[str, Any]:
+    bands, tiles = work_on.bands, work_on.folder
     seen = survey_images(work_on, block, compute("survey of the images"))
     found = survey(block, bands, seen, level=settings.levelled)
     if not (found.owner >= 0).any():
@@ -95,8 +112,8 @@ def make_orthomosaic(
             "orientations, and does the height model reach below the images?"
         )
     plan = plan_tiles(block, found)
-    _refuse_full_disk(final.parent, plan.grid, len(bands))
     missing = missing_tiles(found, plan, tiles)
+    _refuse_full_disk(final.parent, plan.grid, len(bands), stored_nbytes(tiles))
     make_tiles(work_on, missing, compute("tiles"))
     curves, pixels = tone_curves(tiles, plan, bands)
     report = _report(block, found, plan, settings, left_out)
@@ -114,7 +131,7 @@ def make_orthomosaic(
             for depth in settings.depths:
                 name = f"{image}-{depth}.tif"
                 files[name] = write_cog(
-                    part / name, work, plan, tiles, bands, image,
+                    part / name, tiles.parent, plan, tiles, bands, image,
                     curves=curves if depth == 8 else None,
                     georeference=block.georeference, tags=tags,
                 )  # fmt: skip
@@ -124,7 +141,6 @@ def make_orthomosaic(
             [(image.name, image.exposure) for image in block.images], block.georeference,
         )  # fmt: skip
         durable.create_file(part / REPORT_FILE, [canonical_bytes(report)], mode=0o644)
-    durable.remove_tree(work)
     return report | {"files": files, "tiles_computed": len(missing)}
 
 
@@ -146,8 +162,9 @@ def _bands(block: OrthoBlock, images: Sequence[str]) -> tuple[tuple[str, ...], l
     return tuple(bands), left_out
 
 
-def _refuse_full_disk(folder: Path, grid: GroundGrid, bands: int) -> None:
-    needed = grid.width_px * grid.height_px * bands * _BYTES_PER_SAMPLE * _DISK_SHARE
+def _refuse_full_disk(folder: Path, grid: GroundGrid, bands: int, stored_nbytes: int) -> None:
+    pixels = grid.width_px * grid.height_px
+    needed = pixels * bands * _BYTES_PER_SAMPLE * _DISK_SHARE - stored_nbytes
     free = shutil.disk_usage(folder).free
     if free < needed:
         raise OrthomosaicError(

@@ -1,12 +1,13 @@
 """Tiles of an orthomosaic: computed one by one, stored until all are there.
 
-A tile that is stored is not computed again, so that an interrupted run continues. The folder of the
-tiles bears the hash of all inputs: with other inputs all tiles are computed.
+A tile that is stored is not computed again, so that an interrupted run continues. Next to it is the
+hash of its bytes: one that was damaged meanwhile is computed again. The folder of the tiles bears
+the hash of all inputs: with other inputs all tiles are computed.
 """
 
 from __future__ import annotations
 
-import os
+import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -81,7 +82,7 @@ class TileJob:
 
 
 def missing_tiles(survey: CellSurvey, plan: TilePlan, folder: Path) -> list[TileJob]:
-    """The tiles that are not stored.
+    """The tiles that are not stored, or not as they were stored.
 
     Args:
         survey: seams and gains of the block.
@@ -90,7 +91,7 @@ def missing_tiles(survey: CellSurvey, plan: TilePlan, folder: Path) -> list[Tile
     """
     jobs = []
     for column, row, width, height in plan.tiles:
-        if tile_file(folder, column, row).exists():
+        if _is_whole(tile_file(folder, column, row)):
             continue
         first_row, first_column = plan.first_row + row, plan.first_column + column
         rows = slice(first_row // CELL_PX, (first_row + height - 1) // CELL_PX + 1)
@@ -154,8 +155,32 @@ def render_tile(block: OrthoBlock, bands: Sequence[str], job: TileJob) -> Array:
     return result
 
 
+def stored_nbytes(folder: Path) -> int:
+    """Bytes of the tiles in a folder."""
+    return sum(path.stat().st_size for path in folder.glob("*.npy"))
+
+
 def _store(path: Path, pixels: Array) -> None:
-    with durable.new_file(path) as part, part.open("wb") as file:
-        np.save(file, pixels)
-        file.flush()
-        os.fsync(file.fileno())
+    """The tile, then its hash: without one it is computed again."""
+    with durable.new_file(path) as part:
+        with part.open("wb") as file:
+            np.save(file, pixels)
+        digest = _sha256(part)
+    with durable.new_file(_hash_file(path)) as part:
+        part.write_text(digest, encoding="ascii")
+
+
+def _is_whole(path: Path) -> bool:
+    try:
+        return _hash_file(path).read_bytes() == _sha256(path).encode("ascii")
+    except FileNotFoundError:
+        return False
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _hash_file(path: Path) -> Path:
+    return path.with_suffix(".sha256")

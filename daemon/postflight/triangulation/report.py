@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from daemon.orientation.georeference import Georeference
 from daemon.orientation.local_frame import FRAME_FILE
-from daemon.postflight.adjustment.csv_tables import ProjectError, write_table
+from daemon.postflight.adjustment.csv_tables import write_table
 from daemon.postflight.adjustment.project import Project
 from daemon.postflight.adjustment.project_writer import fill_results, new_project
 from daemon.postflight.triangulation.triangulation import ImageBlock
@@ -154,11 +154,8 @@ def write_triangulation(
 
     Raises:
         ProjectError: the folder holds a project.
+        OutputPlaceError: it holds something else.
     """
-    if (folder / "project.toml").exists():
-        raise ProjectError(
-            [f"{folder} holds a triangulation already; give another folder with --out"]
-        )
     with new_project(folder) as part:
         _fill(part, block, project, result, report)
 

@@ -36,6 +36,7 @@ SERVER_DAYS = 397
 """Above 825, tablets of Apple refuse a server certificate (support article 103769)."""
 OPENSSL_TIMEOUT_S = 60.0
 NAMES_MAX = 64
+_AUTHORITY_NAME = "Syntopic"
 _NAME = re.compile(r"(?=.{1,253}\Z)[a-z0-9]([a-z0-9\-]{0,62})(\.[a-z0-9]([a-z0-9\-]{0,62}))*")
 _Network = IPv4Network | IPv6Network
 _PRIVATE = (
@@ -83,6 +84,7 @@ def issue_certificate(
     for created in (folder, authority):
         durable.make_directories(created.absolute())
     certificate, key = folder / SERVER_CERTIFICATE, folder / SERVER_KEY
+    _refuse_foreign(openssl, certificate)
     signer, signer_key = authority / AUTHORITY_CERTIFICATE, authority / AUTHORITY_KEY
     is_new = not signer.exists()
     with tempfile.TemporaryDirectory() as scratch:
@@ -163,6 +165,21 @@ class _Openssl:
         return done.stdout
 
 
+def _refuse_foreign(openssl: _Openssl, certificate: Path) -> None:
+    """Refuse to replace a certificate that another authority signed."""
+    if not certificate.exists():
+        return
+    try:
+        issuer = openssl("x509", "-noout", "-issuer", "-nameopt", "multiline", "-in", certificate)
+    except TlsCertificateError:
+        issuer = b""
+    if _AUTHORITY_NAME.encode() not in issuer:
+        raise TlsCertificateError(
+            f"{certificate} is signed by another authority, and is not replaced. Move it, or give "
+            "another folder with --folder"
+        )
+
+
 def _create_key(openssl: _Openssl, path: Path, *, mode: int) -> None:
     """Create a key of the curve P-256 if there is none."""
     if not path.exists():
@@ -182,7 +199,7 @@ def _authority(openssl: _Openssl, work: Path, key: Path, names: Sequence[str]) -
     config = _config(
         work,
         "[subject]",
-        f"CN = Syntopic {host} {datetime.now(UTC):%Y-%m-%d}",
+        f"CN = {_AUTHORITY_NAME} {host} {datetime.now(UTC):%Y-%m-%d}",
         "[extensions]",
         "basicConstraints = critical, CA:true, pathlen:0",
         "keyUsage = critical, keyCertSign, cRLSign",

@@ -14,10 +14,13 @@ import numpy as np
 import pyproj
 import pytest
 
+from daemon.mission.layout import Mission
+from daemon.mission.store.output_places import OutputPlaceError
+from daemon.postflight.export.gis_export import export_gis
 from daemon.postflight.export.gis_layers import LAYER_NAMES, GisFeature, GisLayer
 from daemon.postflight.export.kmz import kmz_bytes
 from tests.daemon.postflight.exchange.flown_block import FLIGHT
-from tests.daemon.postflight.gis.conftest import Exported, run
+from tests.daemon.postflight.gis.conftest import CRS, Exported, run
 
 pyogrio = pytest.importorskip("pyogrio")
 shapely = pytest.importorskip("shapely")
@@ -160,3 +163,18 @@ def test_without_plan_and_triangulation_the_layers_say_so(
     assert "without a plan" in layers["gaps"]["note"]
     assert "syntopic triangulate" in layers["tie_points"]["note"]
     assert json.dumps(layers) and np.isfinite(layers["footprints"]["features"])
+
+
+def test_a_project_of_qgis_next_to_the_layers_is_not_removed(exported: Exported) -> None:
+    mission, folder = Mission.open(exported.flown.path), Path(exported.gis["folder"])
+    options = {"crs": CRS, "trajectory_file": exported.flown.trajectory}
+    project = folder / "project.qgz"
+    project.write_text("mine")
+    try:
+        with pytest.raises(OutputPlaceError, match=r"project\.qgz"):
+            export_gis(mission, **options)
+        assert project.read_text() == "mine"
+    finally:
+        project.unlink()
+    (folder / "mission.gpkg-wal").write_bytes(b"")
+    assert export_gis(mission, **options).folder == folder

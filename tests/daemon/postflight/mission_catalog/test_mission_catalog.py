@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 
 from daemon.cli import app
 from daemon.mission.layout import Mission
+from daemon.mission.store.output_places import OutputPlaceError
 from daemon.mission.transfer.object_store import ObjectStore
 from daemon.mission.transfer.store_transfer import transfer_to_store
 from tests.daemon.mission.stores.conftest import mission as mission
@@ -301,6 +302,16 @@ def test_a_file_that_is_no_catalog_is_not_replaced(tmp_path: Path, text: str) ->
     done = CliRunner().invoke(app, command)
     assert done.exit_code != 0 and "is not empty and no catalog" in str(done.exception)
     assert (tmp_path / "season/catalog.json").read_text() == text
+
+
+def test_files_of_others_next_to_a_catalog_are_not_removed(season: Path, tmp_path: Path) -> None:
+    notes = season / "notes.txt"
+    notes.write_text("mine")
+    command = ["catalog", "build", str(season), str(tmp_path / "missions")]
+    done = CliRunner().invoke(app, command)
+    assert isinstance(done.exception, OutputPlaceError) and notes.read_text() == "mine"
+    notes.unlink()
+    assert run("build", str(season))["exposures"] == 7
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,6 @@ from benchmarks.orthomosaic import (
     OrthoFlight,
     command,
     displacements,
-    fly,
     owners,
 )
 from daemon.cli import app
@@ -36,15 +35,6 @@ from processing.image.orthoimage.ground_resampling import ImagePose
 pytestmark = pytest.mark.timeout(300)
 
 RUN = CliRunner()
-CRS = "EPSG:32633"
-
-
-@pytest.fixture(scope="module")
-def flown(tmp_path_factory: pytest.TempPathFactory) -> OrthoFlight:
-    """Eight images in two lines under uneven light, and the true height model."""
-    flown = fly(tmp_path_factory.mktemp("block"), width_px=1182, exposures=3)
-    GroundTruth(flown, CRS).write_height_model(flown.folder / "dtm.asc", step_m=20.0)
-    return flown
 
 
 def _arguments(flown: OrthoFlight, out: Path, *more: str) -> list[str]:
