@@ -1,6 +1,7 @@
 """Tie points across exposures: features of one image found in every other that overlaps it.
 
-Prediction by direct georeferencing and the height that earlier matches of the same point gave;
+Prediction by direct georeferencing, and by a height model until an earlier match of the same point
+gave its height;
 correlation and least squares as in `processing.matching.patches`, which find a shift. Images that
 differ by more than that and quarter turns (crab, tilts, oblique views) are first brought to where
 the other stood and looked, by the plane of the ground. Views from too far apart are not matched.
@@ -11,26 +12,20 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, Final
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from processing.bundle.initial_values import intersect
-from processing.geometry.projective import apply_projective
+from processing.geometry.terrain_rays import HeightModel, on_terrain
 from processing.matching.patches import INTERPOLATION, MARGIN_PX, match_patches, select_features
+from processing.matching.plane_rectification import Carry, Picture, rectified
 from processing.rig import VirtualImage
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
-Picture = NDArray[np.float32]
-Carry = Callable[[Array], Array]
 
-_SAME_SHAPE: Final = 2e-3
-"""Rotation, stretch or shear between two images below which a shift fits: 0.02 px at the edge of a
-window. A turn by 2 degrees that is left in it moves a match by 0.07 px."""
 _SIMILAR_VIEW_COSINE: Final = math.cos(math.radians(35.0))
 """Views farther apart show other sides of objects on the ground."""
 
@@ -92,6 +87,7 @@ def match_block(
     ground_m: float,
     settings: BlockMatching | None = None,
     *,
+    heights: HeightModel | None = None,
     progress: Callable[[int], None] = lambda _done: None,
 ) -> BlockTiePoints:
     """Match all overlapping images of a block.
@@ -103,6 +99,7 @@ def match_block(
         rotation: (n, 3, 3) from camera.
         ground_m: height of the ground there, to begin with.
         settings: grid, windows, searches and limits; None takes the defaults.
+        heights: of the ground in that frame, where they are known; elsewhere `ground_m` holds.
         progress: called with the number of images that are done.
 
     Returns:
@@ -113,7 +110,7 @@ def match_block(
     settings = settings or BlockMatching()
     found = []
     for k in range(len(station_m)):
-        found.append(match_image(k, load, image, station_m, rotation, ground_m, settings))
+        found.append(match_image(k, load, image, station_m, rotation, ground_m, settings, heights))
         progress(k + 1)
     return joined_matches(found)
 
@@ -126,6 +123,7 @@ def match_image(
     rotation: Array,
     ground_m: float,
     settings: BlockMatching,
+    heights: HeightModel | None = None,
 ) -> ImageMatches:
     """Match one image with all later ones that overlap it; no other image's matches are needed.
 
@@ -137,6 +135,7 @@ def match_image(
         rotation: (n, 3, 3) from camera.
         ground_m: height of the ground there, to begin with.
         settings: grid, windows, searches and limits.
+        heights: of the ground in that frame, where they are known.
 
     Returns:
         Its features, and where later images show them.
@@ -152,12 +151,13 @@ def match_image(
     if not len(pixels) or not others:
         return found
     rays = rays_of(image, rotation[k], own)
-    ground = station_m[k] + rays * ((ground_m - station_m[k, 2]) / rays[:, 2:])
+    ground = _on_ground(station_m[k], rays, ground_m, heights)
+    plane_m = float(np.median(ground[:, 2]))
     known = np.zeros(len(pixels), dtype=bool)
     for j in others:
         poses = ((station_m[k], rotation[k]), (station_m[j], rotation[j]))
         found.tried[j], at = matched_in(
-            here, rectified(load(j), image, *poses, ground_m), image, rotation[j],
+            here, rectified(load(j), image, *poses, plane_m), image, rotation[j],
             station_m[j], pixels, ground, known, settings,
         )  # fmt: skip
         rows = np.flatnonzero(np.isfinite(at[:, 0]))
@@ -172,6 +172,17 @@ def match_image(
         )
         known[new] = True
     return found
+
+
+def _on_ground(
+    station_m: Array, rays: Array, ground_m: float, heights: HeightModel | None
+) -> Array:
+    """Where rays (n, 3) meet the height model, else level ground, (n, 3)."""
+    level = station_m + rays * ((ground_m - station_m[2]) / rays[:, 2:])
+    if heights is None:
+        return np.asarray(level)
+    found = on_terrain(station_m, rays, heights, earth_radius_m=None)
+    return np.where(np.isfinite(found), found, level)
 
 
 def joined_matches(found: Sequence[ImageMatches]) -> BlockTiePoints:
@@ -266,108 +277,6 @@ def pixels_of(image: VirtualImage, station_m: Array, rotation: Array, xyz_m: Arr
             (image.height_px - 1) / 2.0 - xy[:, 1] / image.pitch_mm,
         ],
         axis=1,
-    )
-
-
-def quarter_rotations(rotation: Array, other: Array) -> int:
-    """Quarter turns, counter-clockwise, that align another image with the first.
-
-    Args:
-        rotation: (3, 3) from camera, of the first image.
-        other: (3, 3) from camera, of the other.
-
-    Returns:
-        0 to 3, for `np.rot90` of the other image.
-    """
-    between = rotation.T @ other
-    return round(math.atan2(between[1, 0], between[0, 0]) / (math.pi / 2.0)) % 4
-
-
-def rotated_px(px: Array, width: int, height: int, quarters: int) -> Array:
-    """Pixels of an image in that image turned by `np.rot90(image, quarters)`.
-
-    Args:
-        px: column and row before the turn, (n, 2).
-        width: columns before the turn.
-        height: rows before the turn.
-        quarters: quarter turns, counter-clockwise, 0 to 3.
-
-    Returns:
-        Column and row after the turn, (n, 2).
-    """
-    column, row = px[:, 0], px[:, 1]
-    rotated = {
-        0: (column, row),
-        1: (row, width - 1 - column),
-        2: (width - 1 - column, height - 1 - row),
-        3: (height - 1 - row, column),
-    }[quarters]
-    return np.stack(rotated, axis=1)
-
-
-def _plane_homography(
-    image: VirtualImage, here: tuple[Array, Array], there: tuple[Array, Array], ground_m: float
-) -> Array:
-    """There from here, (3, 3) on pixels, of level ground at a height; poses are place, rotation."""
-    pitch, middle = image.pitch_mm, ((image.width_px - 1) / 2.0, (image.height_px - 1) / 2.0)
-    right, up = -middle[0] * pitch, middle[1] * pitch
-    ray_from_px = np.array([[pitch, 0.0, right], [0.0, -pitch, up], [0.0, 0.0, -image.f_mm]])
-    # A ray d from S meets the ground at S + d (g - S_z) / d_z; d_z times that, less T d_z:
-    seen = np.outer(here[0] - there[0], [0.0, 0.0, 1.0]) + (ground_m - here[0][2]) * np.eye(3)
-    px_from_ray = np.linalg.inv(ray_from_px)
-    return np.asarray(px_from_ray @ there[1].T @ seen @ here[1] @ ray_from_px)
-
-
-def _shape_beyond_quarters(image: VirtualImage, homography: Array, quarters: int) -> float:
-    """Largest element by which a homography differs locally from quarter turns, at the corners."""
-    turn = np.linalg.matrix_power(np.array([[0.0, 1.0], [-1.0, 0.0]]), quarters)
-    corners = [
-        (x, y, 1.0) for x in (0.0, image.width_px - 1.0) for y in (0.0, image.height_px - 1.0)
-    ]
-    at = np.array(corners) @ homography.T
-    with np.errstate(all="ignore"):
-        local = homography[:2, :2] - at[:, :2, None] / at[:, 2, None, None] * homography[2, :2]
-        return float(np.abs(turn @ (local / at[:, 2, None, None]) - np.eye(2)).max())
-
-
-def rectified(
-    there: Picture,
-    image: VirtualImage,
-    own: tuple[Array, Array],
-    other: tuple[Array, Array],
-    ground_m: float,
-) -> tuple[Picture, Carry, Carry]:
-    """Another image so that about a shift is left to find, and pixels' way into it and back.
-
-    Args:
-        there: (h, w), NaN without data.
-        image: geometry of both.
-        own: place and rotation of the first image.
-        other: those of the other.
-        ground_m: height of the ground.
-
-    Returns:
-        The image, and functions of pixels (n, 2) from the other image into it and back.
-    """
-    height, width = there.shape
-    quarters = quarter_rotations(own[1], other[1])
-    from_here = _plane_homography(image, own, other, ground_m)
-    if not _shape_beyond_quarters(image, from_here, quarters) <= _SAME_SHAPE:
-        to_here = np.asarray(np.linalg.inv(from_here))
-        seen = cv2.warpPerspective(
-            there, from_here, (width, height), flags=cv2.INTER_LANCZOS4 | cv2.WARP_INVERSE_MAP,
-            borderMode=cv2.BORDER_CONSTANT, borderValue=math.nan,
-        )  # fmt: skip
-        return (
-            np.asarray(seen, np.float32),
-            partial(apply_projective, to_here),
-            partial(apply_projective, from_here),
-        )
-    rotated = np.ascontiguousarray(np.rot90(there, quarters))
-    return (
-        rotated,
-        lambda px: rotated_px(px, width, height, quarters),
-        lambda px: rotated_px(px, rotated.shape[1], rotated.shape[0], (4 - quarters) % 4),
     )
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from processing.bundle.initial_values import intersect
-from processing.matching.block_matching import pixels_of, quarter_rotations, rays_of
+from processing.matching.block_matching import pixels_of, rays_of
 from processing.matching.patch_tracks import (
     PatchMatching,
     Picture,
@@ -23,6 +23,7 @@ from processing.matching.patch_tracks import (
     grid_cells,
     match_to_picture,
 )
+from processing.matching.plane_rectification import quarter_rotations
 from processing.rig import VirtualImage
 
 Array = NDArray[np.float64]

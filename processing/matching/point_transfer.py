@@ -12,8 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.matching.block_matching import BlockMatching, matched_in, pixels_of, rectified
+from processing.matching.block_matching import BlockMatching, matched_in, pixels_of
 from processing.matching.patch_tracks import Picture
+from processing.matching.plane_rectification import rectified
 from processing.rig import VirtualImage
 
 Array = NDArray[np.float64]

@@ -14,8 +14,10 @@ from daemon.mission.store.level0 import read_description, read_tiff
 from daemon.postflight.batch.batch_run import Compute, in_this_process
 from daemon.postflight.batch.capacity import PROCESS_NBYTES
 from daemon.postflight.batch.executor import BatchTask
+from daemon.postflight.triangulation.block_heights import heights_of
 from daemon.postflight.triangulation.triangulation import ImageBlock, TriangulationError
 from processing.bundle.normal_equations import refuse_large_block
+from processing.geometry.terrain_rays import HeightModel
 from processing.matching.block_matching import (
     BlockMatching,
     BlockTiePoints,
@@ -48,7 +50,8 @@ class MatchedFile:
 class MatchingWork:
     """Images with start orientations in a local frame; the number of a task is that of its image.
 
-    `station_m` (n, 3), `rotation` (n, 3, 3) from camera, `ground_m` the height of the ground.
+    `station_m` (n, 3), `rotation` (n, 3, 3) from camera, `ground_m` the height of the ground,
+    `heights` that of a height model.
     """
 
     mission: Mission
@@ -59,6 +62,7 @@ class MatchingWork:
     ground_m: float
     settings: BlockMatching
     threads: int = 1
+    heights: HeightModel | None = None
 
     @property
     def memory_nbytes(self) -> int:
@@ -91,7 +95,7 @@ class MatchingAction:
         work = self._work
         return match_image(
             task.number, self.pixels, work.image, work.station_m, work.rotation, work.ground_m,
-            work.settings,
+            work.settings, work.heights,
         )  # fmt: skip
 
     def pixels(self, k: int) -> Picture:
@@ -160,5 +164,6 @@ def _work(block: ImageBlock, settings: BlockMatching) -> MatchingWork:
     ]
     mission = Mission(block.mission.path.absolute(), block.mission.id)
     return MatchingWork(
-        mission, block.image, files, block.station_m, block.rotation, block.ground_m, settings
-    )
+        mission, block.image, files, block.station_m, block.rotation, block.ground_m, settings,
+        heights=heights_of(block),
+    )  # fmt: skip

@@ -9,14 +9,13 @@ import pytest
 from scipy import ndimage
 
 from processing.geometry.rotation import rotation_matrix
+from processing.geometry.terrain_rays import HeightModel
 from processing.matching.block_matching import (
     BlockMatching,
     BlockTiePoints,
     match_block,
-    quarter_rotations,
-    rectified,
-    rotated_px,
 )
+from processing.matching.plane_rectification import quarter_rotations, rectified, rotated_px
 from processing.rig import VirtualImage
 
 
@@ -96,6 +95,28 @@ def test_crab_between_two_lines_does_not_move_matches(kappa_deg) -> None:
     assert tied.matched[0, 1] > 20
     error = ground.errors_px(tied)
     assert float(np.sqrt(np.mean(error**2))) < 0.01
+
+
+def test_a_height_model_predicts_where_the_plan_does_not() -> None:
+    """Ground 300 m above that of the plan moves points by more than is searched."""
+    place = np.array([[0.0, 0.0, 940.0], [14.0, 0.0, 940.0]])
+    rotations = np.stack([np.eye(3), np.eye(3)])
+    ground = FlatGround(place, rotations, (0.0, 0.0))
+    around = {"x_m": -500.0, "y_m": 500.0, "step_x_m": 100.0, "step_y_m": -100.0}
+
+    def matched(ground_m: float, settings: BlockMatching, heights: HeightModel | None) -> int:
+        tied = match_block(
+            ground.look, IMAGE, place, rotations, ground_m, settings, heights=heights
+        )
+        return tied.matched.get((0, 1), 0)
+
+    narrow = BlockMatching(cells=(10, 8), first_search_px=3)
+    model = HeightModel(np.zeros((11, 11)), **around)
+    assert matched(-300.0, narrow, None) == 0
+    assert matched(-300.0, narrow, model) > 20
+    unknown = HeightModel(np.full((11, 11), np.nan), **around)
+    unknown.height_m[:, :1] = 0.0
+    assert matched(0.0, narrow, unknown) == matched(0.0, narrow, None) > 20
 
 
 def test_images_that_differ_by_a_shift_and_quarter_turns_are_not_resampled() -> None:
