@@ -11,6 +11,7 @@ from typing import Final
 
 import numpy as np
 
+from benchmarks.silent_errors.exposure_faults import EXPOSURE_FAULTS
 from benchmarks.silent_errors.exposures import healthy, remeasured
 from benchmarks.silent_errors.faults import FAULTS
 from benchmarks.silent_errors.frame_faults import FRAME_FAULTS
@@ -23,6 +24,7 @@ from processing.quality.figures.image import (
     BlockFigures,
     ClippingFigures,
     ContentFigures,
+    DarkFrameFigures,
     DefectLineFigures,
     IdentityFigures,
     LineOrderFigures,
@@ -45,7 +47,7 @@ from processing.quality.figures.stitching import (
 )
 from processing.quality.report import Flag, QualityReport, Thresholds, Verdict
 
-LATER: Final = ("frame-part", *FRAME_FAULTS)
+LATER: Final = ("frame-part", *FRAME_FAULTS, *EXPOSURE_FAULTS)
 """Kinds that were added last: the first cases of a seed stay what they were."""
 NARROW: Final = ("stuck-column",)
 """Kinds that change less than a region that is compared: without a finding they are silent."""
@@ -219,7 +221,8 @@ def named_causes(report: QualityReport) -> dict[str, frozenset[str]]:
         "part": _names(_one(part.other_ground_sensor), part.other_ground_alternatives),
         "displaced": _names(_one(displaced), displacement.displaced_alternatives),
         "slip": _names(slip.slip_sensors, slip.slip_alternatives),
-        "ground": _names(other_ground),
+        "ground": _names(other_ground, figures.of(ContentFigures).mismatched_alternatives),
+        "dark": _names(figures.of(DarkFrameFigures).dark_sensors),
         "words": _names(figures.of(WordFormatFigures).word_format_sensors),
         "bits": _names(figures.of(WordFormatFigures).constant_bits_sensors),
         "order": _names(_one(figures.of(LineOrderFigures).line_order_sensor)),

@@ -9,6 +9,7 @@ from typing import Any, Final
 import cv2
 import numpy as np
 
+from benchmarks.silent_errors.exposure_faults import EXPOSURE_FAULTS
 from benchmarks.silent_errors.exposures import EmulatedExposure
 from benchmarks.silent_errors.frame_faults import FRAME_FAULTS
 from benchmarks.silent_errors.planting import (
@@ -430,5 +431,6 @@ FAULTS: Final[Mapping[str, FaultInjector]] = {
     "words": _words,
     "frame-lost": _frame_lost,
     **FRAME_FAULTS,
+    **EXPOSURE_FAULTS,
 }
 """How each kind of `benchmarks.silent_errors.limits` is planted."""

@@ -121,6 +121,14 @@ LIMITS: Final[Mapping[str, Limit]] = {
     "frame-flipped": Limit(
         "a frame flipped, last row first", "", _same_limit(STITCHED, 1.0)
     ),
+    "dark-head": Limit("a head without light", "", _same_limit(EVERY, 1.0)),
+    "block-repeated": Limit(
+        "a block of rows of a frame sent twice", "rows", _same_limit(EVERY, 4.0)
+    ),
+    "tdi-lost": Limit("a record without TDI counts", "", _same_limit(STITCHED, 1.0)),
+    "group-other": Limit(
+        "all PAN or all colour frames of another exposure", "", _same_limit(STITCHED, 1.0)
+    ),
 }  # fmt: skip
 
 

@@ -289,6 +289,7 @@ def _smears(rig: Rig, conditions: Conditions) -> tuple[FigureGroup, ...]:
         SmearFigures(
             smear_along_px=max((along for along, _ in smears), default=None),
             smear_across_px=max((across for _, across in smears), default=None),
+            tdi_shifts_max=max((conditions.tdi_shifts.get(name, 0) for name in sensors), default=0),
         ),
     )
 
@@ -296,19 +297,20 @@ def _smears(rig: Rig, conditions: Conditions) -> tuple[FigureGroup, ...]:
 def tdi_misfit_px(rig: Rig, conditions: Conditions, largest_px: float) -> dict[str, float]:
     """By PAN cone, what its TDI count leaves of the motion along track.
 
+    A count of zero counts as any other: a record without counts may be of heads that shift.
+
     Args:
         rig: the camera.
         conditions: speed, height, crab, rates, exposure times and TDI counts are used.
         largest_px: motion up to this is not reported, px.
 
     Returns:
-        Motion of the worst sensor in px by cone name, only above `largest_px`; empty where no head
-        shifts its charges.
+        Motion of the worst sensor in px by cone name, only above `largest_px`.
 
     Source: docs/explanation/mathematics/quality.md#smear.
     """
     found: dict[str, float] = {}
-    if rig.virtual_image is None or not any(conditions.tdi_shifts.values()):
+    if rig.virtual_image is None:
         return found
     for cone in rig.pan_cones:
         smears = [_smear(rig, sensor.name, conditions) for sensor in cone.sensors]

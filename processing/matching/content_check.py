@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -215,11 +215,12 @@ def moved_placements(
     return moved
 
 
-def content_figures(check: ContentCheck) -> ContentFigures:
+def content_figures(check: ContentCheck, alternatives: Sequence[str] = ()) -> ContentFigures:
     """Figures of the quality report from the check.
 
     Args:
         check: shifted and mismatched frames of one exposure.
+        alternatives: frames that may show other ground instead of the mismatched ones.
 
     Returns:
         Names of the sensors, the largest shift in PAN pixels, the most textured positions of a
@@ -229,6 +230,7 @@ def content_figures(check: ContentCheck) -> ContentFigures:
     return ContentFigures(
         mismatched_sensors=tuple(check.mismatched),
         mismatched_positions=max(check.mismatched.values(), default=None),
+        mismatched_alternatives=tuple(alternatives),
         shifted_sensors=tuple(check.shifted_px),
         shifted_px=max(shifts_px, default=None),
     )

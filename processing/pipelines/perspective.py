@@ -37,6 +37,7 @@ from processing.pipelines.exposure_pipeline import (
     StageSettings,
 )
 from processing.pipelines.synthetic_frames import synthetic_head_frames
+from processing.quality.dark_frames import dark_frame_figures, dark_frames
 from processing.quality.defect_lines import defect_line_figures, defect_lines
 from processing.quality.figures import FigureGroup
 from processing.quality.frame_identity import FixedPatterns, heads_by_pattern, pattern_figures
@@ -238,6 +239,7 @@ class HeadPipeline(
             word_format_figures(self.rig, frames),
             repeated_line_figures(self.rig, frames),
             line_order_figures(self.rig, frames),
+            dark_frame_figures(dark_frames(self.rig, level1, {})),
             pattern_figures(heads_by_pattern(self.rig, frames, self._patterns, {})),
         )
         return _CorrectedHeads(level1, statistics, planes, figures)

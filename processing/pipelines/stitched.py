@@ -68,6 +68,7 @@ from processing.pipelines.stitched_stages import (
 )
 from processing.pipelines.synthetic_frames import synthetic_frames
 from processing.quality.clipping import clipping_figures
+from processing.quality.dark_frames import dark_frame_figures, dark_frames
 from processing.quality.frame_identity import FixedPatterns, heads_by_pattern
 from processing.quality.line_order import line_order_figures
 from processing.quality.readout import blank_unread, unread_figures
@@ -176,8 +177,10 @@ class Pipeline(
         )
         with exposure.clock.stage("radiometry"):
             level1, statistics = self._level1(exposure)
+            dark = dark_frames(rig, level1, exposure_scales(rig, conditions.exposure_time_s))
             figures = (
                 unread_figures({n: seen.unread_fraction for n, seen in statistics.items()}),
+                dark_frame_figures(dark),
                 word_format_figures(rig, frames),
                 repeated_line_figures(rig, frames),
                 line_order_figures(rig, frames),
@@ -185,6 +188,9 @@ class Pipeline(
             )
             tdi_shifts = {name: placement.tdi_shifts for name, placement in start.items()}
             by_pattern = heads_by_pattern(rig, frames, self._patterns, tdi_shifts)
+            # A frame without light is as one that is missing: its noise is no ground.
+            for name in dark:
+                del level1[name], statistics[name]
         return CorrectedFrames(level1, statistics, start, ground, by_pattern, figures)
 
     def _level1(

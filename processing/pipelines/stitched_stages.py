@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.geometry.conditions import parallax_px
+from processing.geometry.conditions import parallax_px, tdi_misfit_px
 from processing.geometry.exposure_times import (
     exposure_scale_figures,
     exposure_scales,
@@ -39,7 +39,12 @@ from processing.quality.confirmed_ground import confirmed_ground_figures
 from processing.quality.defect_lines import defect_line_figures, defect_lines
 from processing.quality.figures import FigureGroup
 from processing.quality.figures.circumstances import ParallaxFigures
-from processing.quality.figures.image import LineOrderFigures, ValidFigures, WordFormatFigures
+from processing.quality.figures.image import (
+    LineOrderFigures,
+    RepeatedLineFigures,
+    ValidFigures,
+    WordFormatFigures,
+)
 from processing.quality.figures.stitching import SaturatedOverlapFigures, SupportFigures
 from processing.quality.frame_blocks import block_edges, block_figures, edge_limits
 from processing.quality.frame_identity import identity_figures
@@ -48,7 +53,7 @@ from processing.quality.ground_steps import GroundView, is_drawn_by_step
 from processing.quality.local_sharpness import local_blur_figures
 from processing.quality.other_ground import other_ground_figures, other_ground_regions
 from processing.quality.relative_sharpness import relative_sharpness_figures
-from processing.quality.signal_steps import signal_steps, step_figures
+from processing.quality.signal_steps import signal_steps, step_figures, without_edges
 from processing.quality.stitching_figures import poorest_overlap, stitching_figures
 from processing.quality.valid_area import Mask
 from processing.radiometry.level1 import FrameStatistics, exposed_rows
@@ -130,7 +135,9 @@ def figures_of(
     yield sharpness_figures(pan, level1, exposed)
     means = {n: seen.lines for n, seen in corrected.statistics.items() if seen.lines is not None}
     view = GroundView(rig, mosaic.placements, level1)
-    steps = signal_steps(rig.sensors, means, view)
+    misfit_px = tdi_misfit_px(rig, conditions, settings.thresholds.smear_px)
+    partly_exposed = math.ceil(max(misfit_px.values(), default=0.0))
+    steps = without_edges(rig.sensors, signal_steps(rig.sensors, means, view), partly_exposed)
     limits = edge_limits(rig, means)
     blocks = block_edges(rig, mosaic.placements, level1, means, limits)
     yield from stitching_figures(
@@ -149,7 +156,9 @@ def figures_of(
     yield from platform_figures(adjusted.platform)
     yield scale_figures(adjusted.held)
     yield projection_figures(rig, conditions, settings.relief_fraction)
-    yield content_figures(adjusted.content)
+    yield content_figures(
+        adjusted.content, _of_other_group(rig, adjusted.content, image.registrations, level1)
+    )
     yield other_ground_figures(
         other_ground_regions(
             rig,
@@ -196,7 +205,33 @@ def _explained_frames(corrected: CorrectedFrames, adjusted: AdjustedFrames) -> s
     """Frames of which the report knows why points of theirs do not match."""
     content = adjusted.content
     slipped = {slip.sensor for slip in adjusted.stitching.slips}
-    return {*content.mismatched, *content.shifted_px, *slipped, *corrected.by_pattern}
+    repeated = {
+        str(group.repeated_lines_sensor)
+        for group in corrected.figures
+        if isinstance(group, RepeatedLineFigures)
+    }
+    return {*content.mismatched, *content.shifted_px, *slipped, *corrected.by_pattern, *repeated}
+
+
+def _of_other_group(
+    rig: Rig,
+    content: ContentCheck,
+    registrations: Sequence[BandRegistration],
+    level1: Mapping[str, Array],
+) -> tuple[str, ...]:
+    """The other colour heads and all PAN heads, where green alone disagrees with PAN.
+
+    Where other colour heads agree with green, and PAN heads with each other, the frames of either
+    group may be of another exposure.
+    """
+    if rig.colour_master_cone is None:
+        return ()
+    green = rig.cone(rig.colour_master_cone).sensors[0].name
+    agreeing = [band.sensor for band in registrations if band.registered]
+    pan = [s.name for cone in rig.pan_cones for s in cone.sensors if s.name in level1]
+    if set(content.mismatched) != {green} or not agreeing or len(pan) < 2:
+        return ()
+    return (*agreeing, *pan)
 
 
 def _odd_frames(corrected: CorrectedFrames) -> set[str]:

@@ -27,6 +27,7 @@ from processing.quality.figures.image import (
 from processing.quality.figures.stitching import DisplacedSensorFigures, MisreadProbeFigures
 from processing.quality.image_findings import (
     content_findings,
+    dark_frame_findings,
     exposure_findings,
     identity_findings,
     other_ground_findings,
@@ -167,6 +168,7 @@ def evaluate(
     ]
     findings += _frames(figures, capture_flags, missing_sensors, limits)
     findings += _time_and_temperature(figures, missing_probes, probes_out_of_range, limits)
+    findings += dark_frame_findings(figures)
     findings += content_findings(figures, mismatched_bands)
     findings += other_ground_findings(figures)
     findings += stitching_findings(

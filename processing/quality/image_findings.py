@@ -15,6 +15,7 @@ from processing.quality.figures.image import (
     BlockFigures,
     ClippingFigures,
     ContentFigures,
+    DarkFrameFigures,
     DefectLineFigures,
     IdentityFigures,
     LineOrderFigures,
@@ -49,16 +50,19 @@ def content_findings(figures: QualityFigures, bands: Sequence[str]) -> list[Find
     if not named:
         return []
     positions = content.mismatched_positions
-    return [
-        Finding(
-            Flag.FRAME_CORRUPT,
-            Verdict.REFLY,
-            f"The frame of {named} shows other ground than its neighbours although it has texture: "
-            "frames swapped, of another exposure, turned or mirrored, or the head has moved. "
-            "Check cables and serial numbers of the heads. Fly this exposure again.",
-            None if positions is None else float(positions),
+    sentence = (
+        f"The frame of {named} shows other ground than its neighbours although it has texture: "
+        "frames swapped, of another exposure, turned or mirrored, or the head has moved. "
+        "Check cables and serial numbers of the heads. Fly this exposure again."
+    )
+    if content.mismatched_alternatives and not bands:
+        sentence = (
+            f"The frame of {named} shows other ground than the PAN heads, and other colour heads "
+            "agree with it: the frames of all PAN heads or of all colour heads are of another "
+            "exposure. Check the trigger and the numbering of both. Fly this exposure again."
         )
-    ]
+    value = None if positions is None else float(positions)
+    return [Finding(Flag.FRAME_CORRUPT, Verdict.REFLY, sentence, value)]
 
 
 def other_ground_findings(figures: QualityFigures) -> list[Finding]:
@@ -85,6 +89,30 @@ def other_ground_findings(figures: QualityFigures) -> list[Finding]:
             + "show other ground than the other heads although they have texture: a part of "
             "another exposure. Check the head, cable and transfer. Fly this exposure again.",
             float(positions),
+        )
+    ]
+
+
+def dark_frame_findings(figures: QualityFigures) -> list[Finding]:
+    """Frames without light while other heads are lit.
+
+    Args:
+        figures: of one exposure.
+
+    Returns:
+        One finding or none.
+    """
+    dark = figures.of(DarkFrameFigures)
+    if not dark.dark_sensors:
+        return []
+    return [
+        Finding(
+            Flag.FRAME_CORRUPT,
+            Verdict.REFLY,
+            f"No light in the frame of {', '.join(dark.dark_sensors)} while other heads are lit: "
+            "shutter or lens cover was closed, or the head gave no signal, and the image shows no "
+            "ground there. Check shutter, lens cover and head. Fly this exposure again.",
+            dark.dark_noises,
         )
     ]
 
@@ -201,18 +229,7 @@ def signal_findings(figures: QualityFigures, thresholds: Thresholds) -> list[Fin
                 "check what these heads share, supply and clock."
             )
         findings.append(Finding(Flag.FRAME_CORRUPT, Verdict.USABLE, sentence, step))
-    repeated = figures.of(RepeatedLineFigures)
-    if repeated.repeated_lines is not None:
-        findings.append(
-            Finding(
-                Flag.FRAME_CORRUPT,
-                Verdict.USABLE,
-                f"{repeated.repeated_lines} lines of {repeated.repeated_lines_sensor} from line "
-                f"{repeated.repeated_lines_first} on repeat the line before: read-out or transfer "
-                "stood still, and the image shows no ground there. Check the head and its cable.",
-                float(repeated.repeated_lines),
-            )
-        )
+    findings += _repeated_lines(figures.of(RepeatedLineFigures))
     findings += _defect_line(figures.of(DefectLineFigures))
     balance = figures.of(BalanceFigures)
     outlier, signal = balance.gain_outlier, balance.gain_outlier_signal
@@ -237,6 +254,29 @@ def signal_findings(figures: QualityFigures, thresholds: Thresholds) -> list[Fin
     return findings + _blur(
         figures.of(RelativeSharpnessFigures), figures.of(LocalBlurFigures), thresholds
     )
+
+
+def _repeated_lines(repeated: RepeatedLineFigures) -> list[Finding]:
+    """Lines of a frame that repeat the line before, or a block of lines before."""
+    lines, first = repeated.repeated_lines, repeated.repeated_lines_first
+    source = repeated.repeated_lines_source
+    if lines is None or first is None:
+        return []
+    sentence, verdict = (
+        f"{lines} lines of {repeated.repeated_lines_sensor} from line {first} on repeat the line "
+        "before: read-out or transfer stood still, and the image shows no ground there. Check the "
+        "head and its cable.",
+        Verdict.USABLE,
+    )
+    if source is not None and source < first - 1:
+        sentence, verdict = (
+            f"{lines} lines of {repeated.repeated_lines_sensor} from line {first} on repeat those "
+            f"from line {source} on, word by word: they were sent twice, and the image shows other "
+            "ground in one of both places. Check the head, cable and transfer. Fly this exposure "
+            "again.",
+            Verdict.REFLY,
+        )
+    return [Finding(Flag.FRAME_CORRUPT, verdict, sentence, float(lines))]
 
 
 def _defect_line(line: DefectLineFigures) -> list[Finding]:
@@ -418,14 +458,7 @@ def exposure_findings(figures: QualityFigures, thresholds: Thresholds) -> list[F
         (thresholds.saturated_fraction, thresholds.saturated_refly_fraction),
         "Parts of the image are saturated; shorten the exposure.",
     )
-    smear = figures.of(SmearFigures)
-    for smear_px, way in ((smear.smear_along_px, "along"), (smear.smear_across_px, "across")):
-        findings += above(
-            smear_px,
-            Flag.BLUR,
-            (thresholds.smear_px, thresholds.smear_refly_px),
-            f"Motion blur {way} track; shorten the exposure, check TDI, speed, mount and crab.",
-        )
+    findings += _smear(figures.of(SmearFigures), thresholds)
     sharpness = figures.of(SharpnessFigures).sharpness
     if sharpness is not None and sharpness < thresholds.sharpness:
         findings.append(
@@ -437,4 +470,22 @@ def exposure_findings(figures: QualityFigures, thresholds: Thresholds) -> list[F
                 thresholds.sharpness,
             )
         )
+    return findings
+
+
+def _smear(smear: SmearFigures, thresholds: Thresholds) -> list[Finding]:
+    """Motion during exposure along and across track."""
+    findings = []
+    for smear_px, way in ((smear.smear_along_px, "along"), (smear.smear_across_px, "across")):
+        sentence = (
+            f"Motion blur {way} track; shorten the exposure, check TDI, speed, mount and crab."
+        )
+        if way == "along" and smear.tdi_shifts_max == 0:
+            sentence = (
+                "Motion blur along track, and the record states no TDI shifts. If the heads shift "
+                "charges, enter settings.TdiShifts in the record and process it again. If not, "
+                "shorten the exposure, check speed, mount and crab."
+            )
+        limits = (thresholds.smear_px, thresholds.smear_refly_px)
+        findings += above(smear_px, Flag.BLUR, limits, sentence)
     return findings

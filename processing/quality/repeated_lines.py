@@ -1,6 +1,8 @@
-"""Lines of a raw frame that repeat the line before, word by word: read-out or transfer stood still.
+"""Lines of a raw frame that repeat earlier ones, word by word: read-out or transfer.
 
-Noise differs from line to line, so that two lines of ground are never the same over a whole frame.
+A read-out that stands still repeats the line before; a buffer that is sent twice repeats a block of
+lines. Noise differs from line to line, so that two lines of ground are never the same over a whole
+frame.
 """
 
 from __future__ import annotations
@@ -17,21 +19,23 @@ from processing.rig import Rig
 
 Array = NDArray[Any]
 
-STEP: Final = 4
-"""Every so many lines one is compared with the next; a run of as many is not missed."""
 WORDS: Final = 8
-"""Words compared at first, in the middle of a line; where these are equal, the whole line is."""
+"""Words of a line compared at first; where these are equal, those of the next place are."""
+PLACES: Final = (0.5, 0.25, 0.75)
+"""Of these words, as shares of the width: lines that are equal in all are compared as a whole."""
 MIN_LINES: Final = 4
 """Fewer lines are a defect of single lines."""
+_MIX: Final = np.uint64(0x9E3779B97F4A7C15)
 
 
 @dataclass(frozen=True)
 class RepeatedLines:
-    """`count` lines from `first` on are the line before `first`."""
+    """`count` lines from `first` on are those from `source` on, one by one."""
 
     sensor: str
     first: int
     count: int
+    source: int
 
 
 def repeated_line_figures(rig: Rig, frames: Mapping[str, Array]) -> RepeatedLineFigures | None:
@@ -52,11 +56,11 @@ def repeated_line_figures(rig: Rig, frames: Mapping[str, Array]) -> RepeatedLine
     if not found:
         return None
     longest = max(found, key=lambda run: run.count)
-    return RepeatedLineFigures(longest.count, longest.sensor, longest.first)
+    return RepeatedLineFigures(longest.count, longest.sensor, longest.first, longest.source)
 
 
 def repeated_lines(sensor: str, frame: Array) -> RepeatedLines | None:
-    """The longest run of lines that are the line before them.
+    """The longest run of lines that repeat earlier lines of the frame in their order.
 
     Lines of one value, which were not read out or are saturated, are not looked at.
 
@@ -67,29 +71,37 @@ def repeated_lines(sensor: str, frame: Array) -> RepeatedLines | None:
     Returns:
         None without a run of `MIN_LINES`.
     """
-    longest = RepeatedLines(sensor, 0, 0)
-    last = 0
+    seen: dict[bytes, int] = {}
+    longest = run = RepeatedLines(sensor, 0, 0, 0)
     for line in _alike(frame).tolist():
-        if line < last or not _repeats(frame, line + 1):
+        own = frame[line]
+        if own.min() == own.max():
             continue
-        first, last = line + 1, line + 2
-        while first > 1 and _repeats(frame, first - 1):
-            first -= 1
-        while last < len(frame) and _repeats(frame, last):
-            last += 1
-        if last - first > longest.count:
-            longest = RepeatedLines(sensor, first, last - first)
+        content = own.tobytes()
+        source = seen.get(content)
+        seen[content] = line
+        if source is None:
+            continue
+        goes_on = (line, source) == (run.first + run.count, run.source + run.count)
+        first, count, start = (run.first, run.count, run.source) if goes_on else (line, 0, source)
+        run = RepeatedLines(sensor, first, count + 1, start)
+        if run.count > longest.count:
+            longest = run
     return longest if longest.count >= MIN_LINES else None
 
 
-def _repeats(frame: Array, line: int) -> bool:
-    own = frame[line]
-    return bool(np.array_equal(own, frame[line - 1]) and own.min() < own.max())
-
-
 def _alike(frame: Array) -> Array:
-    """Lines, of every so many, whose words in the middle are those of the next line."""
-    first = max((frame.shape[1] - WORDS) // 2, 0)
-    middle = frame[:, first : first + WORDS]
-    own, following = middle[:-1:STEP], middle[1::STEP]
-    return np.flatnonzero((own == following).all(axis=1)) * STEP
+    """Lines whose words at all `PLACES` are those of another line, in order."""
+    height, width = frame.shape
+    lines = np.arange(height)
+    for share in PLACES:
+        first = round(share * (width - WORDS))
+        rows = frame if len(lines) == height else frame[lines]
+        words = np.ascontiguousarray(rows[:, first : first + WORDS]).view(np.uint64)
+        keys = words[:, 0] * _MIX ^ words[:, 1]
+        in_order = np.sort(keys)
+        repeated = in_order[1:][in_order[1:] == in_order[:-1]]
+        if not len(repeated):
+            return lines[:0]
+        lines = lines[np.isin(keys, repeated)]
+    return lines

@@ -110,6 +110,28 @@ def _of_read_out(steps: Sequence[SignalStep], view: GroundView | None) -> list[S
     return [step for step in steps if step.sensor in named[step.axis]]
 
 
+def without_edges(
+    sensors: Sequence[Sensor], steps: Sequence[SignalStep], rows: int
+) -> tuple[SignalStep, ...]:
+    """Leave out steps in the rows that a wrong TDI count leaves partly exposed.
+
+    Args:
+        sensors: those that were looked at.
+        steps: of their frames.
+        rows: at the first and at the last end of a frame, that may be partly exposed.
+
+    Returns:
+        Steps between rows of which any lies elsewhere, and those between columns.
+    """
+    heights = {sensor.name: sensor.height_px for sensor in sensors}
+
+    def is_edge(step: SignalStep) -> bool:
+        last = heights[step.sensor] - 1 - rows
+        return step.axis == "rows" and all(not rows <= line.at < last for line in step.every)
+
+    return tuple(step for step in steps if not is_edge(step))
+
+
 def step_figures(steps: Sequence[SignalStep]) -> SignalStepFigures:
     """The largest step in figures of the quality report.
 

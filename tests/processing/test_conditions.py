@@ -68,8 +68,14 @@ def test_a_tdi_count_that_leaves_too_much_motion_is_given_by_cone(rig: Rig) -> N
     )
     assert tdi_misfit_px(rig, conditions, 0.8) == {"1": pytest.approx(2.25)}
     assert len(tdi_misfit_px(rig, conditions, 0.2)) == len(rig.pan_cones)
-    still = replace(conditions, tdi_shifts=dict.fromkeys(counts, 0))
+    unstated = replace(conditions, tdi_shifts={})
+    for zero in (unstated, replace(conditions, tdi_shifts=dict.fromkeys(counts, 0))):
+        every = dict.fromkeys((cone.name for cone in rig.pan_cones), pytest.approx(8.25))
+        assert tdi_misfit_px(rig, zero, 0.8) == every
+        assert figures(rig, zero)["tdi_shifts_max"] == 0
+    still = replace(unstated, ground_speed_mps=0.0)
     assert tdi_misfit_px(rig, still, 0.8) == {}
+    assert figures(rig, conditions)["tdi_shifts_max"] == 8
 
 
 def test_angular_rates_smear_by_focal_length_over_pitch(rig: Rig) -> None:

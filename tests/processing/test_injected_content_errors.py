@@ -46,6 +46,9 @@ def _old(*names: str) -> Callable[[Frames, Frames], Frames]:
     return lambda frames, others: {**frames, **{name: others[name] for name in names}}
 
 
+ROTATED_GREEN = _rotated("G")
+
+
 @pytest.mark.parametrize(
     ("change", "named"),
     [
@@ -53,7 +56,7 @@ def _old(*names: str) -> Callable[[Frames, Frames], Frames]:
         (_swapped("SU20", "SU21"), {"SU20", "SU21"}),
         (_rotated("SU30"), {"SU30"}),
         (_mirrored("SU10"), {"SU10"}),
-        (_rotated("G"), {"G"}),
+        (ROTATED_GREEN, {"G"}),
         (_old("SU02"), {"SU02"}),
         (_old("R", "G", "B", "N"), {"G"}),
     ],
@@ -69,6 +72,26 @@ def test_other_ground_in_a_frame_is_named_and_flown_again(
     assert set(str(outcome.figure("mismatched_sensors")).split(", ")) == named
     assert "other ground" in outcome.sentences and "water" not in outcome.sentences
     assert "DISPLACED_SENSOR" not in outcome.flags
+    # One frame that contradicts all others is alone.
+    alone = outcome.figure("mismatched_alternatives") is None
+    assert alone == (named != {"G"} or change is ROTATED_GREEN)
+
+
+@pytest.mark.parametrize(
+    ("rig", "group"),
+    [("ultracam-x-mini", "pan"), ("ultracam-x-mini", "colour"), ("ultracam-l-mini", "pan")],
+)
+def test_of_pan_and_colour_heads_of_two_exposures_either_may_be_wrong(rig: str, group: str) -> None:
+    exposure, other = rendered(rig), rendered(rig, seed=12, dc_k=-15.0)
+    cones = exposure.rig.pan_cones if group == "pan" else exposure.rig.colour_cones
+    changed = [s.name for cone in cones for s in cone.sensors]
+    outcome = replace(exposure, frames=_old(*changed)(exposure.frames, other.frames)).outcome()
+    assert outcome.verdict == "refly" and "FRAME_CORRUPT" in outcome.flags
+    assert "of all PAN heads or of all colour heads are of another exposure" in outcome.sentences
+    accused = (
+        outcome.figure("mismatched_sensors") + ", " + outcome.figure("mismatched_alternatives")
+    )
+    assert set(changed) <= set(accused.split(", "))
 
 
 @pytest.mark.parametrize("calibrated", [True, False])

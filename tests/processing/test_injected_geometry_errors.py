@@ -51,6 +51,20 @@ def test_a_tdi_count_of_the_master_that_misfits_the_motion_widens_the_sigma(
     assert_covered(outcome)
 
 
+@pytest.mark.parametrize(("rig", "seed"), [("ultracam-x-mini", 11), ("ultracam-l-mini", 12)])
+def test_lost_tdi_counts_widen_the_sigma_and_name_the_setting(rig: str, seed: int) -> None:
+    exposure = rendered(rig, seed=seed)
+    for counts in ({}, {name: max(0, n - 2) for name, n in exposure.conditions.tdi_shifts.items()}):
+        conditions = replace(exposure.conditions, tdi_shifts=counts)
+        outcome = replace(exposure, conditions=conditions).outcome()
+        assert "BLUR" in outcome.flags and outcome.true_sigma_px > 0.1
+        assert_covered(outcome)
+        # Partly exposed rows are no step that a supply or clock makes.
+        assert outcome.figure("signal_step_sensor") is None, outcome.sentences
+        is_zero = outcome.figure("tdi_shifts_max") == 0
+        assert is_zero == ("enter settings.TdiShifts" in outcome.sentences)
+
+
 @pytest.mark.parametrize("ppm", [1000.0, -300.0])
 def test_the_masters_principal_distance_is_named_and_widens_the_sigma(
     error_free: InjectedExposure, ppm: float

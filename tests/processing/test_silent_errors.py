@@ -129,6 +129,15 @@ def test_tie_points_that_an_edge_of_a_block_draws_are_no_slip_of_the_neighbour()
 
 
 @pytest.mark.trust
+def test_of_a_block_that_is_sent_twice_no_other_head_is_called_wrong() -> None:
+    """Tie points of green in the block match nothing: P3 or P4 was called another exposure."""
+    outcome = run(Case(0, "block-repeated", DMC, exposure=0, share=4.0, seed=5000))
+    assert outcome.description == "G: 16 rows from 380 are those from 336"
+    assert outcome.result == "found" and outcome.named["repeated"] == "G"
+    assert all(names == "G" for names in outcome.named.values()), outcome.named
+
+
+@pytest.mark.trust
 def test_of_exchanged_bands_nothing_else_is_called_wrong() -> None:
     case = Case(7, "bands-swapped", X, exposure=0, share=1.0, seed=10200007)
     outcome = run(case)

@@ -65,6 +65,9 @@ class SmearFigures(FigureGroup):
         "motion during exposure along track that TDI left, worst PAN cone, pixels",
     ] = None
     smear_across_px: Annotated[float | None, "the same across track"] = None
+    tdi_shifts_max: Annotated[
+        int | None, "largest TDI count of a PAN sensor by the record; 0 also where it states none"
+    ] = None
 
 
 @dataclass(frozen=True)

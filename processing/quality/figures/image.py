@@ -21,6 +21,11 @@ class ContentFigures(FigureGroup):
         int | None,
         "textured positions of the worst of them that were tried",
     ] = None
+    mismatched_alternatives: Annotated[
+        Names,
+        "frames that may show other ground instead: PAN heads, and colour heads that agree with "
+        "green",
+    ] = ()
     shifted_sensors: Annotated[
         Names,
         "frames found farther from their calibrated place than points are sought",
@@ -71,14 +76,30 @@ class UnreadFigures(FigureGroup):
 
 
 @dataclass(frozen=True)
+class DarkFrameFigures(FigureGroup):
+    """Frames without light while others are lit."""
+
+    dark_sensors: Annotated[
+        Names, "frames without light while those of other heads are lit, comma separated"
+    ] = ()
+    dark_noises: Annotated[
+        float | None,
+        "95th percentile of the signal of the brightest of them, standard deviations of read noise",
+    ] = None
+
+
+@dataclass(frozen=True)
 class RepeatedLineFigures(FigureGroup):
-    """Lines that repeat the line before."""
+    """Lines that repeat the line before, or a block of lines before."""
 
     repeated_lines: Annotated[
-        int | None, "longest run of lines of a frame that are the line before, word by word"
+        int | None, "longest run of lines of a frame that are earlier lines of it, word by word"
     ] = None
     repeated_lines_sensor: Annotated[str | None, "the frame it is in"] = None
     repeated_lines_first: Annotated[int | None, "first line of the run"] = None
+    repeated_lines_source: Annotated[
+        int | None, "the line that the first one repeats: the line before, or one farther back"
+    ] = None
 
 
 @dataclass(frozen=True)

@@ -36,6 +36,9 @@ SENTENCES = (
     "rest: lines were lost or repeated in read-out. Also shifted: SU13. Check the head and its "
     "cable. Fly this exposure again.",
     "Motion blur along track; shorten the exposure, check TDI, speed, mount and crab.",
+    "60 lines of N from line 205 on repeat those from line 145 on, word by word: they were sent "
+    "twice, and the image shows other ground in one of both places. Check the head, cable and "
+    "transfer. Fly this exposure again.",
     "Tilted by 4.1 deg, 3.0 deg allowed; fly this part again, level.",
     "Columns 5 to 90, rows 7 to 80 of SU11 (or of SU12 at the same place) show other ground than "
     "the other heads although they have texture: a part of another exposure. Check the head, "
