@@ -84,12 +84,12 @@ def refuse_other_tracks(
     if not differing:
         return
     point, image, _ = differing[0]
-    has, lacks = "points3D.txt", "images.txt"
+    holder, other = "points3D.txt", "images.txt"
     if differing[0] in set(measured):
-        has, lacks = lacks, has
+        holder, other = other, holder
     raise BlockError(
-        f"{folder}: {has} has a measurement of point {point} in image {image}, which {lacks} has "
-        f"not, and {len(differing)} measurements differ in all. One file was cut or edited, or "
+        f"{folder}: {holder} has a measurement of point {point} in image {image}, which {other} "
+        f"has not, and {len(differing)} measurements differ in all. One file was cut or edited, or "
         "they are of different models: copy all files of the model again"
     )
 
