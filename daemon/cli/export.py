@@ -13,6 +13,7 @@ from daemon.cli.exit_status import exit_if_failed
 from daemon.cli.export_block import BLOCK_HELP, block
 from daemon.cli.export_gis import GIS_HELP, STAC_HELP, gis, stac
 from daemon.cli.export_gnss import RINEX_HELP, TRAJECTORY_HELP, rinex, trajectory
+from daemon.cli.export_project import PROJECT_HELP, project
 from daemon.cli.options import AsJson
 from daemon.terminal.console import Console, light_table
 from drivers.base.extras import require
@@ -70,6 +71,7 @@ def export() -> None:
 
 
 app.command("block", help=BLOCK_HELP)(block)
+app.command("project", help=PROJECT_HELP)(project)
 app.command("stac", help=STAC_HELP)(stac)
 app.command("gis", help=GIS_HELP)(gis)
 app.command("rinex", help=RINEX_HELP)(rinex)
