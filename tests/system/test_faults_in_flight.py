@@ -179,6 +179,7 @@ def test_check_prints_a_tree_of_what_is_well_and_the_cure_of_what_is_not(
     )
 
 
+@pytest.mark.trust
 def test_check_fires_one_exposure_only_where_that_is_asked_for(
     emulator: tuple[Emulator, Path],
 ) -> None:

@@ -8,6 +8,8 @@ import pytest
 
 from processing.image.balance import Balance, GainOutlier, PairBalance
 
+pytestmark = pytest.mark.trust
+
 CHAIN = (("A", "B"), ("B", "C"), ("C", "D"), ("A", "C"), ("B", "D"))
 
 

@@ -9,6 +9,8 @@ from scipy.ndimage import gaussian_filter
 from processing.image.sharpness import sharpness
 from processing.rig import find_rig
 
+pytestmark = pytest.mark.trust
+
 SENSOR = find_rig("ultracam-x-mini").master_sensors[0]
 
 

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from processing.image.line_means import line_means
 from processing.quality.block_sides import sides_of_blocks
 from processing.quality.frame_blocks import BlockEdge
 from processing.rig import find_rig
+
+pytestmark = pytest.mark.trust
 
 RIG = find_rig("ultracam-x-mini")
 SENSOR = RIG.master_sensors[0]

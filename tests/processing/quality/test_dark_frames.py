@@ -17,6 +17,8 @@ from processing.quality.report import Flag, Verdict
 from processing.radiometry.level1 import LEVEL1_FLOOR, level1_counts_per_dn
 from processing.rig import Rig, find_rig
 
+pytestmark = pytest.mark.trust
+
 RIG = find_rig("ultracam-l-mini")
 NOISE_DN = 1.5
 

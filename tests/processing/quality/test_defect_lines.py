@@ -16,6 +16,8 @@ from processing.quality.defect_lines import (
 )
 from processing.rig import find_rig
 
+pytestmark = pytest.mark.trust
+
 Array = NDArray[np.float32]
 BUNDLES, LINES, AT = 20, 120, 50
 

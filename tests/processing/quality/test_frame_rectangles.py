@@ -33,6 +33,8 @@ from processing.quality.frame_rectangles import (
 from processing.quality.ground_steps import GroundView
 from processing.rig import find_rig
 
+pytestmark = pytest.mark.trust
+
 Array = NDArray[Any]
 RIG = find_rig("ultracam-x-mini")
 SENSOR = RIG.sensor("SU11")

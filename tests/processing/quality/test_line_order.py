@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from processing.quality.line_order import MAX_RATIO, disorder, line_order_figures
 from processing.rig import Rig, find_rig
 
+pytestmark = pytest.mark.trust
+
 MINI = find_rig("ultracam-x-mini")
 PLAIN = MINI.sensor("SU00")
 BAYER = find_rig("midas-mini").sensors[0]

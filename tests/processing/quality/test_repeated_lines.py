@@ -13,6 +13,8 @@ from processing.quality.repeated_lines import (
 )
 from processing.rig import find_rig
 
+pytestmark = pytest.mark.trust
+
 MINI = find_rig("ultracam-x-mini")
 HEIGHT, WIDTH = 203, 96
 

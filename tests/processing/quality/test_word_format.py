@@ -92,6 +92,7 @@ def noise(mean: float, sigma: float) -> NDArray[np.uint16]:
     return np.asarray(np.clip(np.rint(values), 1, FULL - 1), np.uint16)
 
 
+@pytest.mark.trust
 @pytest.mark.parametrize(
     ("mask_or", "mask_and", "bits"),
     [(0, 0xFFFF, ()), (0x80, 0xFFFF, (7,)), (0, 0xFFF0, (0, 1, 2, 3)), (1, 0xFFFF, (0,))],

@@ -18,6 +18,8 @@ from daemon.onboard.service.command_execution import (
 )
 from daemon.onboard.service.messages import CommandRefused, ServiceCommand
 
+pytestmark = pytest.mark.trust
+
 
 @dataclass
 class FakeLine:
