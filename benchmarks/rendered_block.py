@@ -1,8 +1,9 @@
-"""`python -m benchmarks.rendered_block`: what matching reaches in a strip of rendered frames.
+"""`python -m benchmarks.rendered_block`: what matching reaches in a block of rendered frames.
 
-The emulator renders twenty overlapping exposures, the pipeline makes stitched images of them, tie
-points are matched between neighbours by correlation and least squares, and the strip is adjusted:
-the image residuals are those of matching and stitching, not of a random generator.
+The emulator renders overlapping exposures of one line or several, the pipeline makes stitched
+images of them, tie points are matched between all images by correlation and least squares, and the
+block is adjusted: the image residuals are those of matching and stitching, not of a random
+generator.
 """
 
 from __future__ import annotations
@@ -19,7 +20,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from benchmarks.rendered import process, radiometry_of, take, world_settings
+from benchmarks.rendered import (
+    RenderedExposure,
+    flight_and_mark,
+    process,
+    radiometry_of,
+    world_settings,
+)
 from daemon.cli.benchmark.measurement import machine
 from processing.bundle.adjust import Adjustment, AdjustmentSettings, adjust
 from processing.bundle.adjustment_results import check_point_differences, image_residuals_mm
@@ -38,23 +45,17 @@ from processing.bundle.network import (
 )
 from processing.bundle.self_calibration import SETS, SetName, parts_of, with_self_calibration
 from processing.geometry.rotation import rotations_from_vectors
-from processing.matching.patches import INTERPOLATION, match_patches, select_features
+from processing.matching.block_matching import BlockTiePoints, image_mm, match_block, rays_of
 from processing.mosaic.stitching_patterns import stitching_patterns
 from processing.pipelines.stitched import Pipeline, PipelineSettings
-from processing.rig import VirtualImage
-from sim_hw.world import true_camera
+from sim_hw.world import snapshots, true_camera
+from sim_hw.world.post_processed_trajectory import marks_of_lines
 from sim_hw.world.scene import open_scene
 from sim_hw.world.snapshots import RigElectronics
 from sim_hw.world.world import World
 
 Array = NDArray[np.float64]
 
-CELLS = (26, 18)
-WINDOW_PX = 19
-SEARCH_PX = 14
-MIN_CORRELATION = 0.9
-MIN_PEAK_MARGIN = 0.1
-MAX_SIGMA_PX = 0.1
 GNSS_M = 0.05
 INERTIAL_RAD = 8e-5
 SURVEY_M = 0.02
@@ -64,7 +65,7 @@ JOINT_EVERY = 5
 
 
 @dataclass(frozen=True)
-class RenderedStrip:
+class RenderedBlock:
     """Stitched images (H, W) float32, NaN without data; where the ideal camera truly stood; the
     patterns that stitching may have left in each image."""
 
@@ -75,145 +76,62 @@ class RenderedStrip:
     patterns: tuple[FramePatterns, ...]
 
 
-@dataclass(frozen=True)
-class Matched:
-    """Image points: image, point, (n, 2) px; the point's own image and place, (p,) and (p, 2)."""
-
-    image: NDArray[np.int64]
-    point: NDArray[np.int64]
-    px: Array
-    source_image: NDArray[np.int64]
-    source_px: Array
-
-
-def rendered_strip(rig: str, frames: int, seed: int, scenes: Path) -> RenderedStrip:
-    """Fly, expose and stitch."""
+def rendered_block(rig: str, frames: int, lines: int, seed: int, scenes: Path) -> RenderedBlock:
+    """Fly lines there and back, expose and stitch."""
     world = World(world_settings(rig, seed, exposures=frames))
     scene = open_scene(world.scene_settings, scenes)
     heads = RigElectronics(world, seed=seed)
     pipeline = Pipeline(world.rig, radiometry_of(heads), PipelineSettings(geometry=False))
     images, station, rotation, patterns = [], [], [], []
     master = world.rig.cone(world.rig.master_cone)
-    for k in range(frames):
-        exposure = take(world, scenes, place=k, scene=scene)
+    flight, first_ns = flight_and_mark(world, 0)
+    for k, mark_ns in enumerate(marks_of_lines(world, flight, first_ns, frames, lines)):
+        exposure = RenderedExposure(world, flight, snapshots.take(world, scene, flight, mark_ns))
         product = process(pipeline, heads, exposure, seed=seed * 1000 + k)
         pan = product.pan
         images.append(np.where(pan == 0, np.nan, pan).astype(np.float32))
         patterns.append(stitching_patterns(world.rig, product.mosaic))
-        pose = exposure.flight.pose(exposure.snapshot.mark_gps_ns)
+        pose = flight.pose(mark_ns)
         station.append(true_camera.projection_centre_m(master, pose))
         rotation.append(pose.enu_from_body @ true_camera.BODY_FROM_CAMERA)
-    return RenderedStrip(world, images, np.array(station), np.array(rotation), tuple(patterns))
+    return RenderedBlock(world, images, np.array(station), np.array(rotation), tuple(patterns))
 
 
-def match_strip(strip: RenderedStrip, start_station: Array, start_rotation: Array) -> Matched:
-    """Feature-rich places of every image, found in the next two by prediction and matching."""
-    image = strip.world.image
-    margin_px = WINDOW_PX // 2 + SEARCH_PX + 8
-    columns = np.linspace(margin_px, image.width_px - margin_px, CELLS[0] + 1).astype(np.int64)
-    rows = np.linspace(margin_px, image.height_px - margin_px, CELLS[1] + 1).astype(np.int64)
-    cells = np.array(
-        [
-            (columns[c], columns[c + 1] - 1, rows[r], rows[r + 1] - 1)
-            for r in range(CELLS[1])
-            for c in range(CELLS[0])
-        ]
-    )
-    limits = np.array([0, image.width_px - 1, 0, image.height_px - 1], dtype=np.int64)
-    found_image: list[NDArray[np.int64]] = []
-    found_point: list[NDArray[np.int64]] = []
-    found_px: list[Array] = []
-    source_image: list[NDArray[np.int64]] = []
-    source_px: list[Array] = []
-    count = 0
-    for k in range(len(strip.images) - 1):
-        chosen = select_features(strip.images[k], cells, WINDOW_PX // 2, 2, False)
-        places = np.round(chosen[chosen[:, 2] > 0.0][:, :2]).astype(np.int64)
-        ground = _level(image, start_station[k], start_rotation[k], places.astype(np.float64))
-        seen = np.zeros(len(places), dtype=np.int64)
-        rays: list[tuple[NDArray[np.int64], int, Array]] = []
-        for j in range(k + 1, min(k + 3, len(strip.images))):
-            predicted = _pixels(image, start_station[j], start_rotation[j], ground)
-            inside = (
-                (predicted > margin_px)
-                & (predicted < [image.width_px - margin_px, image.height_px - margin_px])
-            ).all(axis=1)
-            search = np.flatnonzero(inside)
-            if not len(search):
-                continue
-            result = match_patches(
-                strip.images[k],
-                strip.images[j],
-                places[search],
-                np.round(predicted[search]).astype(np.int64),
-                limits,
-                1,
-                WINDOW_PX // 2,
-                SEARCH_PX,
-                False,
-                INTERPOLATION,
-            )
-            good = (
-                (result[:, 7] > 0.0)
-                & (result[:, 4] <= MAX_SIGMA_PX)
-                & (result[:, 5] >= MIN_CORRELATION)
-                & (result[:, 6] >= MIN_PEAK_MARGIN)
-            )
-            own = search[good]
-            # Both places moved by a fraction of a pixel; what counts is where the chosen pixel is.
-            at = result[good, 2:4] - (result[good, :2] - places[own])
-            rays.append((own, j, at))
-            seen[own] += 1
-        used = np.flatnonzero(seen > 0)
-        number = np.full(len(places), -1, dtype=np.int64)
-        number[used] = count + np.arange(len(used))
-        count += len(used)
-        found_image.append(np.full(len(used), k))
-        found_point.append(number[used])
-        found_px.append(places[used].astype(np.float64))
-        source_image.append(np.full(len(used), k))
-        source_px.append(places[used].astype(np.float64))
-        for own, j, at in rays:
-            found_image.append(np.full(len(own), j))
-            found_point.append(number[own])
-            found_px.append(at)
-    return Matched(
-        np.concatenate(found_image).astype(np.int64),
-        np.concatenate(found_point).astype(np.int64),
-        np.concatenate(found_px),
-        np.concatenate(source_image).astype(np.int64),
-        np.concatenate(source_px),
-    )
+def match_images(block: RenderedBlock, station: Array, rotation: Array) -> BlockTiePoints:
+    """Tie points of all images, predicted by navigation and level ground."""
+    return match_block(lambda k: block.images[k], block.world.image, station, rotation, 0.0)
 
 
-def simulate_navigation(strip: RenderedStrip, seed: int) -> tuple[Array, Array]:
+def simulate_navigation(block: RenderedBlock, seed: int) -> tuple[Array, Array]:
     """Projection centres and rotations as receiver and inertial unit have them."""
     random = np.random.default_rng([seed, 3])
-    n = len(strip.station)
-    station = strip.station + random.normal(0.0, GNSS_M, (n, 3))
-    return station, strip.rotation @ rotations_from_vectors(
+    n = len(block.station)
+    station = block.station + random.normal(0.0, GNSS_M, (n, 3))
+    return station, block.rotation @ rotations_from_vectors(
         random.normal(0.0, INERTIAL_RAD, (n, 3))
     )
 
 
 def evaluate(
-    strip: RenderedStrip, seed: int, found: Matched, name: SetName, *, patterns: bool = False
+    block: RenderedBlock, seed: int, found: BlockTiePoints, name: SetName, *, patterns: bool = False
 ) -> dict[str, Any]:
     """Adjust with a set of additional parameters, or patterns of stitching, and hold against the
     truth."""
     random = np.random.default_rng([seed, 4])
-    image, n = strip.world.image, len(strip.station)
-    rig = strip.world.rig
-    gnss, inertial = simulate_navigation(strip, seed)
+    image, n = block.world.image, len(block.station)
+    rig = block.world.rig
+    gnss, inertial = simulate_navigation(block, seed)
+    # An image point's first row is that of the image whose feature was matched.
+    _, source = np.unique(found.point, return_index=True)
     truth = np.array(
         [
-            strip.world.terrain.intersect(
-                strip.station[h], _directions(image, strip.rotation[h], px[None])[0]
+            block.world.terrain.intersect(
+                block.station[h], rays_of(image, block.rotation[h], px[None])[0]
             )
-            for h, px in zip(found.source_image, found.source_px, strict=True)
+            for h, px in zip(found.image[source], found.px[source], strict=True)
         ]
     )
-    xy = _mm(image, found.px)
+    xy = image_mm(image, found.px)
     ray = np.column_stack([xy, np.full(len(xy), -image.f_mm)])
     directions = np.einsum("nij,nj->ni", inertial[found.image], ray)
     xyz, _ = intersect(len(truth), found.point, gnss[found.image], directions)
@@ -252,7 +170,7 @@ def evaluate(
             time_s=np.zeros(n),
         ),
         measured_attitudes=MeasuredAttitudes(index, inertial, np.full((n, 3), INERTIAL_RAD)),
-        patterns=strip.patterns if patterns else (),
+        patterns=block.patterns if patterns else (),
     )
     checks = np.setdiff1d(np.flatnonzero(rays >= 3), control)
     retained = checks[::JOINT_EVERY]
@@ -315,55 +233,22 @@ def joint_heights(result: Adjustment, points: NDArray[np.int64], truth: Array) -
     return float(error @ np.linalg.solve(covariance, error)), len(points)
 
 
-def _mm(image: VirtualImage, px: Array) -> Array:
-    return np.stack(
-        [
-            (px[:, 0] - (image.width_px - 1) / 2.0) * image.pitch_mm,
-            ((image.height_px - 1) / 2.0 - px[:, 1]) * image.pitch_mm,
-        ],
-        axis=1,
-    )
-
-
-def _directions(image: VirtualImage, rotation: Array, px: Array) -> Array:
-    xy = _mm(image, px)
-    return np.asarray(np.column_stack([xy, np.full(len(xy), -image.f_mm)]) @ rotation.T)
-
-
-def _level(image: VirtualImage, station: Array, rotation: Array, px: Array) -> Array:
-    """Where rays of pixels meet level ground at height zero."""
-    rays = _directions(image, rotation, px)
-    return np.asarray(station - rays * (station[2] / rays[:, 2:]))
-
-
-def _pixels(image: VirtualImage, station: Array, rotation: Array, ground: Array) -> Array:
-    seen = (ground - station) @ rotation
-    xy = -image.f_mm * seen[:, :2] / seen[:, 2:]
-    return np.stack(
-        [
-            xy[:, 0] / image.pitch_mm + (image.width_px - 1) / 2.0,
-            (image.height_px - 1) / 2.0 - xy[:, 1] / image.pitch_mm,
-        ],
-        axis=1,
-    )
-
-
-def compare_patterns(rig: str, frames: int, first: int, strips: int) -> None:
-    """Print heights of several strips without and with the patterns of stitching."""
+def compare_patterns(rig: str, frames: int, lines: int, first: int, blocks: int) -> None:
+    """Print heights of several blocks without and with the patterns of stitching."""
     total = {False: [0.0, 0], True: [0.0, 0]}
-    for seed in range(first, first + strips):
+    for seed in range(first, first + blocks):
         with tempfile.TemporaryDirectory(prefix="syntopic-bench-") as folder:
-            strip = rendered_strip(rig, frames, seed, Path(folder))
-            found = match_strip(strip, *simulate_navigation(strip, seed))
+            block = rendered_block(rig, frames, lines, seed, Path(folder))
+        found = match_images(block, *simulate_navigation(block, seed))
         for patterns in (False, True):
-            f = evaluate(strip, seed, found, "none", patterns=patterns)
+            f = evaluate(block, seed, found, "none", patterns=patterns)
             total[patterns][0] += f["joint_height_squares"]
             total[patterns][1] += f["joint_heights"]
             rms = " ".join(f"{v * 100:.2f}" for v in f["check_rms_m"])
             predicted = " ".join(f"{v * 100:.2f}" for v in f["check_predicted_m"])
             ratio = f["joint_height_squares"] / f["joint_heights"]
             print(
-                f"strip {seed} {'with' if patterns else 'without'} patterns: against truth {rms} "
+                f"block {seed} {'with' if patterns else 'without'} patterns: against truth {rms} "
                 f"cm, predicted {predicted} cm, squares {f['check_squares']:.2f}, joint heights "
                 f"{ratio:.2f}; {f['adjusting_s']:.1f} s",
                 flush=True,
@@ -380,22 +265,28 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.rendered_block", description=__doc__
     )
-    parser.add_argument("--rig", default="ultracam-l-mini")
-    parser.add_argument("--frames", type=int, default=20)
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--strips", type=int, help="strips with and without patterns of stitching")
-    parser.add_argument("--scenes", type=Path, default=None, help="folder where scenes are kept")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    add = parser.add_argument
+    add("--rig", default="ultracam-l-mini")
+    add("--frames", type=int, default=20, help="of each line")
+    add("--lines", type=int, default=1, help="there and back, 30 %% apart in overlap")
+    add("--seed", type=int, default=1)
+    add("--blocks", type=int, help="blocks with and without patterns of stitching")
+    add("--scenes", type=Path, default=None, help="folder where scenes are kept")
+    add("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args()
-    if options.strips is not None:
-        compare_patterns(options.rig, options.frames, options.seed, options.strips)
+    if options.blocks is not None:
+        compare_patterns(options.rig, options.frames, options.lines, options.seed, options.blocks)
         return
     with tempfile.TemporaryDirectory(prefix="syntopic-bench-") as folder:
-        strip = rendered_strip(
-            options.rig, options.frames, options.seed, options.scenes or Path(folder)
+        block = rendered_block(
+            options.rig,
+            options.frames,
+            options.lines,
+            options.seed,
+            options.scenes or Path(folder),
         )
-        found = match_strip(strip, *simulate_navigation(strip, options.seed))
-        sets = {name: evaluate(strip, options.seed, found, name) for name in SETS}
+        found = match_images(block, *simulate_navigation(block, options.seed))
+        sets = {name: evaluate(block, options.seed, found, name) for name in SETS}
     if options.json:
         print(json.dumps({"machine": machine(), "rig": options.rig, "sets": sets}))
         return
