@@ -17,10 +17,8 @@ setup: .venv/ready .venv/kernels
 	@PYTHON=$(PYTHON) sh bootstrap.sh
 	@touch $@
 
-# The compiler's cache looks at a kernel's own file only, not at those of the kernels it calls.
 .venv/kernels: .venv/ready $(wildcard processing/*.py processing/*/*.py processing/*/*/*.py) \
 		processing/pipelines/kernel_variants.toml
-	@find processing -name "*.nb[ic]" -delete
 	@echo "[5/5] Compiled kernels ..."
 	@$(BIN)/syntopic kernels
 	@touch $@

@@ -311,10 +311,10 @@ def _run(step: InstallationStep) -> str:
 
 
 def _remove_kernels(cache: Path) -> None:
-    """Only files of the compiler's cache: index (.nbi) and data (.nbc)."""
+    """Only files of the compiler's cache: index (.nbi) and data (.nbc), also half written."""
     for folder, _, names in os.walk(cache, topdown=False):
         for name in names:
-            if name.endswith((".nbi", ".nbc")):
+            if name.removesuffix(".part").endswith((".nbi", ".nbc")):
                 (Path(folder) / name).unlink()
         if Path(folder) != cache:
             _remove_if_empty(Path(folder))

@@ -8,11 +8,15 @@ other pixels, by last bits, depending on the order of compilation (numba 0.62, `
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from collections.abc import Set as AbstractSet
 from typing import Any
 
 # Here and nowhere else.
 from numba import njit
+from numba.core.dispatcher import Dispatcher
+
+from processing.image.kernel_cache import KernelCache
 
 
 def compiled_kernel(
@@ -37,4 +41,12 @@ def compiled_kernel(
         def twice(x):
             return 2.0 * x
     """
-    return njit(cache=True, nogil=True, fastmath=fastmath, error_model=error_model, **options)
+    compiled = njit(nogil=True, fastmath=fastmath, error_model=error_model, **options)
+
+    def decorated(function: Callable[..., Any]) -> Any:
+        kernel = compiled(function)
+        if isinstance(kernel, Dispatcher):  # not with NUMBA_DISABLE_JIT=1
+            kernel._cache = KernelCache(kernel)  # type: ignore[attr-defined]
+        return kernel
+
+    return decorated

@@ -13,13 +13,13 @@ import re
 import signal
 import time
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from multiprocessing import connection
 from pathlib import Path
 from typing import Any, Final
 
-from numba.core import caching, sigutils
+from numba.core import sigutils
 from numba.core.dispatcher import Dispatcher
 
 from processing import ProcessingError
@@ -98,17 +98,17 @@ def recorded_variants(path: Path = VARIANTS_FILE) -> dict[str, KernelVariants]:
     }
 
 
-def _is_cached(kernel: Any, arguments: tuple[Any, ...]) -> bool:
-    """Whether the cache on disk holds a variant; nothing is loaded."""
-    cache = kernel._cache
-    key = cache._index_key(arguments, kernel.targetctx.codegen())
-    return key in cache._cache_file._load_index()
+def _is_cached(kernel: Any, signatures: Sequence[str]) -> bool:
+    """Whether the cache on disk holds variants of the present code, undamaged."""
+    variants = [argument_types(text) for text in signatures]
+    holds: bool = kernel._cache.holds(variants, kernel.targetctx.codegen())
+    return holds
 
 
 def missing_variants(
     kernels: Mapping[str, Any], table: Mapping[str, KernelVariants]
 ) -> dict[str, KernelVariants]:
-    """Kernels of which the cache does not hold every recorded variant.
+    """Kernels of which the cache does not hold every recorded variant, current and undamaged.
 
     Args:
         kernels: dispatchers by "module.function".
@@ -120,8 +120,7 @@ def missing_variants(
     return {
         name: entry
         for name, entry in table.items()
-        if name in kernels
-        and not all(_is_cached(kernels[name], argument_types(s)) for s in entry.signatures)
+        if name in kernels and not _is_cached(kernels[name], entry.signatures)
     }
 
 
@@ -149,6 +148,8 @@ def compile_recorded(
     missing = missing_variants(kernels, recorded_variants() if table is None else table)
     if not missing:
         return 0
+    for kernel in kernels.values():
+        kernel._cache.remove_unused()
     callees = {name: _callees(kernels, name) & missing.keys() for name in missing}
     chains = _longest_chains(missing, callees)
     total_s = sum(entry.seconds for entry in missing.values())
@@ -201,14 +202,13 @@ class _Pool:
 
     def __init__(self, processes: int) -> None:
         context = multiprocessing.get_context("spawn")
-        self._lock = context.Lock()
         self.idle: list[connection.Connection] = []
         self._busy: dict[connection.Connection, tuple[str, float]] = {}
         self._processes = []
         for number in range(processes):
             ours, theirs = context.Pipe()
             process = context.Process(
-                target=_serve, args=(theirs, self._lock), name=f"compiler-{number}", daemon=True
+                target=_serve, args=(theirs,), name=f"compiler-{number}", daemon=True
             )
             process.start()
             theirs.close()
@@ -257,12 +257,11 @@ class _Pool:
         return name, answer
 
 
-def _serve(requests: connection.Connection, lock: Any) -> None:
+def _serve(requests: connection.Connection) -> None:
     """Compile what is requested until the other end is closed."""
     from processing.pipelines.kernel_compilation import kernels
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    _save_one_at_a_time(lock)
     found = kernels()
     while True:
         try:
@@ -277,15 +276,8 @@ def _serve(requests: connection.Connection, lock: Any) -> None:
         except Exception as error:  # noqa: BLE001 - named with its kernel by the other side
             requests.send(f"{type(error).__name__}: {error}")
             continue
+        if not _is_cached(kernel, signatures):
+            folder = kernel._cache.cache_path
+            requests.send(f"{folder} could not be written; check the free space and its owner")
+            continue
         requests.send(sum(kernel.stats.cache_misses.values()) - before)
-
-
-def _save_one_at_a_time(lock: Any) -> None:
-    """Guard the cache's index: numba reads, changes and writes it without a lock."""
-    save = caching.Cache.save_overload
-
-    def guarded(cache: Any, signature: Any, data: Any) -> None:
-        with lock:
-            save(cache, signature, data)
-
-    caching.Cache.save_overload = guarded

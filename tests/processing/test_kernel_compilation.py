@@ -142,10 +142,28 @@ for name in own:
 
 
 def test_a_process_loads_what_another_compiled_for_it(tmp_path: Path) -> None:
+    """Also what another process had to compile again because it was damaged."""
     script = MISSING.replace("{NAMES}", str([ORTHOGONALISE, DOT]))
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
     for _ in range(2):
         subprocess.run([sys.executable, "-c", script], env=environment, timeout=110, check=True)
+        (dot,) = (tmp_path / "cache").rglob("least_squares._dot*.1.nbc")
+        dot.write_bytes(dot.read_bytes()[:-100])
+
+
+def test_kernels_that_cannot_be_stored_are_reported_with_their_folder(tmp_path: Path) -> None:
+    script = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (2048, 2048))\n"
+    script += MISSING.replace("{NAMES}", str([DOT]))
+    done = subprocess.run(
+        [sys.executable, "-c", script],
+        env=os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")},
+        capture_output=True,
+        text=True,
+        timeout=110,
+    )
+    expected = f"{DOT} cannot be compiled: {tmp_path / 'cache'}/matching_"
+    assert "KernelCompilationError: " in done.stderr and expected in done.stderr
+    assert "could not be written; check the free space and its owner" in done.stderr
 
 
 @pytest.mark.parametrize(

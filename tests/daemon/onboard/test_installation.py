@@ -140,8 +140,8 @@ def test_uninstalling_removes_what_was_brought_and_nothing_else(tmp_path: Path) 
     rules.write_text("# mine\n")
     mission = tmp_path / "var/lib/syntopic/flight/mission.json"
     kernel = tmp_path / "var/cache/syntopic/level1_1/correct.py311.nbi"
-    for path in (mission, kernel):
-        path.parent.mkdir(parents=True)
+    for path in (mission, kernel, kernel.with_name(f"{kernel.name}.part")):
+        path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text("x")
     done = uninstall(root=tmp_path, log=ignore)
     assert done.retained == [str(TARGETS["udev.rules"])]
