@@ -1,7 +1,7 @@
 """Exposure times of frames: the common one of comparable frames, and factors that bring signals to
 it.
 
-Also names the frames whose exposure time is not known. The signal itself is scaled in
+Also names the frames whose exposure time is not known or cannot be. The signal itself is scaled in
 `processing.radiometry.level1`.
 """
 
@@ -12,12 +12,54 @@ import statistics
 from collections.abc import Collection, Mapping
 
 from processing.geometry.conditions import by_sensor_name
-from processing.quality.figures.circumstances import ExposureScaleFigures, UnknownExposureFigures
+from processing.quality.figures.circumstances import (
+    ExposureScaleFigures,
+    UnknownExposureFigures,
+)
 from processing.rig import Rig
 
 EXPOSURE_TIME_TOLERANCE = 0.02
 """Exposure times of cones that differ by less are those of one setting."""
 MAX_EXPOSURE_SCALE = 2.05
+PLAUSIBLE_EXPOSURE_TIMES_S = (1e-6, 10.0)
+MAX_EXPOSURE_RATIO = 16.0
+"""Four stops: heads of one kind that are set further apart do not see the same ground."""
+
+
+def implausible_exposure_times(rig: Rig, exposure_time_s: Mapping[str, float]) -> tuple[str, ...]:
+    """Frames whose exposure time cannot be: the record or the head is wrong.
+
+    Outside `PLAUSIBLE_EXPOSURE_TIMES_S`, or, of three or more PAN or colour frames, more than
+    `MAX_EXPOSURE_RATIO` times as long or short as their median.
+
+    Args:
+        rig: the camera.
+        exposure_time_s: by sensor name.
+
+    Returns:
+        Names of the sensors, in the order of the rig.
+
+    Example:
+        >>> from processing.rig import find_rig
+        >>> rig = find_rig("ultracam-x-mini")
+        >>> times_s = {sensor.name: 0.002 for sensor in rig.sensors}
+        >>> implausible_exposure_times(rig, times_s | {"SU10": 1e-8, "R": 0.05})
+        ('SU10', 'R')
+    """
+    shortest_s, longest_s = PLAUSIBLE_EXPOSURE_TIMES_S
+    possible = {n: t for n, t in exposure_time_s.items() if shortest_s <= t <= longest_s}
+    implausible = exposure_time_s.keys() - possible.keys()
+    for cones in (rig.pan_cones, rig.colour_cones):
+        known = {n: t for cone in cones for n, t in by_sensor_name(cone, possible).items()}
+        if len(known) < 3:
+            continue
+        usual = statistics.median_low(known.values())
+        implausible |= {
+            name
+            for name, time_s in known.items()
+            if max(time_s / usual, usual / time_s) > MAX_EXPOSURE_RATIO
+        }
+    return tuple(sensor.name for sensor in rig.sensors if sensor.name in implausible)
 
 
 def reference_exposure_times(rig: Rig, exposure_times: Mapping[str, float]) -> dict[str, float]:
@@ -25,7 +67,8 @@ def reference_exposure_times(rig: Rig, exposure_times: Mapping[str, float]) -> d
 
     The median of its cone where that is the median of all PAN cones, or of all colour cones, to
     within `EXPOSURE_TIME_TOLERANCE`; else the median of those. A cone exposed less than half as
-    long keeps its own: its highlights would leave the range of words.
+    long keeps its own: its highlights would leave the range of words. Of two frames in the middle
+    of a cone that nearer to the median of the cones counts.
 
     Args:
         rig: the camera.
@@ -45,7 +88,13 @@ def reference_exposure_times(rig: Rig, exposure_times: Mapping[str, float]) -> d
             continue
         usual = statistics.median_low(of_cones.values())
         for cone in cones:
-            own = of_cones.get(cone.name, usual)
+            own = usual
+            if known := by_sensor_name(cone, exposure_times):
+                middle = (
+                    statistics.median_low(known.values()),
+                    statistics.median_high(known.values()),
+                )
+                own = min(middle, key=lambda time: abs(math.log(time / usual)))
             is_unscaled = (
                 abs(own / usual - 1.0) <= EXPOSURE_TIME_TOLERANCE
                 or own < usual / MAX_EXPOSURE_SCALE

@@ -10,7 +10,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Generic, TypeVar
 
 import cv2
@@ -24,10 +24,12 @@ from processing.geometry.conditions import (
     condition_figures,
     usable_temperatures,
 )
+from processing.geometry.exposure_times import implausible_exposure_times
 from processing.image.accelerator.devices import DEFAULT_DEVICE, Device
 from processing.image.accelerator.pixel_kernels import PixelKernels, pixel_kernels
 from processing.quality.evaluation import evaluate
 from processing.quality.figures import FigureGroup, QualityFigures
+from processing.quality.figures.circumstances import ImplausibleExposureFigures
 from processing.quality.figures.stitching import MethodFigures
 from processing.quality.report import NO_FLAGS, Flag, QualityReport, Thresholds
 from processing.quality.requirements import QualityRequirements
@@ -81,7 +83,8 @@ class Stopwatch:
 class ExposureInput:
     """Everything one exposure is computed from, and the clock of its stages.
 
-    `frames` are Level-0 by sensor name, (h, w) uint16.
+    `frames` are Level-0 by sensor name, (h, w) uint16. `implausible_exposures` names the frames
+    whose exposure time cannot be; `conditions` have none of them.
     """
 
     frames: Mapping[str, Array]
@@ -89,6 +92,7 @@ class ExposureInput:
     temperatures: UsableTemperatures
     clock: Stopwatch = field(default_factory=Stopwatch)
     kernels: PixelKernels = field(default_factory=lambda: pixel_kernels(DEFAULT_DEVICE))
+    implausible_exposures: tuple[str, ...] = ()
 
     def correct(
         self,
@@ -217,7 +221,18 @@ class ExposurePipeline(ABC, Generic[SettingsT, CorrectedT, AdjustedT, ImageT, Pr
     def _read(self, frames: Mapping[str, Array], conditions: Conditions) -> ExposureInput:
         """What is known of the exposure."""
         temperatures = usable_temperatures(self.rig, conditions, self.settings.thresholds)
-        return ExposureInput(frames, conditions, temperatures, kernels=self.kernels)
+        times_s = conditions.exposure_time_s
+        implausible = implausible_exposure_times(self.rig, times_s)
+        if implausible:
+            known_s = {name: time_s for name, time_s in times_s.items() if name not in implausible}
+            conditions = replace(conditions, exposure_time_s=known_s)
+        return ExposureInput(
+            frames,
+            conditions,
+            temperatures,
+            kernels=self.kernels,
+            implausible_exposures=implausible,
+        )
 
     @abstractmethod
     def _correct(self, exposure: ExposureInput) -> CorrectedT:
@@ -245,6 +260,7 @@ class ExposurePipeline(ABC, Generic[SettingsT, CorrectedT, AdjustedT, ImageT, Pr
             MethodFigures(judgement.method, missing),
             *condition_figures(self.rig, conditions, temperatures),
             *judgement.figures,
+            ImplausibleExposureFigures(exposure.implausible_exposures),
             valid_area_figures(judgement.valid_area),
         )
         return evaluate(

@@ -125,7 +125,8 @@ def figures_of(
     level1, start, stitching = corrected.level1, corrected.start, adjusted.stitching
     tie_points, mosaic = stitching.tie_points, stitching.image
     yield exposure_scale_figures(exposure_scales(rig, conditions.exposure_time_s))
-    yield unknown_exposure_figures(rig, level1.keys(), conditions.exposure_time_s)
+    others = level1.keys() - set(stages.exposure.implausible_exposures)
+    yield unknown_exposure_figures(rig, others, conditions.exposure_time_s)
     yield from corrected.figures
     exposed = {
         s.name: exposed_rows(s, start[s.name].tdi_shifts) for s in rig.sensors if s.name in start

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from processing.quality.figures import QualityFigures
 from processing.quality.figures.circumstances import (
     ExposureScaleFigures,
+    ImplausibleExposureFigures,
     SmearFigures,
     UnknownExposureFigures,
 )
@@ -436,6 +437,17 @@ def exposure_findings(figures: QualityFigures, thresholds: Thresholds) -> list[F
                 f"The record states no exposure time of {unknown}: the colour balance is not "
                 "verified, and one exposure cannot show it. Enter exposure_time_us in the record "
                 "and process it again, or compare colours on the ground.",
+            )
+        )
+    implausible = ", ".join(figures.of(ImplausibleExposureFigures).exposure_implausible_sensors)
+    if implausible:
+        findings.append(
+            Finding(
+                Flag.UNDEREXPOSED,
+                Verdict.USABLE,
+                f"The record states an impossible exposure time of {implausible}: it is not used, "
+                "and their levels are not verified. Correct exposure_time_us in the record and "
+                "process it again; check the head.",
             )
         )
     corrected = figures.of(ExposureScaleFigures)

@@ -290,6 +290,13 @@ def exposed_rows(sensor: Sensor, tdi_shifts: int) -> tuple[int, int]:
     return 0, sensor.height_px - 1 - shifts
 
 
+@compiled_kernel(fastmath=_MATHEMATICS, inline="always")
+def _halved_word(signal):
+    """Half a word, rounded, within its range; limited first, since int32 has no place for all."""
+    limited = min(max(signal + np.float32(0.5), np.float32(1.0)), np.float32(32767.0))
+    return np.int32(limited)
+
+
 @compiled_kernel(parallel=True, fastmath=_MATHEMATICS)
 def _flat_pass(
     raw, offset, factor, full_scale, least, first_row, out, sums, by_row, by_column, unclean
@@ -317,8 +324,7 @@ def _flat_pass(
             row_saturated = np.int32(0)
             for k in range(width):
                 dn = np.int32(source[k])
-                half = np.int32((np.float32(dn) - offset) * factor + np.float32(0.5))
-                half = min(max(half, np.int32(1)), np.int32(32767))
+                half = _halved_word((np.float32(dn) - offset) * factor)
                 full = np.int32((dn >= ceiling) | (half >= 32767))
                 target[k] = np.uint16(2 * half + full)
                 row_total = np.int32(row_total + half)
@@ -403,8 +409,7 @@ def _map_pass(
                 offset = base + np.float32(bias_row[k]) * bias_unit
                 offset += np.float32(darkness) * dark_unit
                 signal = (np.float32(dn) - offset) * (factor / np.float32(responses))
-                half = np.int32(signal + np.float32(0.5))
-                half = min(max(half, np.int32(1)), np.int32(32767))
+                half = _halved_word(signal)
                 full = np.int32((dn >= ceiling) | (half >= 32767))
                 target[k] = np.uint16(2 * half + full)
                 row_total = np.int32(row_total + half)

@@ -17,6 +17,7 @@ from processing.geometry.conditions import (
 from processing.geometry.exposure_times import (
     exposure_scale_figures,
     exposure_scales,
+    implausible_exposure_times,
     reference_exposure_times,
 )
 from processing.geometry.placement import nominal_placements
@@ -131,6 +132,33 @@ def test_the_frames_of_a_cone_are_brought_to_its_median_exposure_time() -> None:
     assert {name for name, scale in scales.items() if scale != 1.0} == {"SU01"}
     assert "SU30" not in exposure_scales(rig, {"SU01": 0.002})
     assert exposure_scales(rig, {"SU00": 0.004, "SU01": 0.002})["SU00"] == 0.5
+
+
+def test_of_two_frames_of_a_cone_the_usual_one_is_the_measure() -> None:
+    rig = find_rig("ultracam-x-mini")
+    usual_s = {sensor.name: 0.004 for sensor in rig.sensors}
+    assert [s.name for s in rig.pan_cones[1].sensors] == ["SU10", "SU11"]
+    for time_s in (0.0005, 0.032):
+        for name in ("SU10", "SU11"):
+            scales = exposure_scales(rig, usual_s | {name: time_s})
+            assert {n: s for n, s in scales.items() if s != 1.0} == {name: 0.004 / time_s}
+
+
+def test_exposure_times_that_cannot_be_are_named() -> None:
+    rig = find_rig("ultracam-x-mini")
+    usual_s = {sensor.name: 0.002 for sensor in rig.sensors}
+    assert implausible_exposure_times(rig, {}) == ()
+    assert implausible_exposure_times(rig, usual_s) == ()
+    for time_s in (1e-8, 0.0, -0.002, math.nan, math.inf, 10.1, 0.002 / 16.1, 0.002 * 16.1):
+        assert implausible_exposure_times(rig, usual_s | {"SU10": time_s}) == ("SU10",)
+        assert implausible_exposure_times(rig, usual_s | {"G": time_s}) == ("G",)
+    for time_s in (0.002 / 15.9, 0.002 * 15.9):
+        assert implausible_exposure_times(rig, usual_s | {"SU10": time_s, "R": time_s}) == ()
+    # PAN and colour differ as they like; of two frames neither is known to be wrong.
+    colour_s = {name: 0.1 if name in "RGBN" else time_s for name, time_s in usual_s.items()}
+    assert implausible_exposure_times(rig, colour_s) == ()
+    assert implausible_exposure_times(rig, {"SU10": 0.002, "SU11": 0.1}) == ()
+    assert implausible_exposure_times(rig, {"SU10": 0.002, "SU11": 1e-7}) == ("SU11",)
 
 
 def test_cones_are_brought_to_the_exposure_time_of_their_kind() -> None:

@@ -237,6 +237,25 @@ def test_residuals_are_reported_as_numbers(rig: Rig, product: Product) -> None:
     assert len(json.dumps(vector_data)) < 40_000
 
 
+def test_an_exposure_time_that_cannot_be_is_named_and_changes_no_other_frame(
+    rig: Rig, pipeline: Pipeline, exposure: Exposure, product: Product
+) -> None:
+    usual = conditions(rig, exposure)
+    planted = replace(usual, exposure_time_s={**usual.exposure_time_s, "SU10": 1e-8, "N": 100.0})
+    found = pipeline.process(exposure.frames, planted)
+    figures = found.report.figures.as_json()
+    assert figures["exposure_implausible_sensors"] == "SU10, N"
+    assert figures["exposure_unknown_sensors"] is None
+    assert found.report.flags == product.report.flags | Flag.UNDEREXPOSED
+    assert "an impossible exposure time of SU10, N: it is not used" in " ".join(
+        finding.sentence for finding in found.report.findings
+    )
+    both = (found.pan > 0) & (product.pan > 0)
+    assert np.count_nonzero(both) == np.count_nonzero(product.pan > 0)
+    change = found.pan[both] / product.pan[both]
+    assert np.quantile(np.abs(change - 1.0), 0.999) < 0.01
+
+
 def test_nothing_compiles_after_the_warm_up(
     rig: Rig, pipeline: Pipeline, exposure: Exposure
 ) -> None:

@@ -123,6 +123,17 @@ class UnknownExposureFigures(FigureGroup):
 
 
 @dataclass(frozen=True)
+class ImplausibleExposureFigures(FigureGroup):
+    """Exposure times that cannot be."""
+
+    exposure_implausible_sensors: Annotated[
+        Names,
+        "frames whose exposure time in the record cannot be and was taken as unknown, comma "
+        "separated",
+    ] = ()
+
+
+@dataclass(frozen=True)
 class ExposureScaleFigures(FigureGroup):
     """Levels corrected for an exposure time of their own."""
 

@@ -108,6 +108,8 @@ def radiometry() -> dict[str, Differences]:
             (71, 67, 1, 5, SUBTLE),
             (67, 33, -1, 3, 0.7),
             (33, 31, 1, 40, 1.0),
+            (35, 29, 1, 2, 2e5),
+            (34, 29, 1, 0, 1e12),
         )
     ]
     for maps, height, width, row_sign, shifts, scale in cases:

@@ -166,6 +166,28 @@ def test_saturation_is_marked_before_the_gain_hides_it(sensor: Sensor) -> None:
     assert statistics.mean_dn == pytest.approx(0.8 * (1000 - 64), rel=1e-3)
 
 
+@pytest.mark.parametrize("flat", [True, False])
+@pytest.mark.parametrize("scale", [1.3e5, 2e5, 1e9, 1e30])
+def test_what_any_scale_carries_beyond_the_range_of_words_is_saturated(
+    sensor: Sensor, calibration: RadiometricCalibration, flat: bool, scale: float
+) -> None:
+    raw = np.full(SHAPE, 4000, np.uint16)
+    raw[::2] = 30
+    out = np.zeros(SHAPE, np.uint16)
+    statistics = level1_from_level0(
+        corrector_for(sensor, neutral_radiometry(sensor) if flat else calibration),
+        raw,
+        temperature_c=None,
+        exposure_time_s=0.001,
+        tdi_shifts=0,
+        out=out,
+        scale=scale,
+    )
+    assert set(out[1::2].ravel().tolist()) == {65535}
+    assert set(out[::2].ravel().tolist()) == {LEVEL1_FLOOR}
+    assert statistics.saturated_fraction == 0.5
+
+
 def test_the_result_does_not_depend_on_the_number_of_threads(
     sensor: Sensor, calibration: RadiometricCalibration
 ) -> None:
