@@ -62,15 +62,21 @@ RELATED: Final = {
 
 @functools.cache
 def software_identity() -> dict[str, str]:
-    """Versions of code and libraries and the CPU family, by name."""
-    from llvmlite import binding
+    """Versions of code and libraries and the processor that kernels are compiled for, by name.
 
-    features = ",".join(sorted(name for name, on in binding.get_host_cpu_features().items() if on))
+    That is this machine's, unless NUMBA_CPU_NAME or NUMBA_CPU_FEATURES states another.
+    """
+    from numba.core.registry import cpu_target
+
+    from processing.image.kernel_cache import compiler_settings
+
+    _, processor, features = cpu_target.target_context.codegen().magic_tuple()
+    compiled = repr((features, compiler_settings()))
     return {
         "software": version("syntopic"),
         "code_sha256": code_sha256(RELATED),
         "python": platform.python_version(),
-        "cpu": f"{binding.get_host_cpu_name()}-{hashlib.sha256(features.encode()).hexdigest()[:8]}",
+        "cpu": f"{processor}-{hashlib.sha256(compiled.encode()).hexdigest()[:8]}",
         **{name: _version(name) for name in LIBRARIES},
     }
 

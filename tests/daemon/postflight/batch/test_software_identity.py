@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+import os
+import subprocess
 import sys
 from collections.abc import Iterator
 from importlib.metadata import packages_distributions
@@ -120,3 +122,30 @@ def test_a_library_that_is_not_installed_is_part_of_the_identity(
     monkeypatch.setattr(software_identity, "LIBRARIES", ("numpy", "no-such-distribution"))
     found = software_identity.software_identity.__wrapped__()
     assert found["no-such-distribution"] == "none"
+
+
+IDENTITY = """
+from daemon.postflight.batch.software_identity import software_identity
+print(software_identity()["cpu"])
+"""
+
+
+def test_the_processor_is_the_one_that_kernels_are_compiled_for() -> None:
+    def cpu(**environment: str) -> str:
+        done = subprocess.run(
+            [sys.executable, "-c", IDENTITY],
+            env=os.environ | environment,
+            capture_output=True,
+            text=True,
+            check=True,
+            timeout=110,
+        )
+        return done.stdout.strip()
+
+    found = [
+        cpu(),
+        cpu(NUMBA_CPU_NAME="generic"),
+        cpu(NUMBA_CPU_FEATURES="+sse2"),
+        cpu(NUMBA_OPT="1"),
+    ]
+    assert len(set(found)) == len(found) and found[1].startswith("generic-")
