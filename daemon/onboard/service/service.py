@@ -435,6 +435,7 @@ class Service:
 
     async def _land(self, tasks: list[asyncio.Task[None]]) -> None:
         tasks[-1].cancel()  # no more exposures
+        self._follow_phase()  # with nothing left to finish nothing else would
         if self.is_power_failing:
             limit_s = self.configuration.limits.power_fail_s
             await self._until(lambda: not self.flight.open_numbers, limit_s)

@@ -291,3 +291,7 @@ def test_the_service_stays_after_the_command_land_until_it_is_ended(
     assert asyncio.run(fly()) == 0
     names = [event["event"] for event in events]
     assert names.index("ended") < names.index("landing")
+    # Also with nothing left to finish, after which no message advances the phase.
+    assert [event["phase"] for event in events if event["event"] == "phase"][-1] == "landed"
+    statuses = [event for event in events[names.index("landing") :] if event["event"] == "status"]
+    assert all(event["phase"] == "landed" for event in statuses)
