@@ -22,6 +22,8 @@ from tests.support.npm import npm_package
 
 SIZES = ((1280, 800), (2000, 1200), (390, 844))
 THEMES = ("", "dark")
+MAP_SHARES = {1280: 0.65, 2000: 0.53, 390: 0.95}
+"""Least share of the width of the window that the map has, by that width."""
 MEASURES = Path(__file__).with_name("cockpit_measures.js")
 CONTRAST = 7.0
 """Of verdict, alarms, lamps and what is left, WCAG 2.2, 1.4.6."""
@@ -29,7 +31,10 @@ DECIDED = {"color-contrast", "label-content-name-mismatch"}
 """Rules of axe whose incomplete results are decided here: `weakTexts` measures the first, where axe
 cannot see through a gradient or an overlap; the second cannot compare a glyph without letters with
 a name."""
-FAULTS = ("outside", "overlapping", "smallTexts", "smallTargets", "clipped", "cut", "weakTexts")
+FAULTS = (
+    *("outside", "overlapping", "smallTexts", "smallTargets"),
+    *("clipped", "cut", "weakTexts", "weakLabels"),
+)
 """What no state of the page may have, by the names of `cockpit_measures.js`."""
 NOON_GPS_NS = 1_466_078_418_000_000_000
 
@@ -96,18 +101,7 @@ class Cockpit:
         self.until("!document.querySelector('#guidance').classList.contains('stale')")
 
     def resize(self, width: int, height: int, theme: str = "") -> None:
-        metrics = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 500}
-        self.browser.call("Emulation.setDeviceMetricsOverride", **metrics)
-        self.set_theme(theme)
-        self.browser.evaluate(
-            "new Promise((r) => requestAnimationFrame(() => requestAnimationFrame(r)))"
-        )
-
-    def set_theme(self, theme: str) -> None:
-        """By the button of the page, which draws the map again."""
-        if self.browser.evaluate("document.documentElement.dataset.theme || ''") != theme:
-            self.browser.click("#theme")
-        assert self.browser.evaluate("document.documentElement.dataset.theme || ''") == theme
+        resize(self.browser, width, height, theme)
 
     def until(self, script: str) -> None:
         self.browser.wait_for(script, WITHIN_S)
@@ -120,6 +114,16 @@ class Cockpit:
         self.browser.call("Input.dispatchMouseEvent", type="mousePressed", **about)
         time.sleep(held_s)
         self.browser.call("Input.dispatchMouseEvent", type="mouseReleased", **about)
+
+
+def resize(browser: Browser, width: int, height: int, theme: str = "") -> None:
+    """Set the size of the window, and the theme by the button of the page."""
+    metrics = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 500}
+    browser.call("Emulation.setDeviceMetricsOverride", **metrics)
+    if browser.evaluate("document.documentElement.dataset.theme || ''") != theme:
+        browser.click("#theme")
+    assert browser.evaluate("document.documentElement.dataset.theme || ''") == theme
+    browser.evaluate("new Promise((r) => requestAnimationFrame(() => requestAnimationFrame(r)))")
 
 
 LINES = {
@@ -147,6 +151,32 @@ def picture_of(number: int) -> np.ndarray:
     ground = cv2.resize(fields, (900, 600), interpolation=cv2.INTER_NEAREST)
     cv2.line(ground, (0, 80 + 40 * number), (900, 300), (170, 170, 170), 9)
     return ground
+
+
+def faults_of_page(browser: Browser, width: int, phone_tab: str = "map") -> list[Any]:
+    """What is wrong with the page as it is seen: measured, and findings of axe.
+
+    Args:
+        browser: with the page, resized to `width`.
+        width: of the window, pixels.
+        phone_tab: what a phone shows; its map covers the pages.
+
+    Returns:
+        Name and places of each fault.
+    """
+    browser.evaluate(MEASURES.read_text())
+    if width < 500:
+        browser.click(f"#tab-{phone_tab}")
+    measured = browser.evaluate("measures()")
+    found: list[Any] = [(fault, measured[fault]) for fault in FAULTS if measured[fault]]
+    if measured["scrolls"]:
+        found.append(("scrolls", True))
+    share = browser.evaluate("document.querySelector('#map').clientWidth / innerWidth")
+    if phone_tab == "map" and share < MAP_SHARES[width]:
+        found.append(("share of the map", share))
+    if measured["weakest"][1] < CONTRAST:
+        found.append(("weakest", measured["weakest"]))
+    return found + axe(browser)
 
 
 def axe(browser: Browser) -> list[Any]:

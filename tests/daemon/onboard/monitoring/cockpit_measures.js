@@ -31,13 +31,13 @@
 
   function overlapping() {
     const regions = seen("header, #alarm-bar, #connection-lost, #map-panel, #verdict-panel, .page, #tabs, #action-bar")
-      .filter((one) => !(one.id === "verdict-panel" && document.querySelector("#pages").contains(one)));
+      .filter((one) => shown(one) && !(one.id === "verdict-panel" && document.querySelector("#pages").contains(one)));
     const controls = seen("button, input, select, summary, .files a, .leaflet-bar a, .leaflet-control-scale-line, #map-attribution, #map-measured, .g-cell")
       .filter((one) => shown(one));
     const found = [];
-    for (const [many, area] of [[regions, box], [controls, shown]]) {
+    for (const many of [regions, controls]) {
       many.forEach((one, k) => many.slice(k + 1).forEach((other) => {
-        if (!one.contains(other) && !other.contains(one) && overlap(area(one), area(other)) > 1) found.push(`${name(one)} / ${name(other)}`);
+        if (!one.contains(other) && !other.contains(one) && overlap(shown(one), shown(other)) > 1) found.push(`${name(one)} / ${name(other)}`);
       }));
     }
     return found;
@@ -105,9 +105,60 @@
     .map((one) => [one, paintedContrast(one)]).filter(([, value]) => !(value >= 4.5))
     .map(([one, value]) => `${name(one)} ${one.textContent.trim().slice(0, 20)} ${value.toFixed(2)}`);
 
+  // The contrast of a text on a canvas with its surroundings, over the worst colour beneath the canvas: that of three quarters of
+  // the pixels at a distance of two pixels from its ink, where its halo or its ground is. The others are parts of further strokes.
+  const [RING_PX, RING_SHARE] = [2, 0.25];
+  function canvasContrast(context, { left, top, width, height }, ink, shade = (colour) => colour) {
+    const { data, width: w, height: h } = context.getImageData(Math.floor(left), Math.floor(top), Math.ceil(width) + 1, Math.ceil(height) + 1);
+    const isInk = (x, y) => {
+      const k = 4 * (y * w + x);
+      return data[k + 3] === 255 && [0, 1, 2].every((c) => Math.abs(data[k + c] - ink[c]) <= 6);
+    };
+    const own = luminance(shade([...ink, 1]));
+    const found = [];
+    for (let y = RING_PX; y < h - RING_PX; y += 1) {
+      for (let x = RING_PX; x < w - RING_PX; x += 1) {
+        let distance = Infinity;
+        for (let dy = -RING_PX; dy <= RING_PX; dy += 1) {
+          for (let dx = -RING_PX; dx <= RING_PX; dx += 1) {
+            if (isInk(x + dx, y + dy)) distance = Math.min(distance, Math.max(Math.abs(dx), Math.abs(dy)));
+          }
+        }
+        if (distance !== RING_PX) continue;
+        const k = 4 * (y * w + x);
+        const beneath = luminance(shade(over([data[k], data[k + 1], data[k + 2], data[k + 3] / 255], [...ink, 1])));
+        found.push((Math.max(own, beneath) + 0.05) / (Math.min(own, beneath) + 0.05));
+      }
+    }
+    return found.sort((a, b) => a - b)[Math.floor(RING_SHARE * found.length)] ?? null;
+  }
+  const colourOf = (text) => {
+    const pen = document.createElement("canvas").getContext("2d");
+    pen.fillStyle = text;
+    pen.fillRect(0, 0, 1, 1);
+    return [...pen.getImageData(0, 0, 1, 1).data].slice(0, 3);
+  };
+  // Labels of the plan on the map with less than 4.5:1, and those that a control covers.
+  async function weakLabels() {
+    if (!document.querySelector("#map")) return [];
+    const { planShown } = await import("/map.js");
+    const canvas = document.querySelector(".leaflet-plan-pane canvas");
+    if (!canvas || !isSeen(canvas)) return [];
+    const [origin, context] = [box(canvas), canvas.getContext("2d", { willReadFrequently: true })];
+    const shade = getComputedStyle(document.querySelector("main > *")).filter.includes("grayscale") ? gray : (colour) => colour;
+    const controls = seen("#map-tools > *, #map-legend, #map-attribution, #map .leaflet-control").map(box);
+    return planShown().labels.flatMap((one) => {
+      const value = canvasContrast(context, one, colourOf(one.ink), shade);
+      const place = { left: origin.left + one.left, right: origin.left + one.left + one.width, top: origin.top + one.top, bottom: origin.top + one.top + one.height };
+      return [...(value >= 4.5 ? [] : [`${one.text} ${value?.toFixed(2)}`]), ...(controls.some((by) => overlap(place, by) > 1) ? [`${one.text} is covered`] : [])];
+    });
+  }
+
   const scrolls = () => document.documentElement.scrollHeight > innerHeight || document.documentElement.scrollWidth > innerWidth || scrollY !== 0;
 
-  window.measures = () => ({ outside: outside(), overlapping: overlapping(), smallTexts: smallTexts(), smallTargets: smallTargets(), clipped: clipped(), cut: cut(), weakTexts: weakTexts(),
+  window.canvasContrast = canvasContrast;
+  window.colourOf = colourOf;
+  window.measures = async () => ({ weakLabels: await weakLabels(), outside: outside(), overlapping: overlapping(), smallTexts: smallTexts(), smallTargets: smallTargets(), clipped: clipped(), cut: cut(), weakTexts: weakTexts(),
     weakest: Object.entries(contrasts()).at(-1), scrolls: scrolls() });
   window.centre = (selector) => {
     const one = seen(selector)[0];

@@ -98,8 +98,11 @@ def vector_map(folder: Path) -> Path:
     )  # fmt: skip
 
 
-def aerial_map(folder: Path) -> Path:
-    """Fields and roads as a GeoTIFF, about 8 km x 5 km about the lines of the tests."""
+def aerial_map(folder: Path, origin: tuple[float, float] = (529_660.0, 5_216_500.0)) -> Path:
+    """Fields and roads as a GeoTIFF, 8 km x 5.2 km about the lines of the tests.
+
+    `origin` is its north-western corner, UTM zone 33, m.
+    """
     random = np.random.default_rng(7)
     fields = random.integers((70, 100, 60), (130, 150, 100), (26, 40, 3)).astype(np.uint8)
     ground = cv2.resize(fields, (2000, 1300), interpolation=cv2.INTER_NEAREST)
@@ -111,5 +114,5 @@ def aerial_map(folder: Path) -> Path:
     return geotiff(
         folder / "fields.tif",
         np.moveaxis(ground, 2, 0).copy(),
-        transform=from_origin(529_660.0, 5_216_500.0, 4.0, 4.0),
+        transform=from_origin(*origin, 4.0, 4.0),
     )

@@ -17,6 +17,7 @@ from tests.daemon.onboard.monitoring import flight_events
 from tests.daemon.onboard.monitoring.cockpit import MEASURES, Cockpit, lines
 from tests.daemon.onboard.monitoring.page_service import WITHIN_S, Service
 from tests.daemon.onboard.monitoring.test_base_maps import geotiff
+from tests.daemon.onboard.monitoring.vector_tiles import labelled_tile
 from tests.support.browser import Browser, chromium
 
 RIDGE_EAST_M = 532_900.0
@@ -140,3 +141,21 @@ def test_sharpness_is_a_layer_of_the_image_at_full_resolution(cockpit: Cockpit) 
     assert found["sharp"] < middle < found["blurred"]
     cockpit.touch("[data-overlay=sharpness]")
     assert browser.evaluate(SHARPNESS) == {}
+
+
+def test_names_on_vector_maps_are_read_on_every_ground(cockpit: Cockpit) -> None:
+    """Measured at the edges of their strokes, day and night."""
+    browser = cockpit.browser
+    browser.evaluate(MEASURES.read_text())
+    for ground in ("land", "water", "buildings", "boundary"):
+        tile = json.dumps(list(labelled_tile(ground)))
+        for is_night, ink in ((False, "#3a3a3a"), (True, "#b9c0c6")):
+            contrast = browser.evaluate(
+                "import('/mvt.js').then(({drawTile}) => {"
+                " const canvas = document.createElement('canvas');"
+                " canvas.width = canvas.height = 256;"
+                f" drawTile(canvas, new Uint8Array({tile}), {json.dumps(is_night)});"
+                " const area = { left: 60, top: 100, width: 136, height: 50 };"
+                f" return canvasContrast(canvas.getContext('2d'), area, colourOf('{ink}')); }})"
+            )
+            assert contrast is not None and contrast >= 4.5, (ground, is_night, contrast)

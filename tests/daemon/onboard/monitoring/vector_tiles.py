@@ -52,3 +52,16 @@ def vector_tile() -> bytes:
             _layer("place", 1, [(1000, 500)], name="Hamlet"),
         )
     )
+
+
+def labelled_tile(ground: str) -> bytes:
+    """A place in the middle of a tile of one ground, with two roads below its name."""
+    whole = [(0, 0), (4096, 0), (4096, 4096), (0, 4096)]
+    roads = [[(0, 2048 + d), (4096, 2048 + d)] for d in (-100, 20)]
+    return b"".join(
+        (
+            _layer(ground, 3, whole, kind="all"),
+            *(_layer("roads", 2, road, **{"class": "primary"}) for road in roads),
+            _layer("place", 1, [(2048, 2048)], name="Hamlet HILL"),
+        )
+    )

@@ -115,6 +115,9 @@ async function readPlan(id) {
 }
 
 export function start(root, feed) {
+  // The button stays when an item changes: replaced, it would lose its touch.
+  const list = element("div");
+  root.append(list, button(t("check.do_test"), () => feed.command("trigger"), { id: "test-exposure" }));
   feed.subscribe(async (record) => {
     const { brief } = feed.flight;
     root.hidden = !FLIGHT_PHASES.has(brief.phase) || (brief.status?.ledger?.triggers?.triggers ?? 0) > 3;
@@ -123,12 +126,11 @@ export function start(root, feed) {
     by("exposure-suggestion").hidden = root.hidden;
     if (root.hidden) return;
     const listed = items(feed);
-    redraw(root, JSON.stringify(listed), () => [
+    redraw(list, JSON.stringify(listed), () => [
       element("h2", { textContent: t("check.title") }),
       element("ul", { className: "checklist" }, ...listed.map((one) => element("li", { className: one.state, dataset: { check: one.name } },
         element("span", { className: "mark", ariaHidden: "true", textContent: MARKS[one.state] }),
         element("span", { textContent: one.text }), element("span", { className: "unseen", textContent: t(`lamp.state.${one.state}`) })))),
-      button(t("check.do_test"), () => feed.command("trigger"), { id: "test-exposure" }),
     ]);
   });
 }

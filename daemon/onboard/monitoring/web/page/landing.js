@@ -140,6 +140,9 @@ function nextSteps(feed) {
 
 export function start(root, feed) {
   let phase = null;
+  // Each is drawn for itself: the time of the summary changes every second, and a button that is replaced loses its touch.
+  const [figures, files, steps] = [1, 2, 3].map(() => element("div"));
+  root.replaceChildren(figures, files, steps);
   const draw = () => {
     const { brief } = feed.flight;
     if (!brief) return;
@@ -149,15 +152,17 @@ export function start(root, feed) {
     phase = brief.phase;
     if (root.hidden) return;
     const rows = summary(feed.flight);
-    redraw(root, JSON.stringify([rows, [...kept.files.keys()], brief.landing, feed.isLinked]), () => [
+    redraw(figures, JSON.stringify([rows, brief.mission.id]), () => [
       element("h2", { textContent: t("landing.title", { mission: brief.mission.id || "" }) }),
       element("dl", { className: "figures wide summary" }, ...rows.map(([name, value, state]) => element("div", { className: state, dataset: { summary: name } },
         element("dt", { textContent: t(`landing.${name}`) }), element("dd", { textContent: value })))),
+    ]);
+    redraw(files, JSON.stringify([...kept.files.keys()]), () => [
       element("h2", { textContent: t("landing.fly_again") }),
       kept.files.size ? element("div", { className: "tools" }, ...Object.keys(FILES).filter((name) => kept.files.has(name)).map((name) => button(FILES[name], () => download(name),
         { dataset: { file: name } }))) : element("p", { className: "note", textContent: t("lines.no_plan") }),
-      element("h2", { textContent: t("landing.next") }), ...nextSteps(feed),
     ]);
+    redraw(steps, JSON.stringify([brief.landing, brief.mission.path, feed.isLinked]), () => [element("h2", { textContent: t("landing.next") }), ...nextSteps(feed)]);
   };
   feed.subscribe(async (record) => {
     followMission(feed.flight.brief.mission?.id || null);

@@ -27,6 +27,15 @@ function cornerOf({ x, y }, side, width) {
     left: [x - width - PADDING_PX, above], right: [x + PADDING_PX, above] }[side];
 }
 
+const CONTROLS = "#map-tools > *, #map-legend, #map-attribution, #map .leaflet-control";
+
+// Areas of the map that controls cover, in its pixels.
+function coveredBy(map) {
+  const { left, top } = map.getContainer().getBoundingClientRect();
+  return [...document.querySelectorAll(CONTROLS)].map((one) => one.getBoundingClientRect()).filter((one) => one.width)
+    .map((one) => ({ left: one.left - left, right: one.right - left, top: one.top - top, bottom: one.bottom - top }));
+}
+
 const STYLES = {
   gap: { weight: 700, ink: "--warning", ground: "--warning-ground" },
   retake: { weight: 700, ink: "--accent-ink", ground: "--accent" },
@@ -39,15 +48,15 @@ export const PlanLayer = CanvasLayer.extend({
     this.plan = null;
     this.gaps = [];
     this.state = {};
-    // Texts of the labels for which there was room, by kind; and the number of areas of gaps in view.
-    this.shown = { line: [], retake: [], gap: [], areas: 0 };
+    // Texts of the labels for which there was room, by kind; their places and inks; and the number of areas of gaps in view.
+    this.shown = { line: [], retake: [], gap: [], labels: [], areas: 0 };
   },
   set(changed) {
     Object.assign(this, changed);
     this.draw();
   },
   paint(size) {
-    this.shown = { line: [], retake: [], gap: [], areas: 0 };
+    this.shown = { line: [], retake: [], gap: [], labels: [], areas: 0 };
     const labels = [];
     this.paintLines(size, labels);
     this.paintRetakes(size, labels);
@@ -124,6 +133,7 @@ export const PlanLayer = CanvasLayer.extend({
   paintLabels({ width, height }, labels) {
     const { context } = this;
     const taken = [];
+    const covered = coveredBy(this._map);
     const inks = Object.fromEntries(Object.entries(STYLES).map(([kind, { ink, ground }]) => [kind, [colour(ink), colour(ground)]]));
     Object.assign(context, { textBaseline: "middle", lineJoin: "round" });
     for (const { kind, text, point, side } of labels.sort((a, b) => a.rank - b.rank)) {
@@ -131,13 +141,18 @@ export const PlanLayer = CanvasLayer.extend({
       context.font = `${STYLES[kind].weight} 14${FONT}`;
       const boxWidth = context.measureText(short(text)).width + 2 * PADDING_PX;
       if (point.x < 0 || point.y < 0 || point.x > width || point.y > height) continue;
-      // Not across an edge of the map.
+      // Neither across an edge of the map nor below a control: above or below that instead.
       const [wantedLeft, wantedTop] = cornerOf(point, side, boxWidth);
       const left = Math.max(0, Math.min(wantedLeft, width - boxWidth));
-      const top = Math.max(0, Math.min(wantedTop, height - LABEL_HEIGHT_PX));
+      let top = Math.max(0, Math.min(wantedTop, height - LABEL_HEIGHT_PX));
+      for (const one of covered) {
+        if (left >= one.right || left + boxWidth <= one.left || top >= one.bottom || top + LABEL_HEIGHT_PX <= one.top) continue;
+        top = one.top < height / 2 ? one.bottom : one.top - LABEL_HEIGHT_PX;
+      }
       if (taken.some(([x, y, w]) => left < x + w && x < left + boxWidth && Math.abs(top - y) < LABEL_HEIGHT_PX)) continue;
       taken.push([left, top, boxWidth]);
       this.shown[kind].push(text);
+      this.shown.labels.push({ text, ink, left, top, width: boxWidth, height: LABEL_HEIGHT_PX });
       const middle = top + LABEL_HEIGHT_PX / 2;
       if (kind === "line") {
         Object.assign(context, { strokeStyle: ground, lineWidth: 4 });

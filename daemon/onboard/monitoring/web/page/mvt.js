@@ -182,7 +182,7 @@ function drawLayer(pen, layer, group, style, scale) {
 function drawLabels(pen, layer, style, scale, size) {
   pen.font = "600 12px system-ui, sans-serif";
   pen.textAlign = "center";
-  pen.lineWidth = 3;
+  pen.lineWidth = 4;
   pen.strokeStyle = style.halo;
   pen.fillStyle = style.text;
   let count = 0;
