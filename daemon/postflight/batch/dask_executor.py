@@ -48,6 +48,7 @@ from daemon.postflight.batch.executor import (
     is_passing,
 )
 from daemon.postflight.batch.local_processes import OPEN_TIMEOUT_S, outcome_of, picklable
+from daemon.postflight.batch.memory_kills import ClusterLosses
 
 CONNECT_TIMEOUT_S: Final = 15.0
 WORKERS_TIMEOUT_S: Final = 60.0
@@ -152,6 +153,7 @@ class DaskExecutor:
         self._task_nbytes = 0
         self._suitable: dict[str, str] = {}  # what is wrong with a worker, by address
         self._restricted: dict[int, frozenset[str]] = {}
+        self._losses = ClusterLosses()
         self.dashboard = ""
 
     @property
@@ -187,6 +189,7 @@ class DaskExecutor:
         check_memory(client, work)
         self._task_nbytes = work.memory_nbytes
         self._suitable = dict.fromkeys(client.nthreads(), "")
+        self._losses.note(client, self._suitable)
         client.register_plugin(ReturnLostTasks())
         self._workers_seen_s = time.monotonic()
         # One worker opens the work before all others, so that kernels are compiled once.
@@ -249,14 +252,20 @@ class DaskExecutor:
             try:
                 ended = self._ended.get(timeout=max(0.0, min(0.5, limit_s - time.monotonic())))
             except queue.Empty:
-                found += self._missed()
+                found += [*self._missed(), *self._decided()]
                 if time.monotonic() >= limit_s:
                     break
                 continue
             found += self._outcome(*ended)
             while not self._ended.empty():
                 found += self._outcome(*self._ended.get())
+            found += self._decided()
         return found
+
+    def _decided(self) -> list[TaskOutcome]:
+        """Losses whose cause is known."""
+        client = self._client
+        return [] if client is None else [*self._losses.decided(client, self._suitable)]
 
     def close(self, timeout_s: float) -> list[TaskOutcome]:
         found: list[TaskOutcome] = []
@@ -286,7 +295,10 @@ class DaskExecutor:
         except distributed.KilledWorker as error:
             del self._futures[number]
             worker = str(getattr(error.last_worker, "address", error.last_worker))
-            return [TaskLost(number, "killed", f"its process was killed ({worker})", worker)]
+            self._losses.add(
+                TaskLost(number, "killed", f"its process was killed ({worker})", worker)
+            )
+            return []
         except (distributed.CancelledError, TimeoutError, OSError):
             del self._futures[number]
             self._is_registration_due = True  # it may be another scheduler at the same address
@@ -346,6 +358,7 @@ class DaskExecutor:
                     self._set_aside(worker, problem)
                 else:
                     self._suitable[worker] = ""
+            self._losses.note(self._client, joined)
         for number, future in list(self._futures.items()):
             restricted = self._restricted.get(number)
             if restricted and not restricted & present.keys() and future.status == "pending":

@@ -21,7 +21,6 @@ from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection, wait
-from pathlib import Path
 from typing import Any, Final
 
 from daemon import DaemonError
@@ -37,6 +36,7 @@ from daemon.postflight.batch.executor import (
     TaskOutcome,
     is_passing,
 )
+from daemon.postflight.batch.memory_kills import CAUSE, memory_kills
 from daemon.products.processing_threads import configure_threads, thread_counts
 
 OPEN_TIMEOUT_S: Final = 600.0
@@ -81,7 +81,7 @@ class _Worker:
         self.connection, child_end = _SPAWN.Pipe(duplex=True)
         self.task: BatchTask | None = None
         self.is_ready = False
-        self.oom_kills = _oom_kills()
+        self.oom_kills = memory_kills()
         self.process = _SPAWN.Process(
             target=worker_main, args=(child_end, work, replaces_compiled), daemon=True
         )
@@ -337,15 +337,6 @@ def _cause_of(worker: _Worker) -> tuple[LossKind, str]:
     if code is None or code >= 0:
         return "killed", f"its process ended with status {code}"
     name = signal.Signals(-code).name
-    if -code == signal.SIGKILL and _oom_kills() > worker.oom_kills:
-        return "out-of-memory", "the kernel killed its process: out of memory"
+    if -code == signal.SIGKILL and memory_kills() > worker.oom_kills:
+        return "out-of-memory", CAUSE
     return "killed", f"its process was killed by {name}"
-
-
-def _oom_kills() -> int:
-    """Processes that the kernel killed for memory since boot; 0 where it does not count them."""
-    try:
-        lines = Path("/proc/vmstat").read_text("ascii").splitlines()
-    except OSError:
-        return 0
-    return next((int(line.split()[1]) for line in lines if line.startswith("oom_kill ")), 0)

@@ -202,6 +202,7 @@ def joining_client(**about: Any) -> Any:
     return SimpleNamespace(
         status="running",
         nthreads=lambda: dict.fromkeys(workers, 1),
+        run=lambda _function, workers, on_error: dict.fromkeys(workers, 0),
         scheduler_info=lambda: {"workers": workers},
         get_versions=lambda check: {
             "client": {"packages": own},

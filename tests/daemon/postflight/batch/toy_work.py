@@ -52,6 +52,8 @@ def _happen(what: str) -> None:
         os.kill(os.getpid(), signal.SIGKILL)
     elif what == "status":
         os._exit(7)
+    elif what == "kernel":
+        _fill_a_group()
     elif what == "memory":
         raise MemoryError
     elif what == "full":
@@ -64,6 +66,36 @@ def _happen(what: str) -> None:
         raise ValueError("frame 3 is damaged")
     elif what == "slow":
         time.sleep(0.5)
+
+
+def memory_groups() -> Path | None:
+    """Where control groups that limit memory can be made; None where they cannot."""
+    for root in (Path("/sys/fs/cgroup/memory"), Path("/sys/fs/cgroup")):
+        limit = "memory.max" if root.name == "cgroup" else "memory.limit_in_bytes"
+        probe = root / f"syntopic-probe-{os.getpid()}"
+        try:
+            probe.mkdir()
+        except OSError:
+            continue
+        is_usable = (probe / limit).exists()
+        probe.rmdir()
+        if is_usable:
+            return root
+    return None
+
+
+def _fill_a_group() -> None:
+    """Allocate more than a control group of this process alone permits: the kernel ends it."""
+    root = memory_groups()
+    assert root is not None
+    group = root / f"syntopic-test-{os.getpid()}"
+    group.mkdir()
+    limit = "memory.max" if root.name == "cgroup" else "memory.limit_in_bytes"
+    (group / limit).write_text("20000000")
+    (group / "cgroup.procs").write_text(str(os.getpid()))
+    held = [bytearray(b"\x01") * 1_000_000 for _ in range(200)]
+    time.sleep(30.0)
+    del held
 
 
 def attempts_of(folder: Path, number: int | str) -> int:
