@@ -12,7 +12,7 @@ import typer
 from rich.progress import Progress
 
 from daemon.cli.batch_options import ExecutorOptions, takes_executor
-from daemon.cli.exit_status import exit_if_failed
+from daemon.cli.exit_status import ExitStatus, exit_if_failed
 from daemon.cli.options import AsJson, Crs, MountFile, Trajectory, lock_for
 from daemon.configuration.model import ConfigurationError
 from daemon.mission.layout import Mission
@@ -140,8 +140,11 @@ def orthomosaic(
                 f"{steps['step_rms_after']['pan']:.2%} after levelling",
                 highlight=False,
             )
-        for sentence in (*report["left_out"], relief_sentence(report)):
+        found = [f"{one['name']}: {one['sentence']}" for one in report["findings"]]
+        for sentence in (*report["left_out"], *found, relief_sentence(report)):
             if sentence:
                 console.print(sentence, style="yellow", markup=False, highlight=False)
         console.print(f"Results: {final}", soft_wrap=True)
     exit_if_failed(block.failures)
+    if block.ground_check.is_wrong:
+        raise typer.Exit(ExitStatus.PROBLEM)

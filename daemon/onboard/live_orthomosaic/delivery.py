@@ -11,10 +11,11 @@ from typing import Any, Final
 
 from daemon.mission.store import durable
 from daemon.onboard.live_orthomosaic.live_orthomosaic import LiveOrthomosaic
-from daemon.onboard.live_orthomosaic.map_layout import TileId, tile_file
+from daemon.onboard.live_orthomosaic.map_layout import TileId, tile_file, world_tile
 from daemon.onboard.live_orthomosaic.pmtiles_file import write_pmtiles
 from daemon.onboard.live_orthomosaic.web_tiles import pixel_m
 from daemon.onboard.monitoring.maps.tiles import EARTH_HALF_M, TILE_PX, Bounds, tile_bounds
+from daemon.orientation.antimeridian import HALF_DEG
 from daemon.products.cog_file import CogLayout, new_cog
 
 COG_FILE: Final = "orthomosaic.tif"
@@ -78,7 +79,7 @@ def write_map(live: LiveOrthomosaic, path: Path, metadata: Mapping[str, Any]) ->
         OSError: the disk refused.
     """
     tiles = {
-        tile: tile_file(live.files.folder, tile)
+        world_tile(tile): tile_file(live.files.folder, world_tile(tile))
         for tile, state in live.files.states.items()
         if state.version
     }
@@ -86,9 +87,9 @@ def write_map(live: LiveOrthomosaic, path: Path, metadata: Mapping[str, Any]) ->
 
 
 def bounds_of(tiles: list[TileId]) -> Bounds:
-    """West, south, east and north of tiles, deg."""
+    """West, south, east and north of tiles, deg; the whole circle across the antimeridian."""
     each = [tile_bounds(*tile) for tile in tiles]
-    return (
-        min(b[0] for b in each), min(b[1] for b in each),
-        max(b[2] for b in each), max(b[3] for b in each),
-    )  # fmt: skip
+    west, east = min(b[0] for b in each), max(b[2] for b in each)
+    if west < -HALF_DEG or east > HALF_DEG:
+        west, east = -HALF_DEG, HALF_DEG
+    return west, min(b[1] for b in each), east, max(b[3] for b in each)

@@ -20,7 +20,7 @@ from daemon.onboard.live_orthomosaic.block_gains import (
     owners_of,
 )
 from daemon.onboard.live_orthomosaic.map_ground import MapGround
-from daemon.onboard.live_orthomosaic.map_layout import TileId
+from daemon.onboard.live_orthomosaic.map_layout import TileId, world_tile
 from daemon.onboard.live_orthomosaic.placed_image import (
     CELL_PX,
     PlacedImage,
@@ -161,8 +161,8 @@ class LiveOrthomosaic:
         """
         if self.zoom < 0:
             return
-        if ground != self.ground:
-            self.ground = ground
+        before_ground, self.ground = self.ground, ground
+        if ground != before_ground:
             for image in self.images:
                 image.ground_m = self._ground_below(image.pose)
         before = {id(image): image.gain for image in self.images}
@@ -262,7 +262,7 @@ class LiveOrthomosaic:
 
     def _nadir(self, pose: ImagePose) -> Array:
         place = self.frame.to_geodetic(pose.centre_m[None])
-        return np.asarray(map_px(self.zoom, place[:, 0], place[:, 1])[0])
+        return np.asarray(map_px(self.zoom, place[:, 0], place[:, 1], self.frame.longitude_deg)[0])
 
     def _tiles_of(self, image: PlacedImage) -> set[TileId]:
         rows, columns = image.covered
@@ -387,7 +387,7 @@ class LiveOrthomosaic:
             if total > limit_bytes and published:
                 break
             version = self.files.publish(tile, picture)
-            published.append(PublishedTile(tile, version, len(picture)))
+            published.append(PublishedTile(world_tile(tile), version, len(picture)))
         return published
 
 

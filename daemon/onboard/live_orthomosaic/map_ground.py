@@ -5,7 +5,7 @@ Heights are above the ellipsoid.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Final, Protocol
 
 import numpy as np
@@ -36,9 +36,13 @@ class MapGround(Protocol):
 
 @dataclass(frozen=True)
 class ModelGround:
-    """A height model; where it has no data, the level ground of the plan."""
+    """A height model; where it has no data, the level ground of the plan.
+
+    `uncovered` is the share of tie points there; None before any is compared.
+    """
 
     relief: TerrainRelief
+    uncovered: float | None = field(default=None, compare=False)
 
     def heights_m(self, latitude_deg: Array, longitude_deg: Array) -> Array:
         places = np.stack([np.atleast_2d(latitude_deg), np.atleast_2d(longitude_deg)], axis=-1)
@@ -46,7 +50,8 @@ class ModelGround:
         return np.asarray(found.reshape(np.shape(latitude_deg)))
 
     def as_json(self) -> dict[str, Any]:
-        return {"kind": "height model"}
+        share = self.uncovered
+        return {"kind": "height model", "uncovered": None if share is None else round(share, 3)}
 
 
 @dataclass(frozen=True)
@@ -64,7 +69,7 @@ class PlaneGround:
 
     def heights_m(self, latitude_deg: Array, longitude_deg: Array) -> Array:
         north = np.asarray(latitude_deg) - self.latitude_deg
-        east = np.asarray(longitude_deg) - self.longitude_deg
+        east = (np.asarray(longitude_deg) - self.longitude_deg + 180.0) % 360.0 - 180.0
         return self.height_m + self.per_degree[0] * north + self.per_degree[1] * east
 
     def as_json(self) -> dict[str, Any]:

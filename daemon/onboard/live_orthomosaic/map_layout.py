@@ -22,3 +22,9 @@ def tile_file(folder: Path, tile: TileId) -> Path:
     """
     zoom, x, y = tile
     return folder / TILES_FOLDER / str(zoom) / str(x) / f"{y}.webp"
+
+
+def world_tile(tile: TileId) -> TileId:
+    """The address of a tile, whose column may be beyond the antimeridian."""
+    zoom, x, y = tile
+    return zoom, x % (1 << zoom), y

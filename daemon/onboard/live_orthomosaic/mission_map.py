@@ -258,12 +258,15 @@ class MissionMap:
         """The height model if it fits the tie points, else the plane through these, else the
         plan's height."""
         done = self._done
-        is_wrong = any(one.name.startswith("HEIGHT_MODEL") for one in done.findings)
+        check = done.heights
+        is_wrong = check is not None and (check.is_contradicted or bool(check.problem))
         if done.relief is not None and not is_wrong:
-            return ModelGround(done.relief)
+            return ModelGround(done.relief, None if check is None else check.uncovered)
         if done.live is not None and done.frame is not None:
             _, xyz, _ = done.live.tied_points()
             found = done.frame.to_geodetic(xyz[:: max(len(xyz) // POINTS_MAX, 1)])
+            # Longitudes without a jump, for their median and the tilt of the plane.
+            found[:, 1] += 360.0 * np.round((done.frame.longitude_deg - found[:, 1]) / 360.0)
             if len(found):
                 height = float(np.median(found[:, 2]))
                 per = metres_per_degree(float(found[0, 0]), height)

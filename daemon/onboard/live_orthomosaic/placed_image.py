@@ -28,6 +28,8 @@ Array = NDArray[np.float64]
 CELL_PX: Final = 16
 DEPRESSION_MIN_DEG: Final = 20.0
 """An image that looks higher with a corner is not placed."""
+FOOTPRINT_MAX_PX: Final = 20e6
+"""A larger footprint on the map would not fit into the memory of the process."""
 _STRIP_ROWS: Final = 64
 _MARGIN: Final = 0.15
 """Of the footprint on each side, for relief."""
@@ -96,7 +98,8 @@ def corners_in_map(pose: ImagePose, ground_m: float, frame: LocalFrame, zoom: in
         zoom: level.
 
     Returns:
-        The places; None if a corner looks nearly to the horizon, or up.
+        The places; None if a corner looks nearly to the horizon, or up, or if they span more than
+        `FOOTPRINT_MAX_PX`.
     """
     x, y = pose.principal
     ends = [(c, r) for r in (-0.5, pose.height_px - 0.5) for c in (-0.5, pose.width_px - 0.5)]
@@ -111,7 +114,8 @@ def corners_in_map(pose: ImagePose, ground_m: float, frame: LocalFrame, zoom: in
     ways *= ((place[2] - ground_m) / -ways[:, 2])[:, None]
     there = pose.centre_m + ways @ frame.local_from_enu(float(place[0]), float(place[1])).T
     geodetic = frame.to_geodetic(there)
-    return map_px(zoom, geodetic[:, 0], geodetic[:, 1])
+    found = map_px(zoom, geodetic[:, 0], geodetic[:, 1], frame.longitude_deg)
+    return found if np.prod(np.ptp(found, axis=0)) <= FOOTPRINT_MAX_PX else None
 
 
 def covered_cells(

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.mission.store import durable
-from daemon.onboard.live_orthomosaic.map_layout import TILES_FOLDER, TileId, tile_file
+from daemon.onboard.live_orthomosaic.map_layout import TILES_FOLDER, TileId, tile_file, world_tile
 from daemon.onboard.monitoring.maps.tiles import TILE_PX
 
 Words = NDArray[np.uint16]
@@ -123,7 +123,7 @@ class TileFiles:
 
     def publish(self, tile: TileId, picture: bytes) -> int:
         """Write the picture of a tile; its new version."""
-        path = tile_file(self.folder, tile)
+        path = tile_file(self.folder, world_tile(tile))
         path.parent.mkdir(parents=True, exist_ok=True)
         part = path.with_suffix(".part")
         part.write_bytes(picture)

@@ -40,9 +40,13 @@ def zoom_of(wanted_gsd_m: float, latitude_deg: float) -> int:
     return min(max(round(math.log2(gsd_m(0, latitude_deg) / wanted_gsd_m)), 0), ZOOM_MAX)
 
 
-def map_px(zoom: int, latitude_deg: Array, longitude_deg: Array) -> Array:
-    """Places in pixels of a level, (n, 2); integers are corners of pixels."""
-    x_m = np.radians(longitude_deg) * _RADIUS_M
+def map_px(zoom: int, latitude_deg: Array, longitude_deg: Array, near_deg: float = 0.0) -> Array:
+    """Places in pixels of a level, (n, 2); integers are corners of pixels.
+
+    Columns go on beyond the antimeridian from the longitude `near_deg` on.
+    """
+    turns = np.round((near_deg - np.asarray(longitude_deg)) / 360.0)
+    x_m = np.radians(longitude_deg + 360.0 * turns) * _RADIUS_M
     y_m = np.arcsinh(np.tan(np.radians(latitude_deg))) * _RADIUS_M
     return np.stack([x_m + EARTH_HALF_M, EARTH_HALF_M - y_m], axis=-1) / pixel_m(zoom)
 

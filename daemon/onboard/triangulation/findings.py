@@ -11,6 +11,7 @@ import numpy as np
 from daemon.onboard.triangulation.drifts import MOUNTING, Drift
 from daemon.onboard.triangulation.exposure_ranges import ranges
 from daemon.onboard.triangulation.heading_check import headings_off, typical_off
+from daemon.onboard.triangulation.height_model_check import HeightModelCheck
 from processing.bundle.adjust import Adjustment
 from processing.bundle.statistics import ObservationGroup
 from processing.pipelines.live_triangulation import LiveTriangulation
@@ -26,10 +27,10 @@ CONTRADICTED_FACTOR: Final = 4.0
 MIN_LEFT_OUT: Final = 3
 LEFT_OUT_SHARE: Final = 0.25
 """Of the exposures; fewer attitudes or positions that were left out are single blunders."""
-HEIGHT_MODEL_SIGMAS: Final = 3.0
-HEIGHT_MODEL_MIN_M: Final = 5.0
 GROUND_CHANGED_SHARE: Final = 0.1
 """Of the tie points."""
+UNCOVERED_SHARE: Final = 0.02
+"""Of the tie points; fewer lie at the edge of the height model."""
 
 LOST: Final = "lost, no head delivered an image"
 NOT_SEALED: Final = "it is not sealed"
@@ -54,32 +55,6 @@ class TriangulationFinding:
             "exposures": list(self.exposures),
             "lines": list(self.lines),
         }
-
-
-@dataclass(frozen=True)
-class HeightModelCheck:
-    """Tie points against the configured height model: median difference and its standard deviation
-    in m; `share_off` of the points differ from the median by more than the limit of a wrong model;
-    `problem` where the model cannot be used."""
-
-    difference_m: float | None = None
-    sigma_m: float | None = None
-    problem: str = ""
-    share_off: float = 0.0
-
-    @property
-    def limit_m(self) -> float:
-        """The largest difference that is not a contradiction."""
-        return height_limit_m(self.sigma_m or 0.0)
-
-
-def height_limit_m(sigma_m: float) -> float:
-    """The largest difference from a height model that is not a contradiction.
-
-    Args:
-        sigma_m: median standard deviation of tie points in height.
-    """
-    return max(HEIGHT_MODEL_MIN_M, HEIGHT_MODEL_SIGMAS * sigma_m)
 
 
 @dataclass(frozen=True)
@@ -194,6 +169,7 @@ def findings_of(
     *,
     skipped: Mapping[int, str],
     planned_lines: Sequence[str] = (),
+    missing_at_ends: Mapping[str, int] | None = None,
     heights: HeightModelCheck | None = None,
     has_landed: bool = False,
 ) -> tuple[TriangulationFinding, ...]:
@@ -202,6 +178,7 @@ def findings_of(
     Args:
         skipped: exposures that are not in the block, with the reason.
         planned_lines: ids of the plan's lines.
+        missing_at_ends: planned exposures before the first and behind the last image, by line.
         heights: the check of the height model, if one is configured.
         has_landed: lines that were not flown count only then.
     """
@@ -214,7 +191,7 @@ def findings_of(
         *_heights(heights),
     ]
     if has_landed:
-        found += _plan(block, planned_lines)
+        found += _plan(block, planned_lines, missing_at_ends or {})
     found += [
         TriangulationFinding(
             "ADJUSTMENT_FAILED",
@@ -401,39 +378,75 @@ def _heights(check: HeightModelCheck | None) -> list[TriangulationFinding]:
         ]
     if check.difference_m is None or check.sigma_m is None:
         return []
-    if abs(check.difference_m) <= check.limit_m:
-        if check.share_off < GROUND_CHANGED_SHARE:
-            return []
-        return [
+    found = []
+    if check.uncovered > UNCOVERED_SHARE:
+        found.append(
             TriangulationFinding(
-                "GROUND_CHANGED",
-                f"{100.0 * check.share_off:.0f} % of the tie points lie more than "
-                f"{check.limit_m:.1f} m from the height model, the others fit: it is older than "
-                "the ground there, or without its buildings and trees. Do not rely on places in "
-                "the orthomosaic there, or give a newer model ([plan] elevation).",
+                "HEIGHT_MODEL_INCOMPLETE",
+                f"{100.0 * check.uncovered:.0f} % of the tie points lie where the height model has "
+                "no height; the live map takes the plan's ground height there. Give a height model "
+                "of the whole block ([plan] elevation).",
             )
+        )
+    if not check.is_contradicted:
+        if check.share_off >= GROUND_CHANGED_SHARE:
+            found.append(
+                TriangulationFinding(
+                    "GROUND_CHANGED",
+                    f"{100.0 * check.share_off:.0f} % of the tie points lie more than "
+                    f"{check.limit_m:.1f} m from the height model, the others fit: it is older "
+                    "than the ground there, or without its buildings and trees. Do not rely on "
+                    "places in the orthomosaic there, or give a newer model ([plan] elevation).",
+                )
+            )
+        return found
+    if check.unit is not None:
+        return [
+            *found,
+            TriangulationFinding(
+                "HEIGHT_MODEL_CONTRADICTED",
+                f"Tie points lie {check.difference_m:+.1f} m from the height model (median), as if "
+                f"its heights were in {check.unit}. Give a height model in metres ([plan] "
+                "elevation).",
+            ),
         ]
     return [
+        *found,
         TriangulationFinding(
             "HEIGHT_MODEL_CONTRADICTED",
             f"Tie points lie {check.difference_m:+.1f} m from the height model (median). Check its "
             "coordinate system and whether its heights count from the geoid ([plan] "
             "elevation_crs).",
-        )
+        ),
     ]
 
 
-def _plan(block: BlockTies, planned: Sequence[str]) -> list[TriangulationFinding]:
+def _plan(
+    block: BlockTies, planned: Sequence[str], missing: Mapping[str, int]
+) -> list[TriangulationFinding]:
     flown = set(block.lines)
     left = tuple(line for line in planned if line not in flown)
+    found = []
+    if missing:
+        named = tuple(missing)
+        found.append(
+            TriangulationFinding(
+                "PLAN_CUT_SHORT",
+                f"{sum(missing.values())} planned exposures at the ends of lines "
+                f"{', '.join(named[:8])}{', ...' if len(named) > 8 else ''} have no image in the "
+                "block. The accuracy is that of the parts that were flown.",
+                lines=named,
+            )
+        )
     if not left:
-        return []
+        return found
     return [
+        *found,
         TriangulationFinding(
             "PLAN_CUT_SHORT",
             f"{len(left)} of {len(planned)} planned lines have no image in the block: "
             f"{', '.join(left[:8])}{', ...' if len(left) > 8 else ''}. The accuracy is that of the "
             "lines that were flown.",
             lines=left,
-        )
+        ),
     ]

@@ -37,14 +37,18 @@ from daemon.onboard.triangulation.findings import (
     LOST,
     NOT_PROCESSED,
     NOT_SEALED,
-    HeightModelCheck,
     TriangulationFinding,
     findings_of,
     live_ties,
 )
 from daemon.onboard.triangulation.flown_lines import FlownLines
+from daemon.onboard.triangulation.flown_plan import missing_at_ends
 from daemon.onboard.triangulation.ground_coverage import GroundCoverage, coverage_of
-from daemon.onboard.triangulation.height_model_check import check_heights, read_relief
+from daemon.onboard.triangulation.height_model_check import (
+    HeightModelCheck,
+    check_heights,
+    read_relief,
+)
 from daemon.onboard.triangulation.measured_images import measured_image, oriented
 from daemon.orientation.exterior_orientation import (
     NavigationSource,
@@ -53,6 +57,7 @@ from daemon.orientation.exterior_orientation import (
 )
 from daemon.orientation.local_frame import LocalFrame
 from daemon.orientation.navigation_sigmas import NavigationSigmas
+from daemon.planning.model import PlannedLine
 from daemon.planning.plan_readers import read_plan
 from daemon.planning.relief import TerrainRelief
 from processing import ProcessingError
@@ -150,7 +155,8 @@ class MissionTriangulation:
         self.relief, self.heights = read_relief(self.plan)
         self._control_problem = ""
         self._surveyed, self._measurements = self._read_control()
-        self._planned_lines = self._read_plan()
+        self._planned = self._read_plan()
+        self._planned_lines = tuple(line.id for line in self._planned)
         self._lines = FlownLines(self._planned_lines)
 
     @property
@@ -294,6 +300,7 @@ class MissionTriangulation:
             self.drifts,
             skipped=self.skipped,
             planned_lines=self._planned_lines,
+            missing_at_ends=self._missing_at_ends(),
             heights=self.heights,
             has_landed=self.has_landed,
         )
@@ -312,13 +319,21 @@ class MissionTriangulation:
             self._control_problem = str(error)
             return None, None
 
-    def _read_plan(self) -> tuple[str, ...]:
+    def _read_plan(self) -> tuple[PlannedLine, ...]:
         if self.mission.plan_path is None:
             return ()
         try:
-            return tuple(line.id for line in read_plan(self.mission.plan_path).lines)
+            return read_plan(self.mission.plan_path).lines
         except (OSError, DaemonError):
             return ()
+
+    def _missing_at_ends(self) -> dict[str, int]:
+        """Planned exposures at the ends of lines that have no image."""
+        if not self._planned or self.live is None or self.frame is None or not self.live.images:
+            return {}
+        images = self.live.images
+        places = self.frame.to_geodetic(np.array([one.position_m for one in images]))
+        return missing_at_ends(self._planned, [one.line for one in images], places[:, :2])
 
     def _check_heights(self) -> HeightModelCheck | None:
         """Tie points against the height model."""

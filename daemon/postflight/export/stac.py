@@ -7,6 +7,7 @@ the mission folder can be moved.
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +19,7 @@ from daemon.mission.store.direct_io import create_file
 from daemon.mission.store.durable import sync_directory
 from daemon.mission.store.level0 import read_description
 from daemon.mission.store.level2 import verdict_of
+from daemon.mission.store.output_places import refuse_foreign_files
 from daemon.mission.store.publication import published
 from daemon.orientation.antimeridian import bbox_of, polygon
 from daemon.orientation.exterior_orientation import ExteriorOrientation, sealed_exposures
@@ -47,6 +49,7 @@ GIS_ASSETS = {
     "mission.kmz": ("application/vnd.google-earth.kmz", "footprints for viewers of KML"),
 }
 _TO_ITEM, _TO_MISSION = "..", "../../.."
+_FILES = re.compile(r"collection\.json|([^/]+)/\1\.json")
 
 
 @dataclass(frozen=True)
@@ -82,6 +85,7 @@ def export_stac(
     Raises:
         OrientationError: no exposure could be oriented.
         AssetError: an orthoimage cannot be read.
+        OutputPlaceError: the folder holds something else.
         TrajectoryError, GeoreferenceError: as their modules say.
     """
     read = sealed_exposures(mission)
@@ -109,6 +113,7 @@ def export_stac(
     every = [*items, *orthoimages]
     collection = _collection(mission, context, every, license_id)
     folder = mission.export_dir / "stac"
+    refuse_foreign_files(folder, _FILES)
     with published(folder) as part:
         _write(part / "collection.json", collection)
         for item in every:

@@ -6,9 +6,7 @@ like on the ground is computed in `processing.image.orthoimage`.
 
 from __future__ import annotations
 
-import json
 import math
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,18 +16,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 import daemon
-from daemon import DaemonError
+from daemon.configuration.model import PlanSection
 from daemon.mission.canonical_json import canonical_bytes, sha256_hex
 from daemon.mission.exposure_batch import ExposureFailure, for_each_exposure
 from daemon.mission.layout import Mission
 from daemon.mission.store.level0 import check_tiff, read_description
+from daemon.orientation.antimeridian import mean_longitude
 from daemon.orientation.elevation import read_elevation
 from daemon.orientation.exterior_orientation import mount_of
 from daemon.orientation.georeference import Georeference
-from daemon.orientation.local_frame import FRAME_FILE, LocalFrame
-from daemon.postflight.adjustment.csv_tables import read_table
+from daemon.orientation.local_frame import LocalFrame
 from daemon.postflight.batch.software_identity import code_sha256, software_identity
 from daemon.postflight.importers.photographs import is_of_photographs
+from daemon.postflight.orthomosaic.ground_check import GroundCheck, check_ground
 from daemon.postflight.orthomosaic.ground_reach import (
     DEPRESSION_MIN_DEG,
     corner_slope,
@@ -40,6 +39,14 @@ from daemon.postflight.orthomosaic.photographs import (
     adjusted_heads,
     check_photograph,
     source_of,
+)
+from daemon.postflight.orthomosaic.triangulated import (
+    ObjectPoints,
+    OrthomosaicError,
+    adjusted_orientations,
+    object_points,
+    only_triangulation,
+    refuse_other_mission,
 )
 from daemon.postflight.triangulation.triangulation import block_of
 from processing.geometry.orientation import grid_from_enu
@@ -52,21 +59,11 @@ from processing.rig import Cone, VirtualImage, load_rig
 
 Array = NDArray[np.float64]
 
-EXTERIOR_FILE: Final = "exterior.csv"
-POINTS_FILE: Final = "adjusted_points.csv"
-_CRS_LINE: Final = re.compile(r"^# Adjusted exterior orientation in ([^\s,]+),")
-_ANGLES: Final = ("omega_deg", "phi_deg", "kappa_deg")
-_PLACE: Final = ("east_m", "north_m", "height_m")
-_ALSO: Final = ("latitude_deg", "longitude_deg", "sx_m", "sy_m", "sz_m", "so_deg", "sp_deg")
 _CODE: Final = {daemon: ("postflight/orthomosaic",)}
 """What computes an orthomosaic, in addition to what computes Level-2."""
 MARKS: Final = ("simulated", "uncalibrated")
 SIDE_MAX_PX: Final = 400_000
 """A grid with a longer side is refused: the GSD is meant in metres."""
-
-
-class OrthomosaicError(DaemonError, ValueError):
-    """A mission without an orthomosaic; the message states what is missing."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +100,8 @@ class OrthoBlock:
     """Everything that an orthomosaic is computed from.
 
     `orientation` is the sentence that states where orientations come from; `failures` are images
-    that cannot be read and are not in the block. `image` is of the first head of photographs.
+    that cannot be read or have no orientation, and are not in the block. `image` is of the first
+    head of photographs. `ground_check` states whether the ground fits.
     """
 
     mission: Mission
@@ -115,6 +113,7 @@ class OrthoBlock:
     grid: GroundGrid
     orientation: str
     failures: tuple[ExposureFailure, ...]
+    ground_check: GroundCheck
 
     @property
     def is_of_photographs(self) -> bool:
@@ -191,12 +190,14 @@ def block_for_orthomosaic(
     Raises:
         OrthomosaicError: no usable images, no orientations, or a ground that does not fit.
     """
-    folder = triangulation or _only_triangulation(mission)
+    folder = triangulation or only_triangulation(mission)
     image, heads = _geometry(mission, folder)
     if folder is not None:
-        georeference, names, place, angles = _triangulated(folder, crs)
+        georeference, names, place, angles = adjusted_orientations(folder, crs)
         orientation = f"adjusted orientations of {folder.name}"
-        failures: tuple[ExposureFailure, ...] = ()
+        geodetic = georeference.geodetic(place)
+        failures = refuse_other_mission(mission, folder, names, geodetic)
+        points = object_points(folder)
     else:
         block = block_of(mission, crs=crs, trajectory_file=trajectory_file, mount_file=mount_file)
         georeference, failures = Georeference(block.crs), block.failures
@@ -207,22 +208,27 @@ def block_for_orthomosaic(
             "delivered orientations: the mission has no triangulation. Run syntopic triangulate "
             "for adjusted ones"
         )
-    geodetic = georeference.geodetic(place)
-    frame = LocalFrame(float(geodetic[:, 0].mean()), float(geodetic[:, 1].mean()))
+        geodetic, points = georeference.geodetic(place), None
+    frame = LocalFrame(float(geodetic[:, 0].mean()), mean_longitude(geodetic[:, 1].tolist()))
     images, unread = _images(
         mission, image, heads, georeference, frame, names, place, geodetic, angles
     )
     offset_m = float(np.median(place[:, 2] - geodetic[:, 2]))
-    ground = _ground(mission, georeference, elevation, plane_height_m)
-    if ground is None and folder is not None:
-        ground = _plane_of_points(folder, _frame_of(folder), offset_m)
+    _, plan = mount_of(mission)
+    ground = _ground(plan, georeference, elevation, plane_height_m)
+    is_given = elevation is not None or plane_height_m is not None
+    missing = plan.elevation if ground is None and not is_given else None
+    if ground is None and points is not None:
+        ground = _plane_of_points(points, offset_m)
     if ground is None:
-        _, plan = mount_of(mission)
         ground = _plane(plan.ground_height_m + offset_m, None)
     grid = _grid(images, ground, gsd_m)
+    check = check_ground(
+        ground.surface, georeference, frame, [one.pose for one in images], points, missing
+    )
     return OrthoBlock(
         mission, image, images, georeference, frame, ground, grid, orientation,
-        (*failures, *unread),
+        (*failures, *unread), check,
     )  # fmt: skip
 
 
@@ -242,39 +248,6 @@ def _geometry(mission: Mission, folder: Path | None) -> tuple[VirtualImage, tupl
         )
     heads = adjusted_heads(folder)
     return perspective_of(heads[0]), heads
-
-
-def _only_triangulation(mission: Mission) -> Path | None:
-    """The mission's triangulation; several are refused, for they differ."""
-    found = sorted(p.parent for p in mission.export_dir.glob(f"triangulation/*/{EXTERIOR_FILE}"))
-    if len(found) > 1:
-        raise OrthomosaicError(
-            f"{mission.path}: {len(found)} triangulations ({', '.join(p.name for p in found)}); "
-            "name one with --triangulation"
-        )
-    return found[0] if found else None
-
-
-def _triangulated(
-    folder: Path, crs: str | None
-) -> tuple[Georeference, Sequence[str], Array, Array]:
-    """System, names, places (n, 3) and angles (n, 3) deg of adjusted orientations."""
-    file = folder / EXTERIOR_FILE
-    table = read_table(file, ("image", *_PLACE, *_ANGLES), (*_ALSO, "sk_deg"))
-    with file.open(encoding="utf-8") as text:
-        stated = _CRS_LINE.match(text.readline())
-    if stated is None:
-        raise OrthomosaicError(f"{file}: its first line names no coordinate system")
-    if crs is not None and crs != stated[1]:
-        raise OrthomosaicError(
-            f"{folder} is in {stated[1]}, not in {crs}; leave --crs out, or triangulate in {crs}"
-        )
-    names = table.names("image")
-    place = np.array([table.numbers(c) for c in _PLACE]).T.reshape(-1, 3)
-    angles = np.array([table.numbers(c) for c in _ANGLES]).T.reshape(-1, 3)
-    if table.problems or not np.isfinite(place).all() or not np.isfinite(angles).all():
-        raise OrthomosaicError("; ".join(table.problems) or f"{file}: a cell without a number")
-    return Georeference(stated[1]), names, place, angles
 
 
 def _images(
@@ -355,7 +328,7 @@ def _bands(mission: Mission, number: int) -> tuple[str, ...]:
 
 
 def _ground(
-    mission: Mission,
+    plan: PlanSection,
     georeference: Georeference,
     elevation: Path | None,
     plane_height_m: float | None,
@@ -365,7 +338,6 @@ def _ground(
         raise OrthomosaicError("--elevation and --ground-height exclude each other; give one")
     if plane_height_m is not None:
         return _plane(plane_height_m, None)
-    _, plan = mount_of(mission)
     if elevation is None and plan.elevation is not None and plan.elevation.is_file():
         elevation = plan.elevation
     if elevation is None:
@@ -374,34 +346,17 @@ def _ground(
     return Ground(model, sha256_hex(elevation.read_bytes()))
 
 
-def _frame_of(folder: Path) -> LocalFrame | None:
-    """The local frame of a triangulation's points."""
-    try:
-        stated = json.loads((folder / FRAME_FILE).read_text(encoding="utf-8"))
-        return LocalFrame(float(stated["latitude_deg"]), float(stated["longitude_deg"]))
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
-
-
 def _plane(height_m: float, relief_rms_m: float | None) -> Ground:
     return Ground(height_m, f"plane {height_m!r}", relief_rms_m)
 
 
-def _plane_of_points(folder: Path, frame: LocalFrame | None, offset_m: float) -> Ground | None:
+def _plane_of_points(points: ObjectPoints, offset_m: float) -> Ground:
     """A plane at the median height of the adjusted object points, and their RMS about it.
 
     Args:
         offset_m: heights of the grid's system less those above the ellipsoid.
     """
-    if frame is None or not (folder / POINTS_FILE).exists():
-        return None
-    axes = ("x_m", "y_m", "z_m")
-    table = read_table(folder / POINTS_FILE, ("point", *axes), ("sx_m", "sy_m", "sz_m", "rays"))
-    xyz = np.array([table.numbers(c) for c in axes]).T.reshape(-1, 3)
-    xyz = xyz[np.isfinite(xyz).all(axis=1)]
-    if not len(xyz):
-        return None
-    height = frame.to_geodetic(xyz)[:, 2] + offset_m
+    height = points.geodetic[:, 2] + offset_m
     middle = float(np.median(height))
     spread = np.abs(height - middle)
     kept = spread <= np.percentile(spread, 99.0)

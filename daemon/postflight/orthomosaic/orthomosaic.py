@@ -15,7 +15,7 @@ from daemon.mission.store import durable
 from daemon.mission.store.publication import published
 from daemon.postflight.batch.batch_run import StepCompute, in_this_process
 from daemon.postflight.orthomosaic.cells import CellSurvey, cell_grid, survey
-from daemon.postflight.orthomosaic.inputs import OrthoBlock, OrthomosaicError, described_ground
+from daemon.postflight.orthomosaic.inputs import OrthoBlock, described_ground
 from daemon.postflight.orthomosaic.orthomosaic_work import (
     OrthomosaicRequest,
     OrthomosaicWork,
@@ -26,6 +26,7 @@ from daemon.postflight.orthomosaic.orthomosaic_work import (
 from daemon.postflight.orthomosaic.rasters import IMAGES, tone_curves, write_cog
 from daemon.postflight.orthomosaic.seam_file import write_seams
 from daemon.postflight.orthomosaic.tiles import TilePlan, missing_tiles, plan_tiles, stored_nbytes
+from daemon.postflight.orthomosaic.triangulated import OrthomosaicError
 from daemon.postflight.orthomosaic.work_folder import refuse_foreign_places, work_folder
 from processing.image.orthoimage.ground_grid import GroundGrid
 from processing.radiometry.tone_curve import curve_as_json
@@ -188,7 +189,8 @@ def _report(
         "orientation": block.orientation,
         "crs": block.georeference.name,
         "height_system": block.georeference.height_system,
-        "ground": described_ground(block.ground),
+        "ground": described_ground(block.ground) | block.ground_check.as_json(),
+        "findings": [one.as_json() for one in block.ground_check.findings],
         "gsd_m": grid.gsd_m,
         "width_px": grid.width_px,
         "height_px": grid.height_px,

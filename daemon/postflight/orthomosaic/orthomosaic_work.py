@@ -14,10 +14,10 @@ from daemon.postflight.batch.executor import BatchTask
 from daemon.postflight.orthomosaic.cells import ImageCells, cells_of
 from daemon.postflight.orthomosaic.inputs import (
     OrthoBlock,
-    OrthomosaicError,
     block_for_orthomosaic,
 )
 from daemon.postflight.orthomosaic.tiles import TileJob, store_tile
+from daemon.postflight.orthomosaic.triangulated import OrthomosaicError
 
 PIXEL_NBYTES: Final = 24
 """Of one pixel of an image that is read whole, with colour, its pansharpened bands and their

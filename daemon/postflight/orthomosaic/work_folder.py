@@ -18,7 +18,7 @@ from typing import Final
 from daemon.mission.layout import Mission
 from daemon.mission.store import durable
 from daemon.mission.store.output_places import refuse_foreign_files, refuse_mission_folder
-from daemon.postflight.orthomosaic.inputs import OrthomosaicError
+from daemon.postflight.orthomosaic.triangulated import OrthomosaicError
 
 WORK_SUFFIX: Final = ".work"
 _CURE: Final = "give another folder with --out"

@@ -21,9 +21,11 @@ from daemon.onboard.triangulation.findings import (
     findings_of,
     left_out_exposures,
 )
+from daemon.onboard.triangulation.flown_plan import missing_at_ends
 from daemon.onboard.triangulation.heading_check import headings_off
 from daemon.onboard.triangulation.height_model_check import check_heights, read_relief
 from daemon.orientation.exterior_orientation import mount_of
+from daemon.planning.model import PlannedLine
 from daemon.planning.plan_readers import read_plan
 from daemon.postflight.triangulation.triangulation import ImageBlock, TriangulationSettings
 from processing.bundle.adjust import Adjustment, adjust
@@ -64,11 +66,17 @@ def block_findings(
         variance = np.einsum("pii->pi", result.point_cofactor[good])
         sigma = np.sqrt(variance_factor(result.sigma0) * np.clip(variance, 0.0, None))
         heights = check_heights(relief, block.frame, result.state.points[good], sigma)
+    planned = _planned_lines(block.mission)
     return findings_of(
         block_ties(block, tied, result),
         drifts,
         skipped=block.skipped,
-        planned_lines=_planned_lines(block.mission),
+        planned_lines=[line.id for line in planned],
+        missing_at_ends=missing_at_ends(
+            planned,
+            block.lines,
+            np.array([(eo.latitude_deg, eo.longitude_deg) for eo in block.oriented]),
+        ),
         heights=heights,
         has_landed=True,
     )
@@ -168,10 +176,10 @@ def _velocity(position_m: Array, line_of: Sequence[str], time_s: Array) -> Array
     return velocity
 
 
-def _planned_lines(mission: Mission) -> tuple[str, ...]:
+def _planned_lines(mission: Mission) -> tuple[PlannedLine, ...]:
     if mission.plan_path is None:
         return ()
     try:
-        return tuple(line.id for line in read_plan(mission.plan_path).lines)
+        return read_plan(mission.plan_path).lines
     except (OSError, DaemonError):
         return ()

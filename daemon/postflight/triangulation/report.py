@@ -156,6 +156,7 @@ def write_triangulation(
         ProjectError: the folder holds a project.
         OutputPlaceError: it holds something else.
     """
+    report = {"mission": block.mission.about().get("id"), **report}
     with new_project(folder) as part:
         _fill(part, block, project, result, report)
 

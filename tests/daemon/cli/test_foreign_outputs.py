@@ -18,6 +18,7 @@ from daemon.mission.store.output_places import OutputPlaceError
 from daemon.onboard.monitoring.access.certificate_authority import issue_certificate
 from daemon.onboard.monitoring.access.certificates import TlsCertificateError
 from daemon.postflight.exchange.mission_export import _own_files
+from daemon.postflight.export.stac import _FILES as STAC_FILES
 from daemon.postflight.export.support_bundle import write_bundle
 from processing.rig import find_rig
 from tests.daemon.postflight.small_adjustment_block import write_small_block
@@ -169,7 +170,7 @@ def test_a_certificate_of_another_authority_is_not_replaced(tmp_path: Path) -> N
         issue_certificate(other.parent)
 
 
-def test_exported_blocks_are_told_from_results_of_the_program() -> None:
+def test_exported_blocks_are_distinguished_from_results_of_the_program() -> None:
     own = _own_files({"sparse/cameras.txt": "", "sparse/images.txt": ""})
     for name in ("sparse/rigs.txt", "images/a/1.jpg", "about.json", "database.db"):
         assert own.fullmatch(name), name
@@ -178,3 +179,10 @@ def test_exported_blocks_are_told_from_results_of_the_program() -> None:
     own = _own_files({"reconstruction.json": "", "image_groups.txt": ""})
     assert own.fullmatch("rig_cameras.json") and not own.fullmatch("tracks.csv")
     assert not own.fullmatch("/points.txt")
+
+
+def test_items_of_stac_are_distinguished_from_files_of_others() -> None:
+    for name in ("collection.json", "000001/000001.json", "m-pan-8/m-pan-8.json"):
+        assert STAC_FILES.fullmatch(name), name
+    for name in ("catalog.json", "000001/notes.json", "notes.txt", "000001/000001.json.bak"):
+        assert not STAC_FILES.fullmatch(name), name

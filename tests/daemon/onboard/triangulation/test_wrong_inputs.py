@@ -14,14 +14,15 @@ import numpy as np
 import pytest
 
 from daemon.mission.layout import Mission
+from daemon.onboard.live_orthomosaic.map_ground import ModelGround
+from daemon.onboard.monitoring.server_messages import message_of
 from daemon.onboard.triangulation.findings import (
     BlockTies,
-    HeightModelCheck,
     TriangulationFinding,
     findings_of,
 )
 from daemon.onboard.triangulation.heading_check import headings_off
-from daemon.onboard.triangulation.height_model_check import check_heights
+from daemon.onboard.triangulation.height_model_check import HeightModelCheck, check_heights
 from daemon.onboard.triangulation.mission_triangulation import MissionTriangulation
 from daemon.orientation.exterior_orientation import sealed_exposures
 from daemon.orientation.local_frame import LocalFrame
@@ -169,6 +170,14 @@ def test_a_wrong_heading_is_named_only_where_nothing_ties() -> None:
 
 def _check(off_m: np.ndarray) -> HeightModelCheck:
     """Tie points that lie that far from a level model at 300 m."""
+    return _against(300.0 + off_m, lambda en: np.full(len(en), 300.0))
+
+
+def _tied() -> BlockTies:
+    return _ties(ties=(40,) * 4, own_line=((40, 30),) * 4)
+
+
+def _against(height_m: np.ndarray, heights_at) -> HeightModelCheck:
     frame = LocalFrame(47.0, 15.0)
     relief = SimpleNamespace(
         system=SimpleNamespace(
@@ -176,10 +185,11 @@ def _check(off_m: np.ndarray) -> HeightModelCheck:
                 east_m=longitude, north_m=latitude, height_m=height
             )
         ),
-        model=SimpleNamespace(at=lambda en: np.full(len(en), 300.0)),
+        model=SimpleNamespace(at=heights_at),
     )
-    xyz = np.column_stack([np.zeros(len(off_m)), np.zeros(len(off_m)), 300.0 + off_m])
-    return check_heights(relief, frame, xyz, np.full((len(off_m), 3), 0.3))
+    count = len(height_m)
+    xyz = np.column_stack([np.zeros(count), np.zeros(count), height_m])
+    return check_heights(relief, frame, xyz, np.full((count, 3), 0.3))
 
 
 def test_a_height_model_of_another_datum_or_of_other_ground_is_named() -> None:
@@ -200,3 +210,57 @@ def test_a_height_model_of_another_datum_or_of_other_ground_is_named() -> None:
     few = fits.copy()
     few[:10] += 25.0
     assert _found(tied, _check(few)) == {}
+
+
+@pytest.mark.parametrize("unit", [(3.2808, "feet"), (0.001, "kilometres"), (100.0, "centimetres")])
+def test_a_height_model_in_another_unit_is_named(unit: tuple[float, str]) -> None:
+    factor, name = unit
+    random = np.random.default_rng(1)
+    points = 300.0 + random.normal(0.0, 0.5, 200)
+    check = _against(points, lambda en: np.full(len(en), 300.0 * factor))
+    found = _found(_tied(), check)["HEIGHT_MODEL_CONTRADICTED"]
+    assert f"in {name}" in found and "geoid" not in found
+    message = message_of(found)
+    assert message is not None and message["code"].endswith("height_unit")
+
+
+def test_tie_points_without_a_height_in_the_model_are_counted() -> None:
+    half = np.arange(200) % 2 == 0
+    heights = iter(np.where(half, np.nan, 300.0))
+    check = _against(np.full(200, 300.2), lambda en: np.array([next(heights) for _ in en]))
+    assert check.uncovered == pytest.approx(0.5)
+    found = _found(_tied(), check)
+    assert list(found) == ["HEIGHT_MODEL_INCOMPLETE"]
+    assert "50 % of the tie points" in found["HEIGHT_MODEL_INCOMPLETE"]
+    message = message_of(found["HEIGHT_MODEL_INCOMPLETE"])
+    assert message is not None and message["code"].endswith("height_incomplete")
+    few = iter(np.where(np.arange(200) < 3, np.nan, 300.0))
+    assert _found(_tied(), _against(np.full(200, 300.2), lambda en: np.array([next(few)]))) == {}
+    assert "HEIGHT_MODEL_FAILED" in _found(
+        _tied(), _against(np.full(200, 300.2), lambda en: np.full(len(en), np.nan))
+    )
+
+
+def test_lines_left_before_their_end_are_named_after_landing() -> None:
+    def found(has_landed: bool) -> list[TriangulationFinding]:
+        return list(
+            findings_of(
+                _tied(), (), skipped={}, planned_lines=("A", "B"), missing_at_ends={"A": 3},
+                has_landed=has_landed,
+            )
+        )  # fmt: skip
+
+    assert found(has_landed=False) == []
+    ends, whole = found(has_landed=True)
+    assert ends.name == whole.name == "PLAN_CUT_SHORT"
+    assert ends.lines == ("A",) and whole.lines == ("B",)
+    assert "3 planned exposures at the ends of lines A have no image" in ends.sentence
+    message = message_of(ends.sentence)
+    assert message is not None and message["code"].endswith("plan_short_ends")
+
+
+def test_the_live_map_states_which_share_of_tie_points_its_model_has_no_height_for() -> None:
+    ground = ModelGround(SimpleNamespace(), 0.4567)
+    assert ground.as_json() == {"kind": "height model", "uncovered": 0.457}
+    # Another share alone is no other ground: no tile is sent again for it.
+    assert ground == ModelGround(ground.relief, 0.2) != ModelGround(SimpleNamespace(at=1), 0.4567)
