@@ -11,6 +11,7 @@ import pytest
 
 from processing.quality.evaluation import evaluate
 from processing.quality.figures import QualityFigures
+from processing.quality.figures.circumstances import SmearFigures
 from processing.quality.report import NO_FLAGS, Flag, QualityReport, Thresholds, Verdict, as_json
 
 GOOD = {
@@ -235,3 +236,16 @@ def test_sensors_that_rest_on_calibration_are_reported() -> None:
     report = evaluated(GOOD | {"resting_on_calibration": "SU00, SU10"})
     assert report.flags == Flag.TIE_POINTS and report.verdict is Verdict.USABLE
     assert "Too little detail to place SU00, SU10" in report.findings[0].sentence
+
+
+@pytest.mark.parametrize(
+    ("shifts", "named"), [(0, True), (None, False), (2, False)], ids=["none", "not known", "two"]
+)
+def test_motion_without_tdi_shifts_in_the_record_names_the_setting(
+    shifts: int | None, named: bool
+) -> None:
+    smear = SmearFigures(smear_along_px=1.5, smear_across_px=1.2, tdi_shifts_max=shifts)
+    along, across = evaluate(QualityFigures(smear)).findings
+    assert along.flag == across.flag == Flag.BLUR
+    assert ("settings.TdiShifts" in along.sentence) == named
+    assert across.sentence.startswith("Motion blur across track; shorten")

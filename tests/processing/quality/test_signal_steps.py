@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from processing.geometry.placement import nominal_placements, vip_mm_from_raw
 from processing.image.line_means import line_means
 from processing.quality.frame_blocks import _have_runs, _texture
-from processing.quality.ground_steps import GroundView
+from processing.quality.ground_steps import Axis, GroundView, LineStep
 from processing.quality.signal_steps import (
     SignalStep,
     _largest,
@@ -17,6 +17,7 @@ from processing.quality.signal_steps import (
     _signs,
     signal_steps,
     step_figures,
+    without_edges,
 )
 from processing.rig import find_rig
 
@@ -272,3 +273,23 @@ def test_runs_of_steps_and_texture_are_those_of_numpy() -> None:
         assert np.flatnonzero(rises).tolist() == [50] and not falls.any()
         rises, falls = _have_runs(sign * made, 150.0, 4)[:: int(sign)]
         assert np.flatnonzero(rises).tolist() == [50, 120] and not falls.any()
+
+
+@pytest.mark.parametrize(
+    ("axis", "lines", "rows", "stays"),
+    [
+        ("rows", (0, 1), 2, False),
+        ("rows", (2,), 2, True),
+        ("rows", (0, 400), 2, True),
+        ("rows", (829, 830), 2, False),
+        ("rows", (828,), 2, True),
+        ("columns", (0, 1), 2, True),
+        ("rows", (0,), 0, True),
+    ],
+)
+def test_steps_in_partly_exposed_rows_are_left_out(
+    axis: Axis, lines: tuple[int, ...], rows: int, stays: bool
+) -> None:
+    every = tuple(LineStep("SU00", axis, at, 0.3) for at in lines)
+    steps = (SignalStep("SU00", axis, lines[0], 0.3, len(lines), every),)
+    assert without_edges(SENSORS, steps, rows) == (steps if stays else ())
