@@ -17,7 +17,7 @@ import sys
 import threading
 import time
 import tomllib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -85,12 +85,12 @@ the time of its request too: it includes the exposures that were processed befor
 class Running:
     """A service and its output."""
 
-    def __init__(self, config: Path) -> None:
+    def __init__(self, config: Path, within: Sequence[str] = ()) -> None:
+        """Start it; `within` is a command that starts another one, such as one for namespaces."""
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "daemon", "run", str(config), "--json-lines"],
+            [*within, sys.executable, "-m", "daemon", "run", str(config), "--json-lines"],
             cwd=ROOT,
             stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
             text=True,
         )
         self.events: list[dict[str, Any]] = []
@@ -114,6 +114,8 @@ class Running:
             try:
                 self.events.append(self._new_events.get(timeout=0.2))
             except queue.Empty:
+                status = self.process.poll()
+                assert status is None, f"it ended with status {status}: {self.events[-3:]}"
                 assert watch.is_within(within_s), f"not within {within_s} s: {self.events[-3:]}"
 
 

@@ -31,6 +31,7 @@ from tests.daemon.onboard.monitoring.cockpit import (
 )
 from tests.daemon.onboard.monitoring.cockpit_flight import (
     HEADS,
+    MISSING,
     cockpit_in,
     degrade,
     expose,
@@ -84,6 +85,11 @@ def test_before_arming(cockpit: Cockpit) -> None:
     assert "R: 2000 µs" in cockpit.browser.text("#exposure-suggestion [data-group=R]")
     cockpit.until("document.querySelector('[data-check=test].good') !== null")
     assert cockpit.browser.text("#phase-button") == "Arm"
+    cockpit.browser.evaluate("window.test = document.querySelector('#test-exposure')")
+    cockpit.status("ready", triggers=1, left=4100, missing=MISSING)
+    cockpit.until("document.querySelector('[data-check=disk]').innerText.includes('615')")
+    assert cockpit.browser.evaluate("window.test.isConnected")
+    cockpit.status("ready", triggers=1, missing=MISSING)
     check(cockpit, "before-arming")
 
 
@@ -283,6 +289,15 @@ def test_after_landing_the_summary_stays_without_an_alarm(cockpit: Cockpit) -> N
         assert (
             browser.evaluate(f"document.querySelector('[data-action={action}]').disabled") is False
         )
+    # The time of the summary goes on; a button that were made again would lose a touch.
+    browser.evaluate("window.verify = document.querySelector('[data-action=verify]')")
+    shown = browser.text("[data-summary=time]")
+    cockpit.mono_s += 5.0
+    cockpit.status("landed", triggers=9)
+    cockpit.until(
+        f"document.querySelector('[data-summary=time]').innerText !== {json.dumps(shown)}"
+    )
+    assert browser.evaluate("window.verify.isConnected")
     check(cockpit, "landed", phone_tab="flight")
     cockpit.service.end()
     cockpit.until("document.body.classList.contains('flight-ended')")
