@@ -206,6 +206,13 @@ def test_after_the_last_line_the_large_button_lands(service: Service, browser: B
     service.emit(armed | {"lines": lines})
     browser.wait_for(button.format("Land"), WITHIN_S)
     assert browser.text("#phase-second") == "Start line"
+    # Also where the lines of the plan were flown without a stop.
+    flying = flight_events.status("flying", triggers=1)
+    service.emit(flying | {"lines": lines | {"flown": [], "current": "A1"}})
+    browser.wait_for(button.format("Stop line"), WITHIN_S)
+    service.emit(flying | {"lines": lines})
+    browser.wait_for(button.format("Land"), WITHIN_S)
+    assert browser.text("#phase-second") == "Stop line"
     # Without a position nothing is next, although the line is left.
     service.emit(armed | {"lines": lines | {"flown": []}})
     browser.wait_for(button.format("Start line"), WITHIN_S)

@@ -11,6 +11,8 @@ const NEXT = { ready: "arm", armed: "start", flying: "stop" };
 // What the large button does in a phase: a command, "alarms" to open their page, or nothing.
 function commandsOf(brief) {
   if (brief.phase === "fault") return { next: ALARMS, second: null };
+  // A plan is flown line after line without a stop between them.
+  if (brief.phase === "flying" && isPlanFlown(brief.status?.lines)) return { next: "land", second: "stop" };
   const hasFlown = (brief.status?.ledger?.triggers?.triggers ?? 0) > 0;
   if (brief.phase !== "armed" || !hasFlown) return { next: NEXT[brief.phase] ?? null, second: null };
   // After the last planned line the next step is the landing.
