@@ -37,18 +37,24 @@ class FreePrincipalPoint:
     """The interior orientation with an estimated principal point, in pixels.
 
     `change_px` is that of the principal distance against the held principal point, `point_px` the
-    principal point's column and row from the middle.
+    principal point's column and row from the middle, `f_sigma_px` the standard deviation of the
+    principal distance with it.
     """
 
     change_px: float
     point_px: tuple[float, float]
     point_sigma_px: tuple[float, float]
+    f_sigma_px: float
 
     def contradicts(self, f_sigma_px: float) -> bool:
         """Whether the point is off the middle and f changes beyond its standard deviation."""
         pairs = zip(self.point_px, self.point_sigma_px, strict=True)
         is_off = any(abs(value) > SIGNIFICANT * sigma for value, sigma in pairs)
         return is_off and abs(self.change_px) > F_CHANGE * f_sigma_px
+
+    def widens(self, f_sigma_px: float) -> bool:
+        """Whether the principal distance is much less accurate than with a held point."""
+        return bool(self.f_sigma_px > F_CHANGE * f_sigma_px)
 
 
 def free_principal_point(
@@ -120,7 +126,6 @@ def _pitch_mm(camera: CameraModel) -> float:
 
 def _changes(held: Adjustment, free: Adjustment) -> tuple[FreePrincipalPoint, ...]:
     """Of each camera, from one adjustment to the other."""
-    at = {name: INTERIOR.index(name) for name in _POINT}
     found = []
     for k, camera in enumerate(held.network.cameras):
         pitch = _pitch_mm(camera)
@@ -128,11 +133,13 @@ def _changes(held: Adjustment, free: Adjustment) -> tuple[FreePrincipalPoint, ..
         f_mm, x_mm, y_mm = perspective_mm(camera, interior)
         change_mm = f_mm - perspective_mm(camera, held.state.interior[k])[0]
         sigma0 = free.sigma0 * f_mm / camera.f_mm
-        sx, sy = (
-            sigma0 * float(np.sqrt(free.cofactor[columns[at[name]], columns[at[name]]])) / pitch
-            for name in _POINT
+        sx, sy, sf = (
+            sigma0 * float(np.sqrt(free.cofactor[column, column])) / pitch if column >= 0 else 0.0
+            for column in (columns[INTERIOR.index(name)] for name in (*_POINT, "df"))
         )
         # y is up in mm, down in px.
         point_px = (x_mm - camera.xp_mm) / pitch, (camera.yp_mm - y_mm) / pitch
-        found.append(FreePrincipalPoint(change_mm / pitch, point_px, (sx, sy)))
+        found.append(
+            FreePrincipalPoint(change_mm / pitch, point_px, (sx, sy), sf * f_mm / camera.f_mm)
+        )
     return tuple(found)

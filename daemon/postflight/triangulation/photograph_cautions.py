@@ -99,6 +99,16 @@ def _camera_cautions(section: Mapping[str, Any], *, is_only: bool) -> list[str]:
             "f: stated standard deviations hold for these parameters only. Lines across, two "
             "heights or control points separate them"
         )
+    elif section["f_hardly_separated_from_point"]:
+        free = section["principal_point_free"]
+        x, y = free["point_sigma_px"]
+        found.append(
+            f"{of}the standard deviation of f, {section['f_sigma_px']:.2f} px, holds for a "
+            f"principal point in the middle; with an estimated one it is {free['f_sigma_px']:.2f} "
+            f"px, for these photographs determine the point to {x:.1f} columns and {y:.1f} rows "
+            "only. Take the larger one where the camera's principal point is not known; "
+            "photographs turned by 90 degrees, two heights or control points separate them"
+        )
     drift = abs(section["f_px"] / section["f_exif_px"] - 1.0)
     if drift > 0.05:
         found.append(

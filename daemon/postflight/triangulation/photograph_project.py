@@ -314,7 +314,7 @@ def photographs_section(
         result: of the adjustment.
         free: the same with estimated principal points; None where they cannot be estimated.
 
-    Keys from `f_exif_px` to `f_depends_on_principal_point` are those of the first camera;
+    Keys from `f_exif_px` to `f_hardly_separated_from_point` are those of the first camera;
     `cameras` has them of each.
     """
     block = found.block
@@ -375,6 +375,7 @@ def _camera_section(
         "principal_point_free": None if free is None else vars(free),
         "principal_point_estimated": int(result.layout.interior[camera][0]) >= 0,
         "f_depends_on_principal_point": free is not None and free.contradicts(sigma_px),
+        "f_hardly_separated_from_point": free is not None and free.widens(sigma_px),
     }
 
 
