@@ -93,6 +93,7 @@ def process(
 ) -> None:
     from daemon.mission.transfer.object_store import is_store_url
     from daemon.planning.overlaps import overlaps_of
+    from daemon.postflight.batch.in_process import InProcessExecutor
     from daemon.postflight.batch.level2_sources import level2_source
     from daemon.postflight.batch.level2_work import Level2Work
     from daemon.postflight.batch.software_identity import software_identity
@@ -141,6 +142,7 @@ def process(
                 return
             if not (found.pending or found.complete):
                 _refuse_unsuitable(folder, work)
+            work = replace(work, shares_maps=not isinstance(placed.executor, InProcessExecutor))
             placed_work = replace(source.placed(work), threads=placed.threads)
             _run(source, placed_work, found, placed, as_json=as_json)
 

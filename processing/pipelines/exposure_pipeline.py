@@ -174,6 +174,12 @@ class ExposurePipeline(ABC, Generic[SettingsT, CorrectedT, AdjustedT, ImageT, Pr
         self.rig = rig
         self.settings = settings
         self.kernels = pixel_kernels(settings.device)
+        self._correctors: dict[str, Corrector] = {}
+
+    @property
+    def correctors(self) -> dict[str, Corrector]:
+        """Calibrations by sensor name; one may be replaced by an equal one in other memory."""
+        return self._correctors
 
     def process(
         self,

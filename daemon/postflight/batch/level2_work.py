@@ -38,6 +38,7 @@ from daemon.products.exposure_products import (
     make_products,
 )
 from daemon.products.processor import Processor, processor_for
+from daemon.products.shared_maps import share_maps
 from processing.image.accelerator.devices import with_same_pixels
 from processing.rig import Rig, load_rig
 
@@ -63,7 +64,8 @@ class Level2Work:
     """What all exposures of a run have in common; it can be pickled.
 
     `identity` is `software_identity` of the command: a worker with another one refuses the work.
-    `threads` is of one process and takes the place of that of `processing`.
+    `threads` is of one process and takes the place of that of `processing`. `shares_maps`: the
+    processes of one machine have one copy of the calibration maps.
     """
 
     mission: Path
@@ -74,6 +76,7 @@ class Level2Work:
     identity: Mapping[str, str]
     recomputes: bool = False
     threads: int = 1
+    shares_maps: bool = False
 
     @property
     def memory_nbytes(self) -> int:
@@ -101,6 +104,8 @@ class Level2Work:
         updated = {"threads": self.threads, "device": device}
         processing = self.processing.model_copy(update=updated)
         processor = processor_for(rig, mission, processing, self.radiometry)
+        if self.shares_maps:
+            share_maps(processor.pipeline.correctors)
         processor.warm_up()
         mount, _ = mount_of(mission)
         geometry = FlightGeometry(mount, self.plan, ground_of(rig, mount, self.plan))
