@@ -28,7 +28,8 @@ from benchmarks.silent_errors.planting import (
     scaled,
     sensors_of_several,
 )
-from processing.rig import Cone, Rig, Sensor
+from benchmarks.silent_errors.slip_faults import slip
+from processing.rig import Cone, Sensor
 
 
 def _principal_distance(emulated: EmulatedExposure, ppm: float, random: Random) -> Fault:
@@ -79,38 +80,6 @@ def _sensor_rotated(emulated: EmulatedExposure, urad: float, random: Random) -> 
         lambda s: replace(s, rotation_rad=s.rotation_rad + off * 1e-6),
         f"rotated {off:+.0f} urad",
     )
-
-
-def _slip(emulated: EmulatedExposure, lines: float, random: Random) -> Fault:
-    name = any_of(random, [*pan_sensors(emulated.rig), *_leading(emulated.rig)])
-    axis = int(random.integers(0, 2))
-    sensor = emulated.rig.sensor(name)
-    size = (sensor.height_px, sensor.width_px)[axis]
-    count = min(round(lines), size // 2)
-    first, by = int(random.integers(8, size - count - 8)), int(random.integers(1, 5))
-    last = first + count
-
-    def change(frame: Array) -> Array:
-        rows = frame if axis == 0 else frame.T
-        rows[first:last] = rows.copy()[np.clip(np.arange(first, last) + by, 0, size - 1)]
-        return frame
-
-    def content(raw: Array) -> Array:
-        at = raw[:, 1 - axis]
-        inside = (at >= first - 0.5) & (at < last - 0.5)
-        moved = raw.copy()
-        moved[inside, 1 - axis] += by
-        return moved
-
-    description = f"{count} {('rows', 'columns')[axis]} from {first} on are those {by} further on"
-    fault = of_frame(emulated, name, change, description)
-    return replace(fault, emulated=replace(fault.emulated, content={name: content}))
-
-
-def _leading(rig: Rig) -> list[str]:
-    """The colour head that is stitched."""
-    name = rig.colour_master_cone
-    return [] if name is None else [rig.cone(name).sensors[0].name]
 
 
 def _blurred(sigma: float) -> Callable[[Array], Array]:
@@ -400,7 +369,7 @@ FAULTS: Final[Mapping[str, FaultInjector]] = {
     "cone-turned": _cone_rotated,
     "sensor-displaced": _sensor_displaced,
     "sensor-rotated": _sensor_rotated,
-    "slip": _slip,
+    "slip": slip,
     "blur": _blur,
     "blur-region": _blur_region,
     "blur-band": _blur_band,

@@ -22,6 +22,7 @@ from benchmarks.silent_errors.planting import (
     pan_sensors,
     scaled,
 )
+from benchmarks.silent_errors.slip_faults import row_inserted
 from processing.rig import Sensor
 
 SMEARS: Final = 8
@@ -32,27 +33,6 @@ def _exposure_half(emulated: EmulatedExposure, _: float, random: Random) -> Faul
     name = any_of(random, pan_sensors(emulated.rig))
     sensor = emulated.rig.sensor(name)
     return of_frame(emulated, name, lambda f: scaled(sensor, f, 0.5), "exposed half as long")
-
-
-def _row_inserted(emulated: EmulatedExposure, _: float, random: Random) -> Fault:
-    rig = emulated.rig
-    leading = rig.colour_master_cone
-    green = [] if leading is None else [rig.cone(leading).sensors[0].name]
-    name = any_of(random, [*pan_sensors(rig), *green])
-    height = rig.sensor(name).height_px
-    row = int(random.integers(height // 5, height - height // 5))
-
-    def change(frame: Array) -> Array:
-        frame[row + 1 :] = frame[row:-1].copy()
-        return frame
-
-    def content(raw: Array) -> Array:
-        moved = raw.copy()
-        moved[raw[:, 1] > row + 0.5, 1] -= 1.0
-        return moved
-
-    fault = of_frame(emulated, name, change, f"row {row} twice, the rest one row further on")
-    return replace(fault, emulated=replace(fault.emulated, content={name: content}))
 
 
 def _stuck_column(emulated: EmulatedExposure, _: float, random: Random) -> Fault:
@@ -177,7 +157,7 @@ def _frame_flipped(emulated: EmulatedExposure, _: float, random: Random) -> Faul
 
 FRAME_FAULTS: Final[Mapping[str, FaultInjector]] = {
     "exposure-half": _exposure_half,
-    "row-inserted": _row_inserted,
+    "row-inserted": row_inserted,
     "stuck-column": _stuck_column,
     "gain-step-oblique": _gain_step_oblique,
     "gain-step-oblique-colour": _gain_step_oblique_colour,

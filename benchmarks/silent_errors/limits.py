@@ -39,7 +39,10 @@ LIMITS: Final[Mapping[str, Limit]] = {
     "cone-turned": Limit("a cone turned about one axis", "urad", {X: 150.0, L: 150.0, DMC: 200.0}),
     "sensor-displaced": Limit("a sensor of a cone of several displaced", "px", {X: 0.3}),
     "sensor-rotated": Limit("a sensor of a cone of several rotated", "urad", {X: 500.0}),
-    "slip": Limit("lines of a frame shifted by 1 to 4 px", "lines", _same_limit(STITCHED, 80.0)),
+    "slip": Limit(
+        "lines of any frame, at its ends too, shifted by 1 to 4 px", "lines",
+        _same_limit(STITCHED, 80.0),
+    ),
     "blur": Limit("a PAN head blurred", "px (sigma)", _same_limit(STITCHED, 1.0)),
     "blur-region": Limit(
         "a quarter of a PAN frame blurred", "px (sigma)", _same_limit(STITCHED, 1.5)
@@ -97,7 +100,8 @@ LIMITS: Final[Mapping[str, Limit]] = {
         "a PAN head exposed half as long, not stated", "", _same_limit(STITCHED, 1.0)
     ),
     "row-inserted": Limit(
-        "one row twice, the rest of the frame one row further on", "", _same_limit(STITCHED, 1.0)
+        "one row twice, the rest of the frame one row further on; 40 rows from its ends", "",
+        _same_limit(STITCHED, 1.0),
     ),
     "stuck-column": Limit("a column stuck at one value", "", _same_limit(EVERY, 1.0)),
     "gain-step-oblique": Limit(

@@ -8,7 +8,7 @@ Source: Heier et al. (2002), 6.1; Ladstädter et al. (2010), steps 5 and 6 of th
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
@@ -98,7 +98,9 @@ class BandRegistration:
     `registered` is False; `textured` counts the positions that were tried there and where the band
     has texture well above noise, `matched` those that matched all the same. `rms_px` is the
     residual length per point, colour pixels. `matched_at` (n, 2) are the places of all matches in
-    the band's frame, `unmatched_at` (m, 2) the positions in green that did not match.
+    the band's frame, `green_at` (n, 2) those in green, `sigma_px` (n,) the standard deviation of a
+    coordinate of each, colour pixels; `unmatched_at` (m, 2) the positions in green that did not
+    match.
     """
 
     band: str
@@ -113,6 +115,8 @@ class BandRegistration:
     unmatched_at: Array = field(
         default_factory=lambda: np.zeros((0, 2), np.int64), compare=False, repr=False
     )
+    green_at: Array = field(default_factory=lambda: np.zeros((0, 2)), compare=False, repr=False)
+    sigma_px: Array = field(default_factory=lambda: np.zeros(0), compare=False, repr=False)
 
 
 def nominal_registration(
@@ -171,19 +175,53 @@ def register_band(
             textured=int(np.count_nonzero(rough)),
             matched=len(sigma),
         )
-    source = vip_mm_from_raw(green, raw_green)
-    target = vip_mm_from_raw(other, raw_band)
-    unit_mm = other.sensor.pitch_mm * _magnification(other, raw_band)
-    homography, rms, used = fit_projective(source, target, sigma * unit_mm)
-    return BandRegistration(
+    matched = BandRegistration(
         band,
         other.sensor.name,
-        homography,
-        used,
-        rms / unit_mm,
-        registered=used >= settings.min_points,
+        np.eye(3),
+        0,
+        None,
+        registered=False,
         matched_at=raw_band,
         unmatched_at=unmatched,
+        green_at=raw_green,
+        sigma_px=sigma,
+    )
+    return fitted_registration(matched, green, other, np.ones(len(sigma), np.bool_), settings)
+
+
+def fitted_registration(
+    matched: BandRegistration,
+    green: SensorPlacement,
+    other: SensorPlacement,
+    keep: Array,
+    settings: ColourSettings,
+) -> BandRegistration:
+    """Estimate the transformation of a band against green from some of its matches.
+
+    Args:
+        matched: the band with its n matches.
+        green: adjusted placement of the green sensor.
+        other: placement of the band's sensor by calibration and TDM.
+        keep: matches to use, (n,).
+        settings: limits.
+
+    Returns:
+        The registration; as calibrated, `registered` False, where fewer matches are used than a
+        transformation needs.
+    """
+    if np.count_nonzero(keep) < settings.min_points:
+        return replace(matched, band_from_green=np.eye(3), points=0, rms_px=None, registered=False)
+    source = vip_mm_from_raw(green, matched.green_at[keep])
+    target = vip_mm_from_raw(other, matched.matched_at[keep])
+    unit_mm = vip_mm_per_pixel(other, matched.matched_at)
+    homography, rms, used = fit_projective(source, target, matched.sigma_px[keep] * unit_mm)
+    return replace(
+        matched,
+        band_from_green=homography,
+        points=used,
+        rms_px=rms / unit_mm,
+        registered=used >= settings.min_points,
     )
 
 
@@ -259,12 +297,20 @@ def _design(h: Array, p: Array) -> Array:
     return design.reshape(-1, 8)
 
 
-def _magnification(placement: SensorPlacement, raw: Array) -> float:
-    """VIP mm per mm on the band's own focal plane, at the points' centre."""
+def vip_mm_per_pixel(placement: SensorPlacement, raw: Array) -> float:
+    """Size of a frame's pixel in the virtual image plane.
+
+    Args:
+        placement: of the frame.
+        raw: places (n, 2), px, at whose centre it is wanted.
+
+    Returns:
+        mm.
+    """
     middle = raw.mean(axis=0)
     corners = middle + np.array([[0.0, 0.0], [100.0, 0.0]])
     xy = vip_mm_from_raw(placement, corners)
-    return float(np.hypot(*(xy[1] - xy[0]))) / (100.0 * placement.sensor.pitch_mm)
+    return float(np.hypot(*(xy[1] - xy[0]))) / 100.0
 
 
 def _match(

@@ -271,24 +271,56 @@ def colour_searches(
             mine = chosen == i
             if not mine.any():
                 continue
-            pair, there = (name, colour), placements[colour]
-            if not whole_ratio or not _differ_by_shift_only(
-                placements[name], there, coverage[name], ratio=whole_ratio
-            ):
-                at = at_colour[mine]
-                region = _region_around(at, there, margin_px + 1)
-                attempted[name] = PairSearch(
-                    pair, PAN_TO_COLOUR, at, at, at.astype(np.float64), step, region
-                )
-                continue
-            first = np.rint(predicted[name][mine] - (whole_ratio - 1) / 2.0).astype(np.int64)
-            centre = first + (whole_ratio - 1) / 2.0
-            expected = raw_from_vip_mm(
-                placements[colour], vip_mm_from_raw(placements[name], centre)
+            attempted[name] = colour_search(
+                (name, colour),
+                placements,
+                coverage[name],
+                predicted[name][mine],
+                at_colour[mine],
+                ratio=whole_ratio,
+                step=step,
+                margin_px=margin_px,
             )
-            at_b = np.rint(expected).astype(np.int64)
-            attempted[name] = PairSearch(pair, PAN_TO_COLOUR, first, at_b, expected, step)
     return list(attempted.values())
+
+
+def colour_search(
+    pair: tuple[str, str],
+    placements: Mapping[str, SensorPlacement],
+    seen: Rectangle,
+    at_pan: Array,
+    at_colour: NDArray[np.int64],
+    *,
+    ratio: int | None,
+    step: int,
+    margin_px: int,
+) -> PairSearch:
+    """The search of one PAN frame in the colour master, from positions in both.
+
+    Args:
+        pair: PAN sensor and colour master.
+        placements: predictions by sensor name.
+        seen: what the PAN sensor covers of the virtual image, mm.
+        at_pan: positions in the PAN frame (n, 2), px.
+        at_colour: the same in the colour master.
+        ratio: whole number of PAN pixels per colour pixel; None where it is none.
+        step: PAN pixels of a side that make one of those compared.
+        margin_px: colour pixels that a window needs around its centre.
+
+    Returns:
+        Boxes of PAN pixels where the frames differ by hardly more than a shift and the ratio, else
+        the region of the colour master as which the PAN frame has to be seen.
+    """
+    pan, there = placements[pair[0]], placements[pair[1]]
+    if not ratio or not _differ_by_shift_only(pan, there, seen, ratio=ratio):
+        region = _region_around(at_colour, there, margin_px + 1)
+        expected = at_colour.astype(np.float64)
+        return PairSearch(pair, PAN_TO_COLOUR, at_colour, at_colour, expected, step, region)
+    first = np.rint(at_pan - (ratio - 1) / 2.0).astype(np.int64)
+    centre = np.asarray(first + (ratio - 1) / 2.0, np.float64)
+    expected = raw_from_vip_mm(there, vip_mm_from_raw(pan, centre))
+    at_b = np.rint(expected).astype(np.int64)
+    return PairSearch(pair, PAN_TO_COLOUR, first, at_b, expected, step)
 
 
 def saturated_window_fraction(

@@ -76,6 +76,22 @@ class TiePoints:
         selected = {name: getattr(self, name)[keep] for name in (*columns, "overlap")}
         return replace(self, **selected)
 
+    def joined(self, others: TiePoints) -> TiePoints:
+        """These points and others of the same names and pairs.
+
+        Args:
+            others: points that follow.
+
+        Returns:
+            A copy with the rows of both.
+        """
+        columns = ("sensor_a", "sensor_b", "raw_a", "raw_b", "sigma_px", "correlation", "kind")
+        both: dict[str, Any] = {
+            name: np.concatenate([getattr(self, name), getattr(others, name)])
+            for name in (*columns, "overlap")
+        }
+        return replace(self, **both)
+
     def counts(self) -> dict[tuple[str, str], int]:
         """Count the points of each searched pair of sensors.
 
@@ -114,7 +130,7 @@ def match_tie_points(
     _check_frames(rig, frames)
     ratio = exact_colour_ratio(rig) or 1.0
     coloured = colour_searches(rig, placements, frames, settings, ratio)
-    to_colour = [_matched(search, placements, frames, settings) for search in coloured]
+    to_colour = [match_pair(search, placements, frames, settings) for search in coloured]
     # Sensors that P/C points tie need few P/P points; the others have nothing else.
     supported = {
         search.pair[0]
@@ -123,7 +139,7 @@ def match_tie_points(
     }
     to_pan = pan_searches(rig, placements, frames, settings, supported=supported)
     searches = to_pan + coloured
-    matches = [_matched(search, placements, frames, settings) for search in to_pan] + to_colour
+    matches = [match_pair(search, placements, frames, settings) for search in to_pan] + to_colour
     names = tuple(sensor.name for sensor in rig.sensors)
     index = {name: i for i, name in enumerate(names)}
     rows = []
@@ -159,13 +175,23 @@ def match_tie_points(
     )
 
 
-def _matched(
+def match_pair(
     search: PairSearch,
     placements: Mapping[str, SensorPlacement],
     frames: Mapping[str, Frame],
     settings: TiePointSettings,
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """The accepted rows of `match_patches` of a pair, in raw pixels; which positions they are."""
+    """Match the positions of one pair of frames.
+
+    Args:
+        search: the positions.
+        placements: predicted places, by sensor name.
+        frames: Level-1 frames by sensor name.
+        settings: windows and limits.
+
+    Returns:
+        The accepted rows of `match_patches`, in raw pixels, and which positions they are.
+    """
     a, b = search.pair
     to_pan = search.kind == PAN_TO_PAN
     if not len(search.at_a):

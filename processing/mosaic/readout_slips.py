@@ -26,6 +26,7 @@ from processing.mosaic.slip_bins import (
     points_of_frame,
     shifted_runs,
 )
+from processing.mosaic.slip_settings import SlipSettings
 from processing.quality.figures.stitching import SlipFigures
 from processing.rig import Rig
 
@@ -39,73 +40,6 @@ MIN_COMMON_FRACTION: Final = 0.3
 ALTERNATIVE_GAIN: Final = 0.8
 ROBUST_LIMIT: Final = 12.0
 """Normalised residual above which a tie point counts as a blunder whatever its size."""
-
-
-@dataclass(frozen=True)
-class SlipSettings:
-    """When a band of residuals is a slip.
-
-    A band holds at least two bins of `bin_points` tie points; the mean of their medians differs
-    from the median of the rest of the frame by more than `limit` standard deviations of
-    independent points, and by more than `min_shift_px`. The second decides on ground where errors
-    of neighbouring points are correlated: relief, trees, clouds, vehicles
-    (docs/explanation/validity.md). All of a band moves: `min_share` of its points have its shift,
-    of vehicles on a road fewer. A head drops whole lines: a band moves by `min_own_px` of its
-    frame's own pixels at least, of which the adjustment leaves `remaining_share`.
-    """
-
-    bin_points: int = 7
-    limit: float = 15.0
-    own_limit: float = 10.0
-    min_share: float = 0.6
-    min_own_px: float = 0.5
-    max_rounds: int = 4
-
-    def min_shift_px(self, points: int) -> float:
-        """The smallest shift of a band that residuals show.
-
-        Args:
-            points: tie points in the band.
-
-        Returns:
-            PAN pixels.
-
-        Source: docs/explanation/mathematics/validity.md#read-out-slips.
-        """
-        return 0.15 + 1.7 / math.sqrt(points)
-
-    def min_whole_px(self, share: float, own_px: float) -> float:
-        """The smallest shift of a band that a head can cause: it shifts by whole pixels.
-
-        Args:
-            share: part of the frame in the band.
-            own_px: size of the frame's own pixel, PAN pixels.
-
-        Returns:
-            PAN pixels.
-
-        Source: docs/explanation/mathematics/validity.md#read-out-slips.
-        """
-        return self.min_own_px * own_px * remaining_share(share)
-
-
-def remaining_share(share: float) -> float:
-    """What a frame's own shift, rotation and scale leave of a band's shift against the rest.
-
-    A straight line fitted to a step of one at the end of a frame takes this much of it; a band in
-    the middle keeps more.
-
-    Args:
-        share: part of the frame in the band, 0 to 1.
-
-    Returns:
-        Shift that is left over the shift; 0.25 for half a frame.
-
-    Example:
-        >>> remaining_share(0.5), remaining_share(0.1)
-        (0.25, 0.73)
-    """
-    return 1.0 - 3.0 * share * (1.0 - share)
 
 
 @dataclass(frozen=True)
@@ -176,7 +110,11 @@ def find_slips(
         if gain <= 0.0:
             break
         if slip.sensor not in {cause.sensor for cause in causes}:
-            causes.append(replace(slip, alternatives=_alternatives(tie_points, slip, gain, found)))
+            others = _alternatives(tie_points, slip, gain, found)
+            others += tuple(
+                n for n in _shown_by_one(tie_points, slip, residuals) if n not in others
+            )
+            causes.append(replace(slip, alternatives=others))
         for side, sign in _sides(tie_points, slip):
             residuals[side] -= sign * np.array([slip.dx_px, slip.dy_px])
     return tuple(causes)
@@ -213,7 +151,14 @@ def inside_slips(tie_points: TiePoints, slips: Sequence[Slip]) -> NDArray[np.boo
     return inside
 
 
-def slip_of(rig: Rig, tie_points: TiePoints, residuals_px: Array, sensor: str) -> Slip | None:
+def slip_of(
+    rig: Rig,
+    tie_points: TiePoints,
+    residuals_px: Array,
+    sensor: str,
+    *,
+    settings: SlipSettings | None = None,
+) -> Slip | None:
     """Measure the slip of one frame by residuals against its calibrated place.
 
     Where the frame has two parts, the one farther from the calibrated place is the shifted one.
@@ -223,11 +168,13 @@ def slip_of(rig: Rig, tie_points: TiePoints, residuals_px: Array, sensor: str) -
         tie_points: all of them.
         residuals_px: as of `find_slips`, of an adjustment that this frame had no part in.
         sensor: the frame.
+        settings: None takes the defaults.
 
     Returns:
         The shifted band; None where the frame has none.
     """
-    slip = next(iter(find_slips(rig, tie_points, residuals_px, sensors=(sensor,))), None)
+    found = find_slips(rig, tie_points, residuals_px, sensors=(sensor,), settings=settings)
+    slip = next(iter(found), None)
     if slip is None:
         return None
     size = rig.sensor(sensor).height_px if slip.axis == "rows" else rig.sensor(sensor).width_px
@@ -290,6 +237,17 @@ def _alternatives(
         and explained > ALTERNATIVE_GAIN * gain
         and np.mean(own[inside_slips(tie_points, (other,))]) > 0.5
     )
+
+
+def _shown_by_one(tie_points: TiePoints, slip: Slip, residuals: Array) -> tuple[str, ...]:
+    """The PAN frame that alone shows a band of the colour master shifted: it may be its own."""
+    rows = _sides(tie_points, slip)[1][0] & (tie_points.kind == PAN_TO_COLOUR)
+    rows &= np.isfinite(residuals).all(axis=1)
+    shift = -np.array([slip.dx_px, slip.dy_px])
+    along = residuals @ shift / float(shift @ shift)
+    seen_in = tie_points.sensor_a[rows]
+    shown = [n for n in np.unique(seen_in) if np.median(along[rows][seen_in == n]) > 0.5]
+    return (tie_points.names[shown[0]],) if len(shown) == 1 else ()
 
 
 def _sigma_px(tie_points: TiePoints, residuals_px: Array) -> Array:

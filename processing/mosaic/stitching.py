@@ -11,6 +11,8 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import Final, Literal
 
+import numpy as np
+
 from processing.geometry.placement import SensorPlacement, start_similarity
 from processing.matching.tie_points import TiePoints
 from processing.mosaic.calibration_support import (
@@ -62,6 +64,7 @@ def stitch(
     temperatures_c: Mapping[str, float],
     method: Method,
     settings: MosaicSettings,
+    ends: TiePoints | None = None,
 ) -> Stitching:
     """Adjust, test, correct the datum, and support what tie points do not determine.
 
@@ -73,6 +76,7 @@ def stitch(
         temperatures_c: temperatures that were read, by probe name.
         method: "free", or one to be compared with.
         settings: of the adjustment.
+        ends: points along the ends of frames, which are searched for read-out slips alone.
 
     Returns:
         The mosaics, their test and what was found.
@@ -85,7 +89,9 @@ def stitch(
         return Stitching(tie_points, mosaic, mosaic, mosaic, None, ())
     tie_points = tie_points.only(~unconfirmed(rig, start, tie_points))
     mosaic = free_mosaic(rig, start, tie_points, settings=settings)
-    tie_points, mosaic, slips = _without_slips(rig, start, tie_points, mosaic, settings)
+    if ends is None:
+        ends = tie_points.only(np.zeros(len(tie_points), np.bool_))
+    tie_points, mosaic, slips = _without_slips(rig, start, tie_points, ends, mosaic, settings)
     validity = evaluate_master(rig, mosaic, temperatures_c)
     contradicted = contradicted_colour(rig, tie_points, mosaic, validity)
     if contradicted.any():
@@ -110,6 +116,7 @@ def _without_slips(
     rig: Rig,
     start: Placements,
     tie_points: TiePoints,
+    ends: TiePoints,
     mosaic: Mosaic,
     settings: MosaicSettings,
 ) -> tuple[TiePoints, Mosaic, tuple[Slip, ...]]:
@@ -122,17 +129,20 @@ def _without_slips(
     slips: tuple[Slip, ...] = ()
     scaled, adjusted = _rescaled(rig, start, tie_points, mosaic, settings)
     for _ in range(SLIP_ROUNDS):
-        found = find_slips(rig, tie_points, adjusted.residuals_px)
+        searched = tie_points.joined(ends)
+        of_ends = residuals_px(adjusted.model, adjusted.placements, ends)
+        found = find_slips(rig, searched, np.concatenate([adjusted.residuals_px, of_ends]))
         if not found:
             break
         candidate = found[0].sensor
         others = tie_points.only(~of_sensor(tie_points, candidate))
         without = free_mosaic(rig, scaled, others, settings=settings)
-        seen = residuals_px(without.model, without.placements, tie_points)
-        slip = slip_of(rig, tie_points, seen, candidate) or found[0]
+        seen = residuals_px(without.model, without.placements, searched)
+        slip = slip_of(rig, searched, seen, candidate) or found[0]
         slip = replace(slip, alternatives=found[0].alternatives)
         slips += (slip,)
         tie_points = tie_points.only(~inside_slips(tie_points, (slip,)))
+        ends = ends.only(~inside_slips(ends, (slip,)))
         adjusted = mosaic = free_mosaic(rig, scaled, tie_points, settings=settings)
     if slips and scaled is not start:
         mosaic = free_mosaic(rig, start, tie_points, settings=settings)

@@ -7,7 +7,7 @@ reads a file or waits.
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -43,14 +43,17 @@ from processing.matching.content_check import (
     check_content,
     moved_placements,
 )
+from processing.matching.frame_ends import match_frame_ends
 from processing.matching.tie_points import TiePoints, match_tie_points
+from processing.mosaic.band_slips import without_band_slips
 from processing.mosaic.estimated_dc import EstimatedDc, estimate_dc
 from processing.mosaic.fixed_mosaic import fixed_mosaic
 from processing.mosaic.free_mosaic import Mosaic, MosaicSettings
 from processing.mosaic.held import held_quantities
 from processing.mosaic.layers import check_layers
 from processing.mosaic.mounting import check_platform
-from processing.mosaic.stitching import Method, stitch
+from processing.mosaic.readout_slips import Slip
+from processing.mosaic.stitching import Method, Stitching, stitch
 from processing.mosaic.uncertainty_contribution import (
     CalibrationChecks,
     uncertainty_contribution_of,
@@ -233,7 +236,7 @@ class Pipeline(
     def _adjust(self, exposure: ExposureInput, corrected: CorrectedFrames) -> AdjustedFrames:
         rig, settings, temperatures = self.rig, self.settings, exposure.temperatures
         with exposure.clock.stage("tie_points"):
-            tie_points, content = self._match(corrected)
+            tie_points, content, ends = self._match(corrected)
         with exposure.clock.stage("mosaic"):
             mosaic_settings = self._mosaic_settings(exposure.conditions)
             stitching = stitch(
@@ -244,6 +247,7 @@ class Pipeline(
                 temperatures_c=temperatures.usable_c if settings.use_drift else {},
                 method=settings.method,
                 settings=mosaic_settings,
+                ends=ends,
             )
             estimated = self._estimate_dc(stitching.free, stitching.validity, temperatures)
             tie_points = stitching.tie_points
@@ -270,18 +274,21 @@ class Pipeline(
             )
         return AdjustedFrames(stitching, content, estimated, platform, layers, held, contribution)
 
-    def _match(self, corrected: CorrectedFrames) -> tuple[TiePoints, ContentCheck]:
-        """Tie points; sought again where the content of a frame lies elsewhere."""
+    def _match(
+        self, corrected: CorrectedFrames
+    ) -> tuple[TiePoints, ContentCheck, TiePoints | None]:
+        """Tie points, sought again where the content of a frame lies elsewhere, and frame ends."""
         rig, level1, settings = self.rig, corrected.level1, self.settings.tie_points
         tie_points = match_tie_points(rig, corrected.start, level1, settings=settings)
         content = check_content(rig, corrected.start, level1, tie_points, settings=settings)
         if content.shifted_px:
             pitch_mm = self._pan.image.pitch_mm
             elsewhere = moved_placements(corrected.start, content, pitch_mm)
-            tie_points = match_tie_points(rig, elsewhere, level1, settings=settings)
-        else:
-            tie_points = filled_gaps(rig, corrected.start, level1, tie_points, settings=settings)
-        return tie_points, content
+            return match_tie_points(rig, elsewhere, level1, settings=settings), content, None
+        start = corrected.start
+        tie_points = filled_gaps(rig, start, level1, tie_points, settings=settings)
+        ends = match_frame_ends(rig, start, level1, tie_points, settings=settings)
+        return tie_points, content, ends
 
     def _resample(
         self, exposure: ExposureInput, corrected: CorrectedFrames, adjusted: AdjustedFrames
@@ -296,14 +303,15 @@ class Pipeline(
                 interpolation=settings.interpolation,
             )
         with clock.stage("colour"):
-            registrations, colour, gaps = self._register(mosaic, corrected.level1)
+            registrations, slips = self._register(adjusted.stitching, corrected.level1)
+            colour, gaps = self._compose_bands(mosaic, corrected.level1, registrations)
         with clock.stage("baselines"):
             baselines = self._baselines(exposure, adjusted.stitching.tie_points)
         with clock.stage("geometry"):
             geometry = self._geometry(mosaic, baselines) if settings.geometry else {}
         with clock.stage("quicklook"):
             picture = quicklook(pan.pan, colour)
-        return ComposedImage(pan, registrations, colour, gaps, baselines, geometry, picture)
+        return ComposedImage(pan, registrations, colour, gaps, baselines, geometry, picture, slips)
 
     def _judge(self, stages: StitchedStages) -> Judgement:
         clock, image = stages.exposure.clock, stages.image
@@ -373,52 +381,69 @@ class Pipeline(
         )
 
     def _register(
-        self, mosaic: Mosaic, level1: Mapping[str, Array]
-    ) -> tuple[tuple[BandRegistration, ...], dict[str, Array], dict[str, Mask]]:
-        """Green as the adjustment placed it, the other bands by their tie points with green.
+        self, stitching: Stitching, level1: Mapping[str, Array]
+    ) -> tuple[tuple[BandRegistration, ...], tuple[Slip, ...]]:
+        """How the bands other than green lie to it, and their read-out slips."""
+        green = None if self._green is None else self._green.sensor.name
+        placements, settings = stitching.image.placements, self.settings.colour
+        heads = {
+            head.sensor.name: head.leading
+            for head in self._heads
+            if head.sensor.name in level1 and head.sensor.name != green
+        }
+        if green is None or green not in level1:
+            return tuple(nominal_registration(band, name) for name, band in heads.items()), ()
+        positions = green_positions(placements[green], level1[green], settings)
+        registrations = tuple(
+            register_band(
+                band,
+                placements[green],
+                placements[name],
+                level1[green],
+                level1[name],
+                positions=positions,
+                settings=settings,
+            )
+            for name, band in heads.items()
+        )
+        # Lines of green that lie elsewhere would be seen in every band.
+        if any(green in (slip.sensor, *slip.alternatives) for slip in stitching.slips):
+            return registrations, ()
+        return without_band_slips(
+            self.rig, placements[green], placements, registrations, settings=settings
+        )
 
-        Returns:
-            How the bands were registered, their rasters, and their cells without valid pixels.
+    def _compose_bands(
+        self,
+        mosaic: Mosaic,
+        level1: Mapping[str, Array],
+        registrations: Sequence[BandRegistration],
+    ) -> tuple[dict[str, Array], dict[str, Mask]]:
+        """Rasters of the bands, and their cells without valid pixels.
+
+        Green lies as the adjustment placed it, the others as they are registered to it.
         """
-        registrations = []
         rasters: dict[str, Array] = {}
         gaps: dict[str, Mask] = {}
         columns, rows = self._grid
-        green = None if self._green is None else self._green.sensor.name
-        intervals = self.settings.colour
-        positions = None
-        if green is not None and green in level1:
-            positions = green_positions(mosaic.placements[green], level1[green], intervals)
+        homographies = {r.sensor: r.band_from_green for r in registrations if r.registered}
         for head in self._heads:
-            name, leading = head.sensor.name, head.leading
+            name = head.sensor.name
             if name not in level1:
                 rasters |= {band: self._colour.empty(band) for band in head.bands}
                 gaps |= {band: np.ones((rows, columns), np.bool_) for band in head.bands}
                 continue
-            placement = mosaic.placements[name]
-            homography = None
-            if name != green:
-                found = nominal_registration(leading, name)
-                if green is not None and positions is not None:
-                    found = register_band(
-                        leading,
-                        mosaic.placements[green],
-                        placement,
-                        level1[green],
-                        level1[name],
-                        positions=positions,
-                        settings=intervals,
-                    )
-                registrations.append(found)
-                homography = found.band_from_green if found.registered else None
             for band in head.bands:
                 rasters[band] = self._colour.compose(
-                    band, placement, homography, interpolation=self.settings.interpolation
+                    band,
+                    mosaic.placements[name],
+                    homographies.get(name),
+                    interpolation=self.settings.interpolation,
                 )
                 gaps[band] = gap_cells(
                     self._colour.source, columns, rows, saturated_bit=SATURATED_SOURCE
                 )
-        return tuple(registrations), rasters, gaps
+        return rasters, gaps
 
     def _baselines(self, exposure: ExposureInput, tie_points: TiePoints) -> dict[str, Mosaic]:
         """The fixed method with and without TDM, from the same tie points."""

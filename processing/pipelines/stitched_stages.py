@@ -28,7 +28,7 @@ from processing.mosaic.held import HeldQuantities, scale_figures
 from processing.mosaic.layers import LayerCheck, layer_figures
 from processing.mosaic.mounting import PlatformCheck, platform_figures
 from processing.mosaic.precision import UncertaintyContribution, precision_figures
-from processing.mosaic.readout_slips import slip_figures
+from processing.mosaic.readout_slips import Slip, slip_figures
 from processing.mosaic.stitching import Stitching
 from processing.pipelines.exposure_pipeline import Stages
 from processing.pipelines.product import PipelineSettings
@@ -93,7 +93,10 @@ class AdjustedFrames:
 
 @dataclass(frozen=True)
 class ComposedImage:
-    """The virtual image: PAN, and by band the colour and its cells without valid pixels."""
+    """The virtual image: PAN, and by band the colour and its cells without valid pixels.
+
+    `slips` are those of bands that are registered to green.
+    """
 
     pan: Composition
     registrations: tuple[BandRegistration, ...]
@@ -102,6 +105,7 @@ class ComposedImage:
     baselines: Mapping[str, Mosaic]
     geometry: Mapping[str, Mapping[str, Array]]
     quicklook: Array
+    slips: tuple[Slip, ...] = ()
 
 
 StitchedStages = Stages[CorrectedFrames, AdjustedFrames, ComposedImage]
@@ -169,7 +173,7 @@ def figures_of(
             image.registrations,
             settings=settings.tie_points,
             colour=settings.colour,
-            explained=_explained_frames(corrected, adjusted),
+            explained=_explained_frames(corrected, adjusted) | {s.sensor for s in image.slips},
         )
     )
     yield confirmed_ground_figures(rig, level1, tie_points, image.registrations)
@@ -191,7 +195,7 @@ def figures_of(
         rig,
         [
             slip
-            for slip in stitching.slips
+            for slip in _worst_first(stitching.slips, image.slips)
             if not is_drawn_by_step(view, every, slip.sensor, (slip.axis, slip.first, slip.last))
         ],
     )
@@ -200,6 +204,12 @@ def figures_of(
     )
     yield ValidFigures(float(np.count_nonzero(image.pan.source)) / image.pan.source.size)
     yield ParallaxFigures(parallax_px(rig, conditions, settings.relief_fraction))
+
+
+def _worst_first(*groups: tuple[Slip, ...]) -> list[Slip]:
+    """All slips, those of the group with the longest one first; each group in its order."""
+    longest = sorted(groups, key=lambda group: -max((s.length_px for s in group), default=0.0))
+    return [slip for group in longest for slip in group]
 
 
 def _explained_frames(corrected: CorrectedFrames, adjusted: AdjustedFrames) -> set[str]:

@@ -134,6 +134,62 @@ def test_a_read_out_slip_is_found_named_and_measured(
         assert outcome.figure("stitched_sigma_worst_px") > 0.4 * share * shift_px
 
 
+@pytest.mark.parametrize(
+    ("sensor", "axis", "first", "by", "length", "shift_px"),
+    [
+        ("R", "rows", 416, 3, None, 9.0),
+        ("B", "rows", 300, 2, 160, 6.0),
+        ("N", "columns", 624, 2, None, 6.0),
+    ],
+)
+def test_a_read_out_slip_of_a_head_that_is_registered_to_green_is_found(
+    error_free: InjectedExposure,
+    sensor: str,
+    axis: str,
+    first: int,
+    by: int,
+    length: int | None,
+    shift_px: float,
+) -> None:
+    outcome = error_free.with_frame(sensor, slipped(axis, first, by, length)).outcome()
+    assert outcome.verdict == "refly", outcome.sentences
+    assert outcome.figure("slip_sensors") == sensor and outcome.figure("slip_axis") == axis
+    assert outcome.figure("slip_alternatives") is None
+    assert outcome.figure("slip_px") == pytest.approx(shift_px, abs=0.3)
+    assert outcome.figure("slip_first") == pytest.approx(first, abs=30)
+    # The lines in place are registered without those that are not.
+    assert outcome.figure(f"{_band_of(error_free, sensor)}_rms_px") < 0.3
+    assert outcome.inner_px < 0.03
+
+
+def slipped_frames(outcome: Outcome) -> set[str]:
+    """All frames that are named for a slip."""
+    names = [outcome.figure("slip_sensors") or "", outcome.figure("slip_alternatives") or ""]
+    return {name for group in names for name in group.split(", ") if name}
+
+
+def _band_of(exposure: InjectedExposure, sensor: str) -> str:
+    return exposure.rig.cone_of(sensor).bands[0]
+
+
+@pytest.mark.parametrize(
+    ("sensor", "axis", "first", "by", "shift_px"),
+    [
+        ("SU03", "rows", 792, -3, 3.0),
+        ("SU10", "rows", 0, 1, 1.0),
+        ("SU20", "columns", 0, 2, 2.0),
+    ],
+)
+def test_lines_that_slipped_at_the_end_of_a_frame_are_found(
+    error_free: InjectedExposure, sensor: str, axis: str, first: int, by: int, shift_px: float
+) -> None:
+    outcome = error_free.with_frame(sensor, slipped(axis, first, by, 40)).outcome()
+    assert outcome.verdict == "refly", outcome.sentences
+    assert sensor in slipped_frames(outcome) and outcome.figure("slip_axis") == axis
+    assert outcome.figure("slip_px") == pytest.approx(shift_px, rel=0.3)
+    assert outcome.figure("stitched_sigma_worst_px") > 0.09 * shift_px
+
+
 @pytest.mark.parametrize("off_k", [4.0, -28.0])
 def test_all_probes_that_misread_alike_widen_the_sigma(
     error_free: InjectedExposure, off_k: float
@@ -254,3 +310,22 @@ def test_a_turn_below_its_detection_limit_widens_the_sigma_by_the_mean() -> None
     assert turned.verdict == "good", turned.sentences
     assert_covered(turned)
     assert turned.stated_sigma_px > 1.3 * healthy.outcome().stated_sigma_px
+
+
+def test_a_slip_of_the_second_colour_head_is_found_and_green_is_not_accused(
+    two_cones: InjectedExposure,
+) -> None:
+    outcome = two_cones.with_frame("N", slipped("rows", 416, 3)).outcome()
+    assert outcome.verdict == "refly"
+    assert outcome.figure("slip_sensors") == "N" and outcome.figure("slip_alternatives") is None
+    assert outcome.figure("slip_px") == pytest.approx(6.0, abs=0.3)
+
+
+@pytest.mark.parametrize(("sensor", "first", "by"), [("SU10", 0, 2), ("SU00", 1624, -1)])
+def test_of_two_pan_frames_the_one_with_slipped_lines_at_its_end_is_named(
+    two_cones: InjectedExposure, sensor: str, first: int, by: int
+) -> None:
+    outcome = two_cones.with_frame(sensor, slipped("rows", first, by, 40)).outcome()
+    assert outcome.verdict == "refly"
+    assert slipped_frames(outcome) - {"RGB"} == {sensor}
+    assert outcome.figure("slip_px") == pytest.approx(abs(by), abs=0.4)

@@ -11,13 +11,13 @@ from processing.mosaic import readout_slips
 from processing.mosaic.readout_slips import (
     MIN_SIGMA_PX,
     Slip,
-    SlipSettings,
     find_slips,
     inside_slips,
     of_sensor,
     slip_figures,
     slip_of,
 )
+from processing.mosaic.slip_settings import SlipSettings, remaining_share
 from processing.rig import find_rig
 
 Array = NDArray[np.float64]
@@ -324,7 +324,7 @@ def test_a_straight_line_leaves_this_much_of_a_step(share: float, kept: float) -
     step = (at < share).astype(np.float64)
     left = step - np.polyval(np.polyfit(at, step, 1), at)
     assert np.mean(left[at < share]) - np.mean(left[at >= share]) == pytest.approx(kept, abs=1e-3)
-    assert readout_slips.remaining_share(share) == pytest.approx(kept)
+    assert remaining_share(share) == pytest.approx(kept)
 
 
 def test_pixels_are_as_large_as_they_lie_in_the_virtual_image() -> None:
@@ -349,3 +349,35 @@ def test_a_band_moves_by_half_a_pixel_of_its_own_frame_or_is_no_slip(
         "SU00", "rows", 840, at, residuals, sigma, SlipSettings(), own_px=own_px
     )
     assert (found is not None) is expected
+
+
+@pytest.mark.parametrize("shown_by", [(0,), (0, 1)])
+def test_a_pan_frame_that_alone_shows_a_slip_of_green_is_named_as_well(
+    shown_by: tuple[int, ...],
+) -> None:
+    count, rng = 1200, np.random.default_rng(9)
+    sensor_a = np.arange(count) % 2
+    raw = rng.uniform(0.0, 1.0, (count, 2)) * np.array([WIDTH - 1.0, HEIGHT - 1.0])
+    tie_points = TiePoints(
+        names=("SU00", "SU10", "G"),
+        pairs=(("SU00", "G"), ("SU10", "G")),
+        attempted=(count, count),
+        sensor_a=sensor_a,
+        sensor_b=np.full(count, 2),
+        # Rows of the PAN frames at which the shift lies differ: only green has them side by side.
+        raw_a=rng.permutation(raw),
+        raw_b=raw,
+        sigma_px=np.full(count, 0.1),
+        correlation=np.ones(count),
+        kind=np.full(count, PAN_TO_COLOUR),
+        overlap=sensor_a,
+    )
+    residuals = rng.normal(0.0, 0.1, (count, 2))
+    band = (raw[:, 1] >= 100) & (raw[:, 1] < 260)
+    # The other frame has few points there.
+    keep = ~band | (sensor_a == 0) | (np.arange(count) % 16 == 1)
+    residuals[band & np.isin(sensor_a, shown_by), 1] += 2.0
+    tie_points, residuals = tie_points.only(keep), residuals[keep]
+    slip, *_ = find_slips(MINI, tie_points, residuals, sensors=("G",))
+    assert slip.sensor == "G"
+    assert slip.alternatives == (("SU00",) if shown_by == (0,) else ())
