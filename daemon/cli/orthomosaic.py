@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import time
 from pathlib import Path
@@ -91,7 +92,7 @@ def orthomosaic(
     images, depths = tuple(image or IMAGES), tuple(bits or DEPTHS)
     if set(images) - set(IMAGES) or set(depths) - set(DEPTHS):
         raise ConfigurationError(["--image is pan, rgb or cir, --bits is 16 or 8"])
-    if gsd is not None and not gsd > 0.0:
+    if gsd is not None and not 0.0 < gsd < math.inf:
         raise ConfigurationError([f"--gsd is {gsd:g}; it is positive, in metres"])
     where.check()
     begun = time.monotonic()
