@@ -131,13 +131,20 @@ class ExecutorOptions:
             address, announce=lambda sentence: console.print(sentence, highlight=False)
         )
 
-    def place(self, task_nbytes: int, tasks: int, tasks_per_process: int = 1) -> Placement:
+    def place(
+        self,
+        task_nbytes: int,
+        tasks: int,
+        tasks_per_process: int = 1,
+        further_nbytes: int | None = None,
+    ) -> Placement:
         """An executor for so many tasks: the cluster, processes, or this process.
 
         Args:
             task_nbytes: memory of one process with a task.
             tasks: their number.
             tasks_per_process: as many as take longer than the start of a process.
+            further_nbytes: memory of a further task in one process; None for that of a process.
 
         Raises:
             ConfigurationError: more processes than memory, or a cluster that cannot be used.
@@ -153,7 +160,9 @@ class ExecutorOptions:
             from daemon.postflight.batch.in_process import InProcessExecutor
             from daemon.products.pipeline_pool import usable_count
 
-            fits = IN_PROCESS_COUNT * task_nbytes <= capacity.available_memory_nbytes()
+            further = task_nbytes if further_nbytes is None else further_nbytes
+            needed = task_nbytes + (IN_PROCESS_COUNT - 1) * further
+            fits = needed <= capacity.available_memory_nbytes()
             return Placement(InProcessExecutor(IN_PROCESS_COUNT if fits else 1, usable_count), plan)
         from daemon.postflight.batch.local_processes import LocalProcessExecutor
 

@@ -93,6 +93,7 @@ def process(
 ) -> None:
     from daemon.mission.transfer.object_store import is_store_url
     from daemon.planning.overlaps import overlaps_of
+    from daemon.postflight.batch.capacity import further_exposure_nbytes
     from daemon.postflight.batch.in_process import InProcessExecutor
     from daemon.postflight.batch.level2_sources import level2_source
     from daemon.postflight.batch.level2_work import Level2Work
@@ -133,7 +134,11 @@ def process(
                     [f"--only {number}: {source.place} has no such exposure" for number in absent]
                 )
             found = source.survey(source.placed(work), numbers, overlaps_of(folder, work.rig))
-            placed = where.place(work.memory_nbytes, len(found.pending))
+            placed = where.place(
+                work.memory_nbytes,
+                len(found.pending),
+                further_nbytes=further_exposure_nbytes(work.rig),
+            )
             if dry_run:
                 on_cluster = where.scheduler is not None
                 _print_dry_run(

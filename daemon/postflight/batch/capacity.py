@@ -18,6 +18,11 @@ FRAMES_FACTOR: Final = 6.2
 Source: benchmarks/records/bench-shared-cells.json: `ultracam-x`, with its calibrations, occupies
 2,416 MiB in addition to its frames of 432 MB.
 """
+FURTHER_FRAMES_FACTOR: Final = 2.7
+"""Memory of a further exposure in work in the same process, in the same unit.
+
+Source: as above: two in work occupy 668 MiB more than one, in addition to the frames of the second.
+"""
 MEMORY_SHARE: Final = 0.8
 """Of the available memory; the rest is for the page cache that the disk is written through."""
 
@@ -33,8 +38,16 @@ class ProcessAllocation:
 
 def exposure_nbytes(rig: Rig) -> int:
     """Memory of a process with one exposure of this rig in work."""
-    frames = sum(2 * sensor.width_px * sensor.height_px for sensor in rig.sensors)
-    return PROCESS_NBYTES + round(FRAMES_FACTOR * frames)
+    return PROCESS_NBYTES + round(FRAMES_FACTOR * _frames_nbytes(rig))
+
+
+def further_exposure_nbytes(rig: Rig) -> int:
+    """Memory of a further exposure in work in the same process, which shares the calibrations."""
+    return round(FURTHER_FRAMES_FACTOR * _frames_nbytes(rig))
+
+
+def _frames_nbytes(rig: Rig) -> int:
+    return sum(2 * sensor.width_px * sensor.height_px for sensor in rig.sensors)
 
 
 def plan_processes(

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from daemon.cli.batch_options import ExecutorOptions
 from daemon.postflight.batch import capacity
 from daemon.postflight.batch.control_groups import group_free_nbytes
 from processing.rig import find_rig
@@ -99,3 +100,16 @@ def test_the_estimate_of_an_exposure_is_not_below_what_was_measured(
     assert measured_nbytes <= capacity.exposure_nbytes(rig)
     if name == "ultracam-x":
         assert capacity.exposure_nbytes(rig) <= 1.05 * measured_nbytes
+
+
+@pytest.mark.parametrize(("available_gb", "count"), [(4.05, 1), (4.3, 2), (6.1, 2)])
+def test_two_exposures_in_one_process_need_what_was_measured(
+    monkeypatch: pytest.MonkeyPatch, available_gb: float, count: int
+) -> None:
+    """`ultracam-x`: 4.1 GB measured for two in work, not twice the 3.0 GB of one."""
+    rig = find_rig("ultracam-x")
+    monkeypatch.setattr(capacity, "available_memory_nbytes", lambda: int(available_gb * 1e9))
+    placed = ExecutorOptions(processes=0).place(
+        capacity.exposure_nbytes(rig), 20, further_nbytes=capacity.further_exposure_nbytes(rig)
+    )
+    assert placed.executor.capacity == count

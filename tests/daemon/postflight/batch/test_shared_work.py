@@ -22,8 +22,8 @@ def test_maps_are_shared_where_processes_compute(
     shared: list[list[str]] = []
     place = ExecutorOptions.place
 
-    def placed(self: ExecutorOptions, *arguments: Any) -> Placement:
-        found = place(self, *arguments)
+    def placed(self: ExecutorOptions, *arguments: Any, **options: Any) -> Placement:
+        found = place(self, *arguments, **options)
         return found if is_in_process else Placement(Elsewhere(found.executor), found.allocation)
 
     class Elsewhere:
