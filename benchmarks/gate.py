@@ -1,8 +1,8 @@
-"""The performance gate of `make bench`: CPU time of the pipeline against the record.
+"""The performance gate of `make bench`: the pace of the pipeline against the record.
 
 Ratios to a copy of the same bytes and to a bare cv2.remap, medians of runs in turn, hardly depend
-on the load of a machine. They do depend on its processor and on the ground of the exposure, so each
-has rows of its own.
+on the load of a machine; that of elapsed time does where others use its cores. They do depend on
+its processor and on the ground of the exposure, so each has rows of its own.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ RUNS: Final = 5
 COMMAND: Final = "python -m benchmarks.mini --accept"
 SLOWER, NOT_COMPARED = 1, 3
 """Exit status where a ratio is above its record, and where there is no record of it."""
-_COLUMNS: Final = ["processor", "ground", "over", "CPU time of the pipeline", "cores", "date"]
+_COLUMNS: Final = ["processor", "ground", "over", "pipeline", "cores", "date"]
 _KEY, _RATIO, _DATE = slice(0, 3), 3, 5
 
 
@@ -47,18 +47,24 @@ def processor_name(cpuinfo: Path = Path("/proc/cpuinfo")) -> str:
     return ", ".join(parts)
 
 
-def cpu_ratios(timed: Mapping[str, Mapping[str, float]]) -> dict[str, float]:
-    """CPU time of the pipeline over that of the tasks that ran in turn with it.
+def ratios_of(timed: Mapping[str, Mapping[str, float]]) -> dict[str, float]:
+    """What the pipeline takes over what the tasks take that ran in turn with it.
 
     Args:
-        timed: by task as of `daemon.cli.benchmark.measurement.interleaved`; the pipeline is
-            "process".
+        timed: by task as of `daemon.cli.benchmark.measurement.interleaved`: the pipeline is
+            "process", with all files of an exposure "products".
 
     Returns:
-        Ratios of the medians by the name of the other task.
+        Ratios of the medians: of CPU time to a copy and to a remap, of CPU time with all files and
+        of elapsed time to a remap.
     """
-    own = timed["process"]["median_cpu_s"]
-    return {name: own / timed[name]["median_cpu_s"] for name in ("copy", "remap")}
+    own, remap = timed["process"], timed["remap"]
+    return {
+        "copy": own["median_cpu_s"] / timed["copy"]["median_cpu_s"],
+        "remap": own["median_cpu_s"] / remap["median_cpu_s"],
+        "remap, with files": timed["products"]["median_cpu_s"] / remap["median_cpu_s"],
+        "remap, elapsed": own["median_s"] / remap["median_s"],
+    }
 
 
 def compared(
@@ -67,21 +73,21 @@ def compared(
     """Compare measured ratios with those of the record.
 
     Args:
-        ratios: CPU time of the pipeline over that of a task, by its name.
+        ratios: as of `ratios_of`.
         processor: by `processor_name`, the one they were measured on.
         ground: of the exposure.
         record: file of the record.
 
     Returns:
         `slower`: names of the tasks whose ratio is more than `TOLERANCE` above the record's;
-        `unknown`: names of those without a record; `status`: the exit status; `sentences`: what was
-        found, one for each ratio.
+        `faster`: of those as far below it; `unknown`: of those without a record; `status`: the
+        exit status; `sentences`: what was found, one for each ratio.
 
     Raises:
         RecordError: the record cannot be read.
     """
     known = {row[_KEY]: float(row[_RATIO]) for row in _rows(record)}
-    slower, unknown, sentences = [], [], []
+    slower, faster, unknown, sentences = [], [], [], []
     for name, ratio in ratios.items():
         limit = known.get((processor, ground, name))
         if limit is None:
@@ -100,9 +106,21 @@ def compared(
                 f". That is slower by more than {TOLERANCE:.0%}: find the change, or run "
                 f"`{COMMAND}` and give the reason in the commit."
             )
+        elif change < -TOLERANCE:
+            faster.append(name)
+            sentence += (
+                f". That is faster by more than {TOLERANCE:.0%}: run `{COMMAND}`, or a change to "
+                "the old pace passes."
+            )
         sentences.append(sentence)
     status = SLOWER if slower else NOT_COMPARED if unknown else 0
-    return {"slower": slower, "unknown": unknown, "status": status, "sentences": sentences}
+    return {
+        "slower": slower,
+        "faster": faster,
+        "unknown": unknown,
+        "status": status,
+        "sentences": sentences,
+    }
 
 
 def accept(
@@ -130,7 +148,7 @@ def accept(
         "date": sorted({row[_DATE] for row in rows}),
         "command": COMMAND,
         "machine": "each row's",
-        "conditions": f"CPU seconds, medians of {RUNS} runs in turn or more",
+        "conditions": f"CPU seconds unless elapsed, medians of {RUNS} runs in turn or more",
         "figures": [{"table": {"columns": _COLUMNS, "rows": sorted(rows)}}],
     }
     record.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")

@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Mapping
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
@@ -28,20 +30,25 @@ from rich.table import Table
 from benchmarks import gate
 from daemon.cli.benchmark import peers
 from daemon.cli.benchmark.measurement import interleaved, machine
-from daemon.configuration.model import PlanSection
+from daemon.configuration.model import MountSection, PlanSection
 from daemon.mission.exposure import CaptureRecord, FrameRecord
 from daemon.mission.layout import Mission
 from daemon.mission.store.store import Level0Writer, load_level0
 from daemon.products.exposure_conditions import conditions_of
+from daemon.products.exposure_products import FlightGeometry, make_products
 from daemon.products.processing_threads import configure_threads, thread_counts
+from daemon.products.processor import Processor
+from daemon.products.stitched_image import build_stitched
 from daemon.terminal.console import Console
 from processing.pipelines.stitched import Pipeline, PipelineSettings
-from processing.quality.report import Flag
+from processing.quality.report import NO_FLAGS
 from processing.radiometry.calibration import load_radiometry
 from processing.rig import load_rig
 from sim_hw.__main__ import parser
 
 THREADS = 2
+COPY_S = 0.1
+"""CPU time of the copies of one run: one alone takes 4 to 7 ms."""
 GROUND: str = parser().get_default("ground")
 """What the demonstration flies over."""
 Frames = Mapping[str, NDArray[np.uint16]]
@@ -63,14 +70,15 @@ def main() -> int:
             "pipeline": _in_own_process(mission, radiometry, options.runs),
             "writer": _time_writer(Path(folder), mission, options.runs),
         }
-    ratios, processor = result["pipeline"]["cpu_ratios"], gate.processor_name()
-    if options.accept:
-        gate.accept(ratios, processor, GROUND, result["machine"]["cores"])
+    ratios, processor = result["pipeline"]["ratios"], gate.processor_name()
     result["gate"] = gate.compared(ratios, processor, GROUND)
     if options.json:
         print(json.dumps(result))
     else:
         _print(result)
+    if options.accept:
+        gate.accept(ratios, processor, GROUND, result["machine"]["cores"])
+        return 0
     return int(result["gate"]["status"])
 
 
@@ -105,7 +113,8 @@ def _time_pipeline(mission_path: Path, radiometry: Path, runs: int) -> dict[str,
     pipeline.warm_up()
     frames, exposure = load_level0(mission.level0(2), rig)
     plan = PlanSection(ground_height_m=395.0, height_above_ground_m=3000.0)
-    conditions = conditions_of(exposure, rig, plan, Flag(0))
+    geometry = FlightGeometry(MountSection(), plan)
+    conditions = conditions_of(exposure, rig, plan, NO_FLAGS)
     stages: dict[str, list[float]] = {}
     product = pipeline.process(frames, conditions)
     written = [product.pan, *product.colour.values()]
@@ -130,7 +139,23 @@ def _time_pipeline(mission_path: Path, radiometry: Path, runs: int) -> dict[str,
         for one in remaps:
             one()
 
-    timed = interleaved(runs, process=process, copy=copy, remap=remap)
+    used = time.process_time()
+    copy()
+    times = math.ceil(COPY_S / max(time.process_time() - used, 1e-3))
+    processor = Processor(pipeline, build_stitched)
+
+    def copies_of_one_run() -> None:
+        for _ in range(times):
+            copy()
+
+    timed = interleaved(
+        runs,
+        process=process,
+        products=lambda: make_products(processor, geometry, exposure, frames),
+        copy=copies_of_one_run,
+        remap=remap,
+    )
+    timed["copy"] = {name: seconds / times for name, seconds in timed["copy"].items()}
     pixels = sum(frame.size for frame in frames.values())
     seconds = timed["process"]["median_s"]
     return {
@@ -139,7 +164,7 @@ def _time_pipeline(mission_path: Path, radiometry: Path, runs: int) -> dict[str,
         "megapixels_per_s": pixels / 1e6 / seconds,
         "ratio_to_copy": seconds / timed["copy"]["median_s"],
         "ratio_to_remap": seconds / timed["remap"]["median_s"],
-        "cpu_ratios": gate.cpu_ratios(timed),
+        "ratios": gate.ratios_of(timed),
         "realtime_factor": rig.frame_interval_s / seconds,
     }
 

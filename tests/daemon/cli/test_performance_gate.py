@@ -34,10 +34,11 @@ def test_a_tenth_more_passes_and_more_than_that_fails_with_its_cure(record: Path
     assert "--accept" in failed["sentences"][1] and "--accept" not in failed["sentences"][0]
 
 
-def test_a_faster_pipeline_passes(record: Path) -> None:
-    assert (
-        gate.compared({"copy": 5.0, "remap": 1.0}, PROCESSOR, "landscape", record)["slower"] == []
-    )
+def test_a_faster_pipeline_passes_and_is_asked_to_be_recorded(record: Path) -> None:
+    found = gate.compared({"copy": 9.1, "remap": 1.79}, PROCESSOR, "landscape", record)
+    assert (found["slower"], found["faster"], found["status"]) == ([], ["remap"], 0)
+    assert "faster by more than 10%" in found["sentences"][1]
+    assert "--accept" in found["sentences"][1] and "--accept" not in found["sentences"][0]
 
 
 @pytest.mark.parametrize(
@@ -104,25 +105,47 @@ def test_pipeline_copy_and_remap_run_in_turn_five_times() -> None:
     assert set(timed) == {"process", "copy", "remap"}
 
 
-def test_ratios_are_of_medians_of_cpu_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One run that was disturbed changes nothing, nor does waiting."""
+def test_ratios_are_of_medians(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One run that was disturbed changes nothing. Waiting counts in elapsed time alone."""
     spent = {"process": [9.0, 9.0, 900.0, 9.5, 8.0], "copy": [0.1, 0.1, 0.1, 5.0, 0.1]}
-    spent["remap"] = [2.0, 3.0, 3.0, 3.0, 50.0]
+    spent |= {"remap": [2.0, 3.0, 3.0, 3.0, 50.0], "products": [12.0, 12.0, 12.0, 1.0, 99.0]}
+    waited = {"process": 6.0, "copy": 0.0, "remap": 2.0, "products": 100.0}
     clock = {"cpu": 0.0, "wall": 0.0}
 
     def task(name: str) -> Any:
         left = iter(spent[name])
 
         def run() -> None:
-            clock["cpu"] += next(left)
-            clock["wall"] += 1000.0
+            used = next(left)
+            clock["cpu"] += used
+            clock["wall"] += used + waited[name]
 
         return run
 
     monkeypatch.setattr(time, "process_time", lambda: clock["cpu"])
     monkeypatch.setattr(time, "perf_counter", lambda: clock["wall"])
     timed = interleaved(gate.RUNS, **{name: task(name) for name in spent})
-    assert gate.cpu_ratios(timed) == pytest.approx({"copy": 90.0, "remap": 3.0})
+    assert gate.ratios_of(timed) == pytest.approx(
+        {"copy": 90.0, "remap": 3.0, "remap, with files": 4.0, "remap, elapsed": 3.0}
+    )
+
+
+def test_accepting_compares_with_the_record_before(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], record: Path
+) -> None:
+    monkeypatch.setattr(gate.compared, "__defaults__", (record,))
+    monkeypatch.setattr(gate.accept, "__defaults__", (record,))
+    monkeypatch.setattr(gate, "processor_name", lambda: PROCESSOR)
+    monkeypatch.setattr(mini, "GROUND", "landscape")
+    monkeypatch.setattr(mini, "_fly", lambda _folder: (None, None))
+    monkeypatch.setattr(mini, "_in_own_process", lambda *_: {"ratios": {"remap": 3.0}})
+    monkeypatch.setattr(mini, "_time_writer", lambda *_: {})
+    monkeypatch.setattr(sys, "argv", ["mini", "--json", "--accept"])
+    assert mini.main() == 0
+    found = json.loads(capsys.readouterr().out)["gate"]
+    assert found["slower"] == ["remap"] and "record 2.00 (+50%)" in found["sentences"][0]
+    table = read_record(record).figures[0].table
+    assert table is not None and [row[2:4] for row in table.rows] == [("remap", "3.00")]
 
 
 @pytest.mark.parametrize(
@@ -147,7 +170,7 @@ def test_make_bench_exits_by_what_it_found(
     monkeypatch.setattr(gate, "_rows", lambda _record: rows if known else [])
     monkeypatch.setattr(gate, "processor_name", lambda: PROCESSOR)
     monkeypatch.setattr(mini, "_fly", lambda _folder: (None, None))
-    monkeypatch.setattr(mini, "_in_own_process", lambda *_: {"cpu_ratios": ratios})
+    monkeypatch.setattr(mini, "_in_own_process", lambda *_: {"ratios": ratios})
     monkeypatch.setattr(mini, "_time_writer", lambda *_: {})
     monkeypatch.setattr(sys, "argv", ["mini", "--json"])
     assert mini.main() == status
