@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 from scipy import stats
 
+from daemon.postflight.adjustment.antenna_effects import antenna_effects
 from daemon.postflight.adjustment.contradictions import SUSPICIOUS_SIGMA0
 from daemon.postflight.adjustment.separate_blocks import separate_blocks
 from daemon.postflight.adjustment.variance_factors import (
@@ -127,6 +128,8 @@ def _largest_residual(result: Adjustment) -> list[str]:
     name = observation_name(
         result.network, int(rows.group[worst]), int(rows.source[worst]), int(rows.axis[worst])
     )
+    if named := antenna_effects(result):
+        return named
     return [
         f"sigma0 is above its interval, and the largest residual is {size.max():.3g} of its own "
         f"standard deviations ({name}): blunders are likely; adjust with --significance 0.05"
