@@ -33,12 +33,12 @@ from tests.daemon.onboard.monitoring.cockpit import (
     save_picture,
 )
 from tests.daemon.onboard.monitoring.guidance_frames import aerial_map, vector_map
-from tests.robustness.crash.test_full_disk import NAMESPACE
+from tests.robustness.crash.test_full_disk import NAMESPACE, needs_namespace
 from tests.support.browser import Browser, chromium
 from tests.support.stopwatch import Stopwatch, slowdown
 from tests.system.test_operators_page import Running
 
-pytestmark = [pytest.mark.system, pytest.mark.timeout(900)]
+pytestmark = [needs_namespace, pytest.mark.system, pytest.mark.timeout(900)]
 
 RIG = "ultracam-x-mini"
 SPEED_MPS = 30.0
