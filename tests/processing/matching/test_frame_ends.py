@@ -14,6 +14,8 @@ from processing.matching.frame_ends import END_PX, WINDOW_PX, match_frame_ends
 from processing.matching.tie_points import PAN_TO_COLOUR, TiePoints, match_tie_points
 from processing.rig import find_rig
 
+pytestmark = pytest.mark.trust
+
 X = find_rig("ultracam-x-mini")
 PLACES = nominal_placements(X, {}, {})
 Frames = dict[str, NDArray[Any]]

@@ -18,6 +18,8 @@ from processing.image.colour import BandRegistration, ColourSettings, fitted_reg
 from processing.mosaic.band_slips import without_band_slips
 from processing.rig import find_rig
 
+pytestmark = pytest.mark.trust
+
 X = find_rig("ultracam-x-mini")
 PLACES = nominal_placements(X, {}, {})
 GREEN = PLACES["G"]
