@@ -48,7 +48,7 @@ class ClusterLosses:
             workers: addresses of workers that are there.
         """
         unknown = {_machine(one): one for one in workers if _machine(one) not in self._counts}
-        for worker, count in _asked(client, unknown.values()).items():
+        for worker, count in _kills_by_worker(client, unknown.values()).items():
             self._counts[_machine(worker)] = count
 
     def add(self, lost: TaskLost) -> None:
@@ -73,7 +73,7 @@ class ClusterLosses:
         askable = {_machine(one): one for one in present if one not in gone}
         counts = {
             _machine(worker): count
-            for worker, count in _asked(
+            for worker, count in _kills_by_worker(
                 client, [one for machine, one in askable.items() if machine in machines]
             ).items()
         }
@@ -98,7 +98,7 @@ def _machine(worker: str) -> str:
     return urlsplit(worker).hostname or ""
 
 
-def _asked(client: Any, workers: Iterable[str]) -> dict[str, int]:
+def _kills_by_worker(client: Any, workers: Iterable[str]) -> dict[str, int]:
     """Counts by worker; one that does not answer is left out."""
     chosen = list(workers)
     if not chosen:
