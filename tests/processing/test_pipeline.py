@@ -237,6 +237,7 @@ def test_residuals_are_reported_as_numbers(rig: Rig, product: Product) -> None:
     assert len(json.dumps(vector_data)) < 40_000
 
 
+@pytest.mark.trust
 def test_an_exposure_time_that_cannot_be_is_named_and_changes_no_other_frame(
     rig: Rig, pipeline: Pipeline, exposure: Exposure, product: Product
 ) -> None:
