@@ -48,11 +48,24 @@ class KernelCache(caching.FunctionCache):  # type: ignore[misc]  # numba has no 
         self._cache_file = _KernelFiles(Path(self.cache_path), self._impl.filename_base, kernel)
 
     def holds(self, variants: Iterable[tuple[Any, ...]], codegen: Any) -> bool:
-        """Whether each variant, given by its argument types, can be loaded."""
+        """Whether all variants can be loaded.
+
+        Args:
+            variants: argument types of each.
+            codegen: numba's code generator of the kernel's target.
+
+        Returns:
+            False where one is missing, damaged, or compiled from other code.
+        """
         return self._cache_file.holds([self._index_key(types, codegen) for types in variants])
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        """Write a compiled variant; where that fails, the process goes on with what it has."""
+        """Write a compiled variant; where that fails, the process goes on with what it has.
+
+        Args:
+            sig: its argument types.
+            data: the compiled result of numba.
+        """
         try:
             super().save_overload(sig, data)
         except OSError as error:
