@@ -32,6 +32,9 @@ along a line reaches 3.3."""
 MAX_SPREAD: Final = 0.5
 """Of that difference, by which the neighbours differ from each other and from their own ones; in
 healthy frames, roads along a line among them, 1.5 and more where the difference is large."""
+MIN_PARTS: Final = 0.5
+"""Share of the bundles that show the line by themselves, by half of the limit at least: a narrow
+road that goes over from one line to the next did so in 0.28."""
 
 
 @dataclass(frozen=True)
@@ -101,10 +104,12 @@ def _worst(means: Array) -> tuple[int, float] | None:
     before2, before, after, after2 = (means[:, lines + k] for k in (-2, -1, 1, 2))
     near, far = 0.5 * (before + after), 0.5 * (before2 + after2)
     signal = np.maximum(near, 1.0)
-    differs, spread, aside = (
-        np.median(np.abs(off) / signal, axis=0) for off in (own - near, near - far, after - before)
-    )
+    apart = np.abs(own - near) / signal
+    spread, aside = (np.abs(off) / signal for off in (near - far, after - before))
+    parts = (apart > 0.5 * limit) & (np.maximum(spread, aside) <= MAX_SPREAD * apart)
+    differs, spread, aside = (np.median(one, axis=0) for one in (apart, spread, aside))
     alone = (differs > limit) & (np.maximum(spread, aside) <= MAX_SPREAD * differs)
+    alone &= np.mean(parts, axis=0) >= MIN_PARTS
     if not alone.any():
         return None
     best = int(np.argmax(np.where(alone, differs, 0.0)))

@@ -61,6 +61,17 @@ def test_an_edge_and_a_line_that_a_lens_spreads_are_ground() -> None:
     assert _worst(with_line(1.3 * plain[:, AT : AT + 2], width=2)) is None
 
 
+def test_a_narrow_road_that_goes_over_from_one_line_to_the_next_is_ground() -> None:
+    means = ground()
+    means[:5, AT + 1] *= 1.9
+    means[5:12, AT] *= 1.9
+    assert _worst(means) is None
+    means[:12, AT] = means[:12, AT - 1] * 1.9
+    means[:12, AT + 1] = means[:12, AT - 1]
+    found = _worst(means)
+    assert found is not None and found[0] == AT
+
+
 def test_differences_are_averages_over_the_bundles() -> None:
     means = np.full((4, 9), 100.0, np.float32)
     means[:, 4] = (110.0, 90.0, 100.0, 120.0)
