@@ -28,7 +28,7 @@ def poweroff_problem(path: Path = HELPER_SOCKET) -> str:
     if is_socket:
         return ""
     return (
-        "the helper that shuts the computer down is not enabled. Run: sudo systemctl enable --now "
+        "The helper that shuts the computer down is not enabled. Run: sudo systemctl enable --now "
         "syntopic-poweroff.socket"
     )
 
@@ -46,5 +46,8 @@ def request_poweroff(path: Path = HELPER_SOCKET) -> str | None:
             channel.settimeout(CONNECT_TIMEOUT_S)
             channel.connect(str(path))
     except OSError as error:
-        return f"the helper that shuts the computer down did not answer ({error})"
+        return (
+            f"The helper that shuts the computer down did not answer ({error}); check its unit with "
+            "systemctl"
+        )
     return None
