@@ -47,7 +47,7 @@ def request_poweroff(path: Path = HELPER_SOCKET) -> str | None:
             channel.connect(str(path))
     except OSError as error:
         return (
-            f"The helper that shuts the computer down did not answer ({error}); check its unit with "
-            "systemctl"
+            f"The helper that shuts the computer down did not answer ({error}); check its unit "
+            "with systemctl"
         )
     return None
