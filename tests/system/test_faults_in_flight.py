@@ -228,7 +228,7 @@ def test_a_head_that_is_not_there_and_a_slow_pipeline_cost_flags_and_nothing_els
     text = service_toml(devices.ready, root="degraded", count=3, end_when_done=True)
     address = devices.ready["heads"]["SU11"]["address"]
     text = (
-        text.replace(f'"{address}"', f'"{ABSENT_ADDRESS}"') + "\n[limits]\nready_timeout_s = 4.0\n"
+        text.replace(f'"{address}"', f'"{ABSENT_ADDRESS}"') + "\n[limits]\nready_timeout_s = 12.0\n"
     )
     config.write_text(text)
     service = start(config)

@@ -84,8 +84,8 @@ def issue_certificate(
     for created in (folder, authority):
         durable.make_directories(created.absolute())
     certificate, key = folder / SERVER_CERTIFICATE, folder / SERVER_KEY
-    _refuse_foreign(openssl, certificate)
     signer, signer_key = authority / AUTHORITY_CERTIFICATE, authority / AUTHORITY_KEY
+    _refuse_foreign(openssl, certificate, signer)
     is_new = not signer.exists()
     with tempfile.TemporaryDirectory() as scratch:
         work = Path(scratch)
@@ -165,13 +165,15 @@ class _Openssl:
         return done.stdout
 
 
-def _refuse_foreign(openssl: _Openssl, certificate: Path) -> None:
-    """Refuse to replace a certificate that another authority signed."""
+def _refuse_foreign(openssl: _Openssl, certificate: Path, signer: Path) -> None:
+    """Refuse to replace a certificate of another authority, or a damaged one without ours."""
     if not certificate.exists():
         return
     try:
         issuer = openssl("x509", "-noout", "-issuer", "-nameopt", "multiline", "-in", certificate)
     except TlsCertificateError:
+        if signer.exists():
+            return
         issuer = b""
     if _AUTHORITY_NAME.encode() not in issuer:
         raise TlsCertificateError(

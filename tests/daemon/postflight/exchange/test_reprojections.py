@@ -282,8 +282,10 @@ def test_rotation_vectors_in_degrees_are_refused(scene, tmp_path) -> None:
 def test_pixels_that_are_counted_from_another_origin_are_stated(scene, tmp_path) -> None:
     path = colmap(scene, tmp_path / "in")
     measured(path, lambda x, y: (x - 0.5, y - 0.5))
-    (_, note) = import_block(path, "colmap", tmp_path / "out").block.notes
-    assert "projections of the points are 0.5" in note and "another origin" in note
+    notes = import_block(path, "colmap", tmp_path / "out").block.notes
+    assert any(
+        "projections of the points are 0.5" in note and "another origin" in note for note in notes
+    )
 
 
 def test_measurements_that_fit_hardly_are_stated_with_their_distance(scene, tmp_path) -> None:
