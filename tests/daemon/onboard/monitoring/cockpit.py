@@ -180,10 +180,19 @@ def faults_of_page(browser: Browser, width: int, phone_tab: str = "map") -> list
 
 
 def axe(browser: Browser) -> list[Any]:
-    """Violations, and incomplete results that are not decided here."""
+    """Violations, and incomplete results that are not decided here.
+
+    A page that is redrawn while axe compares places gives results of no moment, so that only those
+    that a second run has as well are reported.
+    """
     if not browser.evaluate("typeof axe === 'object'"):
         browser.call("Page.setBypassCSP", enabled=True)
         browser.evaluate((npm_package("axe-core") / "axe.min.js").read_text())
+    first = _axe_once(browser)
+    return [one for one in _axe_once(browser) if one[0] in dict(first)] if first else []
+
+
+def _axe_once(browser: Browser) -> list[tuple[str, list[str]]]:
     # The rule of WCAG 2.2 is off by default.
     options = "{resultTypes: ['violations', 'incomplete'], rules: {'target-size': {enabled: true}}}"
     found = browser.evaluate(f"axe.run(document, {options})")
