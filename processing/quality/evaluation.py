@@ -1,6 +1,7 @@
 """From figures to findings and a verdict: every rule by which a flag is raised, and its sentence.
 
-Rules about the pixels are in `processing.quality.image_findings`, those about stitching in
+Rules about what a frame shows are in `processing.quality.content_findings`, those about its pixels in
+`processing.quality.image_findings`, those about stitching in
 `processing.quality.stitching_findings`.
 What a report consists of, the thresholds and the meaning of every figure are in
 `processing.quality.report`.
@@ -12,6 +13,13 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Final
 
+from processing.quality.content_findings import (
+    content_findings,
+    dark_frame_findings,
+    identity_findings,
+    other_ground_findings,
+    word_format_findings,
+)
 from processing.quality.figures import QualityFigures
 from processing.quality.figures.circumstances import (
     EstimatedDcFigures,
@@ -25,15 +33,7 @@ from processing.quality.figures.image import (
     ValidFigures,
 )
 from processing.quality.figures.stitching import DisplacedSensorFigures, MisreadProbeFigures
-from processing.quality.image_findings import (
-    content_findings,
-    dark_frame_findings,
-    exposure_findings,
-    identity_findings,
-    other_ground_findings,
-    signal_findings,
-    word_format_findings,
-)
+from processing.quality.image_findings import exposure_findings, signal_findings
 from processing.quality.report import (
     NO_FLAGS,
     Finding,
