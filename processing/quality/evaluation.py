@@ -1,7 +1,7 @@
 """From figures to findings and a verdict: every rule by which a flag is raised, and its sentence.
 
-Rules about what a frame shows are in `processing.quality.content_findings`, those about its pixels in
-`processing.quality.image_findings`, those about stitching in
+Rules about what a frame shows are in `processing.quality.content_findings`, those about its
+pixels in `processing.quality.image_findings`, those about stitching in
 `processing.quality.stitching_findings`.
 What a report consists of, the thresholds and the meaning of every figure are in
 `processing.quality.report`.
