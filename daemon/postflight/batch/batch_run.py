@@ -34,6 +34,7 @@ LOSSES_MAX: Final = 3
 """Ends of the process that an exposure may cause; the last attempt is made with no other in work,
 so that an exposure next to it cannot be the cause."""
 OUT_OF_MEMORY_MAX: Final = 2
+"""The same where memory was exhausted."""
 STORE_RETRIES_S: Final = (1.0, 4.0, 16.0)
 """Delays before the attempts after a store did not answer."""
 CLAIM_RETRY_S: Final = 1.0
@@ -229,14 +230,14 @@ class _Run:
         count = self._losses[task.number, lost.kind]
         limit = OUT_OF_MEMORY_MAX if lost.kind == "out-of-memory" else LOSSES_MAX
         if count >= limit:
-            alone = ", the last time with no other exposure in work" if limit == LOSSES_MAX else ""
+            alone = ", the last time with no other exposure in work"
             cure = (
                 "give fewer --processes or a machine with more memory"
                 if lost.kind == "out-of-memory"
                 else "repeat the command with --processes 0 to see its messages"
             )
             self._fail(task, f"quarantined after {count} attempts: {lost.cause}{alone}; {cure}")
-        elif count == limit - 1 and limit == LOSSES_MAX:
+        elif count == limit - 1:
             self._last.append(task)
         else:
             self._waiting.appendleft(task)

@@ -16,7 +16,15 @@ from daemon.mission.transfer.object_store import ObjectStoreUnavailableError
 from daemon.postflight.batch import batch_run, local_processes
 from daemon.postflight.batch.batch_run import BatchOutcome, run_batch
 from daemon.postflight.batch.capacity import plan_processes
-from daemon.postflight.batch.executor import BatchExecutor, BatchTask
+from daemon.postflight.batch.executor import (
+    BatchExecutor,
+    BatchTask,
+    BatchWork,
+    LossKind,
+    TaskDone,
+    TaskLost,
+    TaskOutcome,
+)
 from daemon.postflight.batch.in_process import InProcessExecutor
 from daemon.postflight.batch.local_processes import LocalProcessExecutor
 from tests.daemon.postflight.batch.toy_work import ToyAction, ToyWork, attempts_of
@@ -86,6 +94,45 @@ def test_killed_processes_cost_their_own_exposure_one_more_attempt(tmp_path: Pat
     attempts = [attempts_of(tmp_path, number) for number in range(1, 13)]
     assert attempts == [1, 2, 3, 3, 2, 2, 2, 1, 1, 1, 1, 1]
     assert outcome.counts.lost_processes == 1 + 2 + 3 + 1 + 2 + 1
+
+
+class OneProcess:
+    """One process with two tasks in work, both of which end with it: as a worker of a cluster."""
+
+    capacity, description = 2, "one process"
+
+    def __init__(self, kind: LossKind) -> None:
+        self._kind, self._in_work, self._ended = kind, list[BatchTask](), 0
+
+    def start(self, work: BatchWork) -> None:
+        """Nothing is opened."""
+
+    def submit(self, task: BatchTask) -> None:
+        self._in_work.append(task)
+
+    def wait(self, timeout_s: float) -> list[TaskOutcome]:
+        tasks, self._in_work = self._in_work, []
+        if not any(task.payload for task in tasks):
+            return [TaskDone(task.number, task.number * 10) for task in tasks]
+        self._ended += 1
+        return [TaskLost(one.number, self._kind, "it ended", str(self._ended)) for one in tasks]
+
+    def close(self, timeout_s: float) -> list[TaskOutcome]:
+        return []
+
+
+@pytest.mark.trust
+@pytest.mark.parametrize(("kind", "most"), [("killed", 3), ("out-of-memory", 2)])
+def test_an_exposure_that_shared_the_process_of_a_poisonous_one_is_computed(
+    kind: LossKind, most: int, tmp_path: Path
+) -> None:
+    for poisonous in range(1, 6):
+        tasks = [BatchTask(n, "poison" if n == poisonous else "") for n in range(1, 6)]
+        outcome = run_batch(OneProcess(kind), ToyWork(tmp_path), tasks)
+        assert outcome.results == {n: 10 * n for n in range(1, 6) if n != poisonous}
+        assert [failure.exposure for failure in outcome.failures] == [poisonous]
+        assert causes(outcome)[poisonous].startswith(f"quarantined after {most} attempts: it ended")
+        assert outcome.counts.lost_processes == most
 
 
 def test_ctrl_c_lets_what_is_in_work_finish_and_begins_nothing_more(tmp_path: Path) -> None:

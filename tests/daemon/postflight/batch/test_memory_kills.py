@@ -102,14 +102,15 @@ def test_a_process_that_outgrows_its_memory_is_named_on_this_machine(tmp_path: P
     check_named(run_batch(LocalProcessExecutor(2), ToyWork(tmp_path), tasks), tmp_path)
 
 
-@pytest.fixture
-def scheduler(tmp_path: Path) -> Iterator[str]:
+@pytest.fixture(scope="module")
+def scheduler(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """A scheduler and one worker of `syntopic worker`."""
+    log_file = tmp_path_factory.mktemp("cluster") / "cluster.txt"
     url = f"tcp://127.0.0.1:{free_port()}"
     dask = [str(Path(sys.executable).with_name("dask")), "scheduler", "--host", "127.0.0.1"]
     dask += ["--port", url.rpartition(":")[2], "--dashboard-address", "127.0.0.1:0"]
     own = [sys.executable, "-m", "daemon", "worker", url, "--processes", "1"]
-    with (tmp_path / "cluster.txt").open("wb") as log:
+    with log_file.open("wb") as log:
         parts = [
             subprocess.Popen(command, cwd=ROOT, stdout=log, stderr=log) for command in (dask, own)
         ]
@@ -140,6 +141,30 @@ def test_the_only_worker_of_a_cluster_that_outgrows_its_memory_is_named(
     began_s = time.monotonic()
     check_named(run_batch(executor, ToyWork(attempts), tasks), attempts)
     assert time.monotonic() - began_s < 150
+
+
+@pytest.mark.trust
+@pytest.mark.timeout(240)
+def test_a_result_that_ended_with_its_worker_before_it_was_fetched_is_computed_again(
+    scheduler: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fetched, real = list[int](), DaskExecutor._outcome
+
+    def late(self: DaskExecutor, number: int, future: Any) -> Any:
+        limit_s = time.monotonic() + 60
+        while number == 1 and not fetched and not (tmp_path / "2").exists():
+            assert time.monotonic() < limit_s
+            time.sleep(0.05)  # until the worker has begun the task that ends it
+        time.sleep(0.5)
+        fetched.append(number)
+        return real(self, number, future)
+
+    monkeypatch.setattr(DaskExecutor, "_outcome", late)
+    tasks = [BatchTask(1), BatchTask(2, "killed 1"), BatchTask(3)]
+    executor = DaskExecutor(cluster_address(scheduler, None, None, None))
+    outcome = run_batch(executor, ToyWork(tmp_path), tasks)
+    assert outcome.results == {1: 10, 2: 20, 3: 30} and outcome.failures == []
+    assert attempts_of(tmp_path, 1) == 2 and fetched[0] == 1
 
 
 def check_named(outcome: Any, attempts: Path) -> None:
