@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import socket
+import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import pytest
 
@@ -69,6 +73,24 @@ def test_the_other_pages_recover_too(service: Service, browser: Browser, page: s
     browser.wait_for(READY, WITHIN_S)
 
 
+def is_refused_after_a_flood(address: str) -> bool:
+    """Ask for what is not there until one answer is 429, however slow the machine is."""
+    parts = urlsplit(address)
+    request = f"GET /api/v1/none HTTP/1.1\r\nHost: {parts.netloc}\r\n\r\n".encode()
+    deadline_s = time.monotonic() + WITHIN_S
+    while time.monotonic() < deadline_s:
+        # Pipelined. The connection is reset with the first refusal, which may be lost in it.
+        for count in (2 * REQUESTS_BURST, 1):
+            link = socket.create_connection((parts.hostname, parts.port), WITHIN_S)
+            with link, suppress(OSError):
+                link.sendall(request * count)
+                link.shutdown(socket.SHUT_WR)
+                while answer := link.recv(65536):
+                    if b"HTTP/1.1 429" in answer:
+                        return True
+    return False
+
+
 def test_a_page_opens_although_its_address_has_sent_too_many_requests(
     service: Service, tmp_path: Path
 ) -> None:
@@ -77,14 +99,7 @@ def test_a_page_opens_although_its_address_has_sent_too_many_requests(
         browser.wait_for(f"{CONNECTED} && navigator.serviceWorker.controller !== null", WITHIN_S)
         browser.evaluate("location.reload()")
         browser.wait_for(f"{CONNECTED} && {READY}", WITHIN_S)
-        refused = browser.evaluate(
-            f"""(async () => {{
-              const ask = () => fetch('/api/v1/ledger').then((one) => one.status);
-              const all = await Promise.all(Array.from({{length: {2 * REQUESTS_BURST}}}, ask));
-              return all.filter((status) => status === 429).length;
-            }})()"""
-        )
-        assert refused > 0
+        assert is_refused_after_a_flood(service.address)
         browser.evaluate("location.reload()")
         browser.wait_for(f"{CONNECTED} && {READY} && typeof L === 'object'", WITHIN_S)
 
