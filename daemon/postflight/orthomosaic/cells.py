@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from daemon.postflight.orthomosaic.ground_reach import ground_reach_m
 from daemon.postflight.orthomosaic.inputs import OrthoBlock, OrthoImage
-from daemon.postflight.orthomosaic.pixels import image_pixels
+from daemon.postflight.orthomosaic.pixels import reduced_pixels, reduction_of
 from processing.image.orthoimage.ground_grid import GroundGrid
-from processing.image.orthoimage.ground_resampling import reduced_image, resample_to_ground
+from processing.image.orthoimage.ground_resampling import resample_to_ground
 from processing.image.orthoimage.levelling import GainField, ImageLevels, level_block, levelled
 
 Array = NDArray[Any]
@@ -130,22 +130,15 @@ def _signal_of(
     row, column = (max(n, 0) // BLOCK_CELLS * BLOCK_CELLS for n in (row, column))
     height, width = (max(min(side, n), 1) for n in (grid.height_px - row, grid.width_px - column))
     part = grid.window(column, row, width, height)
-    # Cells are as large as this many pixels of the image.
-    factor = max(round(grid.gsd_m / _pixel_m(block, image)), 1)
-    small = reduced_image(image_pixels(block, image, bands), factor)
+    factor = reduction_of(block, image, grid.gsd_m)
     cells = resample_to_ground(
-        small, pose.reduced(factor), block.surface(part), interpolation="bilinear"
-    )
+        reduced_pixels(block, image, bands, factor), pose.reduced(factor), block.surface(part),
+        interpolation="bilinear",
+    )  # fmt: skip
     # The reduced image has data where all its pixels have; a cell reaches half of one further.
     whole = _shrunk(np.asarray((cells > 0.0).all(axis=0)))
     cells[:, ~whole] = 0.0
     return _cropped((row, column), cells)
-
-
-def _pixel_m(block: OrthoBlock, image: OrthoImage) -> float:
-    ground = block.ground.surface
-    level = ground if isinstance(ground, float) else float(np.nanmean(ground.height_m))
-    return (image.height_m - level) * image.pose.pixel_mm / image.pose.f_mm
 
 
 def _shrunk(mask: Array) -> Array:

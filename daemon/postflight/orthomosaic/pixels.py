@@ -1,4 +1,7 @@
-"""Pixels of the images of an orthomosaic, whole or a window: PAN, and colour at its resolution."""
+"""Pixels of the images of an orthomosaic, whole or a window: PAN, and pansharpened colour.
+
+For ground pixels larger than those of an image they are means of blocks of its pixels.
+"""
 
 from __future__ import annotations
 
@@ -12,12 +15,56 @@ from numpy.typing import NDArray
 from daemon.mission.store.level0 import read_description, read_tiff_rows
 from daemon.postflight.orthomosaic.inputs import OrthoBlock, OrthoImage
 from daemon.postflight.orthomosaic.photographs import photograph_pixels
+from processing.image.orthoimage.ground_resampling import reduced_image
 from processing.image.pansharpening import pansharpened
 
 Array = NDArray[Any]
 
 MARGIN_PX: Final = 10
 """Colour pixels around a window that pansharpening sees."""
+
+
+def reduction_of(block: OrthoBlock, image: OrthoImage, gsd_m: float) -> int:
+    """Pixels of an image along a ground pixel, rounded; at least one.
+
+    Args:
+        block: of the image.
+        image: whose pixels.
+        gsd_m: size of the ground pixels.
+    """
+    ground = block.ground.surface
+    level = ground if isinstance(ground, float) else float(np.nanmean(ground.height_m))
+    pixel_m = (image.height_m - level) * image.pose.pixel_mm / image.pose.f_mm
+    return max(round(gsd_m / pixel_m), 1)
+
+
+def reduced_pixels(
+    block: OrthoBlock,
+    image: OrthoImage,
+    bands: Sequence[str],
+    factor: int,
+    window: tuple[int, int, int, int] | None = None,
+) -> Array:
+    """Means of blocks of pixels of an image, those of `image.pose.reduced(factor)`.
+
+    Args:
+        block: of the image.
+        image: whose pixels.
+        bands: "pan" first, then colour bands.
+        factor: pixels to a block along each axis.
+        window: first column and row, columns, rows, of the blocks; None: all.
+
+    Returns:
+        (bands, rows, columns) float32, with a factor of 1 uint16; 0 is no data.
+
+    Raises:
+        RasterError: a raster that cannot be read.
+    """
+    if window is not None:
+        first_column, first_row, width, height = (factor * n for n in window)
+        window = first_column, first_row, width, height
+    pixels = image_pixels(block, image, bands, window)
+    return pixels if factor == 1 else reduced_image(pixels, factor)
 
 
 def image_pixels(

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from daemon.mission.store import durable
 from daemon.postflight.orthomosaic.cells import BLOCK_CELLS, CELL_PX, CellSurvey
 from daemon.postflight.orthomosaic.inputs import OrthoBlock
-from daemon.postflight.orthomosaic.pixels import image_pixels
+from daemon.postflight.orthomosaic.pixels import reduced_pixels, reduction_of
 from processing.image.orthoimage.ground_grid import GroundGrid
 from processing.image.orthoimage.ground_resampling import resample_to_ground, window_seen
 from processing.image.orthoimage.levelling import GainField
@@ -139,12 +139,14 @@ def render_tile(block: OrthoBlock, bands: Sequence[str], job: TileJob) -> Array:
     rows, columns = (y + 0.5) / span - 0.5, (x + 0.5) / span - 0.5
     for k, gain in job.gains.items():
         image = block.images[k]
-        visible = window_seen(surface, image.pose)
+        factor = reduction_of(block, image, job.grid.gsd_m)
+        pose = image.pose.reduced(factor)
+        visible = window_seen(surface, pose)
         if visible is None:
             continue
         wanted = owner == k
-        pixels = image_pixels(block, image, bands, visible)
-        found = resample_to_ground(pixels, image.pose.window(*visible), surface, wanted=wanted)
+        pixels = reduced_pixels(block, image, bands, factor, visible)
+        found = resample_to_ground(pixels, pose.window(*visible), surface, wanted=wanted)
         filled = found > 0.0
         found = gain.levelled(found, rows, columns)
         words = np.clip(np.rint(found), 1.0, _WORD_MAX).astype(np.uint16)

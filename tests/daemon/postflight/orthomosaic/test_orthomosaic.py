@@ -27,10 +27,12 @@ from daemon.postflight.orthomosaic import orthomosaic as making
 from daemon.postflight.orthomosaic.cells import CELL_PX, cells_of, survey
 from daemon.postflight.orthomosaic.ground_reach import corner_slope, ground_reach_m
 from daemon.postflight.orthomosaic.inputs import block_for_orthomosaic
-from daemon.postflight.orthomosaic.tiles import TILE_PX
+from daemon.postflight.orthomosaic.tiles import TILE_PX, TileJob, render_tile
 from processing.geometry.rotation import rotation_matrix
 from processing.geometry.terrain_rays import HeightModel
+from processing.image.orthoimage.ground_grid import GroundGrid
 from processing.image.orthoimage.ground_resampling import ImagePose
+from processing.image.orthoimage.levelling import GainField
 
 pytestmark = pytest.mark.timeout(300)
 
@@ -167,6 +169,29 @@ def test_a_finer_grid_shows_the_same_ground(flown) -> None:
         area_m2.append((found.owner >= 0).sum() * (gsd_m * CELL_PX) ** 2)
     # Cells are taken where an image covers them whole; smaller ones come nearer to its edge.
     assert 1.0 < area_m2[1] / area_m2[0] < 1.1
+
+
+def test_a_coarser_grid_shows_means_of_the_ground_and_not_points(flown) -> None:
+    """Against means of ground pixels at the sampling distance of the images, by the same code."""
+    factor, side = 4, 128
+    block = _block(flown, gsd_m=0.15 * factor)
+    east_m, north_m = block.images[0].nadir_m
+    coarse = GroundGrid(east_m, north_m, 0.15 * factor, side, side)
+    half = 0.15 * (factor - 1) / 2
+    fine = GroundGrid(east_m - half, north_m + half, 0.15, side * factor, side * factor)
+    bands, nodes = ("pan", *block.images[0].colour), np.zeros((5, 2, 2))
+    gains = {0: GainField(0.0, 0.0, (64.0, 64.0), nodes, nodes)}
+
+    def tile(grid: GroundGrid) -> np.ndarray:
+        owner = np.zeros((grid.height_px // CELL_PX, grid.width_px // CELL_PX), np.int32)
+        return render_tile(block, bands, TileJob(0, 0, 0, 0, grid, owner, gains)).astype(float)
+
+    means = tile(fine).reshape(len(bands), side, factor, side, factor).mean(axis=(2, 4))
+    found = tile(coarse)
+    assert found.min() > 0.0
+    detail = means.std(axis=(1, 2))
+    difference = np.sqrt(np.mean((found - means) ** 2, axis=(1, 2)))
+    assert (difference < 0.06 * detail).all()
 
 
 def test_tiles_of_another_geometry_or_other_code_have_another_key(flown, monkeypatch) -> None:
