@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from daemon.postflight.orthomosaic.ground_reach import ground_reach_m
 from daemon.postflight.orthomosaic.inputs import OrthoBlock, OrthoImage
 from daemon.postflight.orthomosaic.pixels import reduced_pixels, reduction_of
+from daemon.postflight.orthomosaic.triangulated import OrthomosaicError
 from processing.image.orthoimage.ground_grid import GroundGrid
 from processing.image.orthoimage.ground_resampling import resample_to_ground
 from processing.image.orthoimage.levelling import GainField, ImageLevels, level_block, levelled
@@ -23,6 +24,8 @@ from processing.image.orthoimage.levelling import GainField, ImageLevels, level_
 Array = NDArray[Any]
 
 CELL_PX: Final = 16
+CELLS_MIN: Final = 8
+"""Cells along the shorter side of an image: fewer are no survey of it."""
 BLOCK_CELLS: Final = 4
 """Cells along a block whose mean signal is levelled."""
 SEAM_MAX: Final = 0.5
@@ -63,6 +66,29 @@ class ImageCells:
     place: tuple[int, int]
     covered: NDArray[np.bool_]
     levels: ImageLevels
+
+
+def refuse_coarse_grid(block: OrthoBlock) -> None:
+    """Refuse ground pixels so large that an image would hold too few cells.
+
+    Args:
+        block: images and grid.
+
+    Raises:
+        OrthomosaicError: they are.
+    """
+    cells = min(
+        min(image.pose.width_px, image.pose.height_px)
+        // reduction_of(block, image, CELL_PX * block.grid.gsd_m)
+        for image in block.images
+    )
+    if cells < CELLS_MIN:
+        largest_m = block.grid.gsd_m * cells / CELLS_MIN if cells else None
+        example = f", such as {largest_m:.2g}" if largest_m else ""
+        raise OrthomosaicError(
+            f"an image is {cells} cells of {CELL_PX} ground pixels of {block.grid.gsd_m:g} m; it "
+            f"must be {CELLS_MIN} at least. Give a smaller --gsd, in metres{example}"
+        )
 
 
 def cells_of(block: OrthoBlock, image: OrthoImage, bands: Sequence[str]) -> ImageCells:

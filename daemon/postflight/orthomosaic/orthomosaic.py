@@ -14,7 +14,7 @@ from daemon.mission.canonical_json import canonical_bytes
 from daemon.mission.store import durable
 from daemon.mission.store.publication import published
 from daemon.postflight.batch.batch_run import StepCompute, in_this_process
-from daemon.postflight.orthomosaic.cells import CellSurvey, cell_grid, survey
+from daemon.postflight.orthomosaic.cells import CellSurvey, cell_grid, refuse_coarse_grid, survey
 from daemon.postflight.orthomosaic.inputs import OrthoBlock, described_ground
 from daemon.postflight.orthomosaic.orthomosaic_work import (
     OrthomosaicRequest,
@@ -77,12 +77,14 @@ def make_orthomosaic(
 
     Raises:
         OutputPlaceError: the folder holds something else.
-        OrthomosaicError: no image covers the ground, one cannot be read, the disk is too small, or
-            another command makes the same orthomosaic.
+        OrthomosaicError: no image covers the ground, ground pixels are too large for the images,
+            one cannot be read, the disk is too small, or another command makes the same
+            orthomosaic.
         OSError: the disk refused.
     """
     final = final.resolve()
     refuse_foreign_places(final, block.mission)
+    refuse_coarse_grid(block)
     bands, left_out = _bands(block, settings.images)
     with work_folder(final, _key(block, bands, settings)) as tiles:
         work_on = work_of(request, block, bands, tiles)

@@ -227,6 +227,8 @@ def test_a_view_to_the_horizon_is_refused_and_low_ground_widens_the_reach() -> N
         (["--ground-height", "99999"], "is not below all cameras"),
         (["--gsd", "-1"], "positive"),
         (["--gsd", "inf"], "positive"),
+        (["--gsd", "100"], "Give a smaller --gsd, in metres"),
+        (["--gsd", "2.5"], "smaller --gsd, in metres, such as 1.2"),
         (["--gsd", "0.0001"], "larger --gsd"),
         (["--bits", "12"], "16 or 8"),
         (["--image", "nir"], "pan, rgb or cir"),
