@@ -20,6 +20,7 @@ from datetime import timedelta
 from typing import Any, Final, TypeVar
 
 from daemon import DaemonError
+from daemon.mission.transfer.s3_requests import S3RefusedError
 
 SCHEMES: Final = ("s3", "gs", "az")
 PART_BYTES: Final = 16_000_000
@@ -238,17 +239,43 @@ class ObjectStore:
         """
         import obstore
 
+        def send() -> None:
+            if nbytes <= PART_BYTES:
+                obstore.put(self._store, name, b"".join(blocks()), use_multipart=False)
+            else:
+                obstore.put(
+                    self._store, name, blocks(), use_multipart=True, chunk_size=PART_BYTES,
+                    max_concurrency=2,
+                )  # fmt: skip
+
+        self.put_by(send, name, nbytes, sha256, errors=(obstore.exceptions.BaseError,))
+
+    def put_by(
+        self,
+        send: Callable[[], None],
+        name: str,
+        nbytes: int,
+        sha256: str,
+        *,
+        errors: tuple[type[Exception], ...],
+    ) -> None:
+        """Write an object as `put` does, by a function that sends it.
+
+        Args:
+            send: sends the whole object.
+            name: of the object.
+            nbytes: size of the content.
+            sha256: of the content.
+            errors: that `send` raises where the store fails.
+
+        Raises:
+            ObjectStoreError: the store refused in every attempt.
+        """
         for attempt in range(1, WRITE_ATTEMPTS + 1):
             try:
-                if nbytes <= PART_BYTES:
-                    obstore.put(self._store, name, b"".join(blocks()), use_multipart=False)
-                else:
-                    obstore.put(
-                        self._store, name, blocks(), use_multipart=True, chunk_size=PART_BYTES,
-                        max_concurrency=2,
-                    )  # fmt: skip
+                send()
                 return
-            except obstore.exceptions.BaseError as error:
+            except errors as error:
                 # An upload that was aborted elsewhere is begun again.
                 if _is_final(error) and _NO_UPLOAD not in str(error):
                     raise self._refused(name, error) from error
@@ -342,7 +369,8 @@ def _is_final(error: Exception) -> bool:
     import obstore
 
     absent = FileNotFoundError | obstore.exceptions.NotFoundError
-    return isinstance(error, absent) or bool(_access_cure(error))
+    is_absent = isinstance(error, S3RefusedError) and error.status == 404
+    return is_absent or isinstance(error, absent) or bool(_access_cure(error))
 
 
 def _access_cure(error: Exception) -> str:

@@ -18,7 +18,8 @@ from pathlib import Path
 from daemon.mission.layout import Mission
 from daemon.mission.store.file_tree import FileEntry, FileTree
 from daemon.mission.transfer.object_store import PART_BYTES, ObjectStore, StoredObject
-from daemon.mission.transfer.s3_uploads import UnfinishedUploads, abort_unfinished
+from daemon.mission.transfer.s3_parts import ERRORS, PartUploads, part_uploads
+from daemon.mission.transfer.s3_uploads import UnfinishedUploads, list_unfinished
 from daemon.mission.transfer.store_products import is_processed
 from daemon.mission.transfer.store_verification import check_store_copy, read_store_manifest
 from daemon.mission.transfer.transfer import (
@@ -156,6 +157,7 @@ class _StoreCopying:
         self._entries = self._source_entries()
         self._nbytes = sum(entry.nbytes for entry in self._entries)
         self._step = counter(3 * self._nbytes, progress)
+        self._parts: PartUploads | None = None
 
     def run(self, mission: Mission, *, remove: bool) -> StoreTransferReport:
         """Copy, read back, and seal and remove the source where that is wanted."""
@@ -176,10 +178,14 @@ class _StoreCopying:
             },
         )
         self._target.replace_small(MANIFEST_FILE, note.to_bytes())
-        uploads = abort_unfinished(
+        listing = list_unfinished(
             self._target.url, lambda name: name in note.files or is_processed(name)
         )
+        self._parts = part_uploads(
+            listing, {e.name for e in self._entries if e.nbytes > PART_BYTES}
+        )
         done = self._copy_all(present)
+        uploads = self._parts.end() if self._parts else UnfinishedUploads(problem=listing.problem)
         for name in removed:
             self._target.delete(name)
         self._refuse_changed_source()
@@ -234,6 +240,8 @@ class _StoreCopying:
         try:
             done, _ = wait(work.values(), return_when=FIRST_EXCEPTION)
         finally:
+            if self._parts:
+                self._parts.stop()
             pool.shutdown(wait=True, cancel_futures=True)
         for one in done:
             one.result()  # the error that ended the work, if there was one
@@ -253,7 +261,10 @@ class _StoreCopying:
                     f"earlier in {self._target.url}; both are kept. Run `syntopic verify "
                     f"{self._source.path}`, or transfer the mission into another folder"
                 )
-        self._target.put(entry.name, lambda: self._blocks(entry), entry.nbytes, here)
+        if self._parts and entry.nbytes > PART_BYTES:
+            self._put_in_parts(self._parts, entry, here)
+        else:
+            self._target.put(entry.name, lambda: self._blocks(entry), entry.nbytes, here)
         written = self._target.find(entry.name)
         if (
             written is None
@@ -265,6 +276,23 @@ class _StoreCopying:
                 "source is kept. Run the transfer again"
             )
         return here, False
+
+    def _put_in_parts(self, parts: PartUploads, entry: FileEntry, sha256: str) -> None:
+        with self._source.reading(entry.name) as descriptor:
+
+            def read(offset: int, nbytes: int) -> bytes:
+                try:
+                    return os.pread(descriptor, nbytes, offset)
+                except OSError as error:
+                    raise TransferError(
+                        f"{self._source.path / entry.name} cannot be read: {error.strerror}; the "
+                        "source is kept. Check its disk"
+                    ) from error
+
+            def send() -> None:
+                parts.send(entry.name, read, entry.nbytes, self._step)
+
+            self._target.put_by(send, entry.name, entry.nbytes, sha256, errors=ERRORS)
 
     def _blocks(self, entry: FileEntry) -> Iterator[bytes]:
         with self._source.reading(entry.name) as descriptor:

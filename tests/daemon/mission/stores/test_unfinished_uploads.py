@@ -13,9 +13,10 @@ from typer.testing import CliRunner
 
 from daemon.cli import app
 from daemon.mission.layout import Mission
-from daemon.mission.transfer import s3_uploads
+from daemon.mission.transfer import s3_requests, s3_uploads
 from daemon.mission.transfer.object_store import ObjectStore
-from daemon.mission.transfer.s3_uploads import Credentials, abort_unfinished, signed_headers
+from daemon.mission.transfer.s3_requests import Credentials, S3Answer, S3Folder, signed_headers
+from daemon.mission.transfer.s3_uploads import abort_unfinished
 from daemon.mission.transfer.store_transfer import transfer_to_store
 from tests.daemon.mission.stores.faulty_s3 import BUCKET, Faults
 from tests.daemon.mission.stores.test_store_transfer import client
@@ -87,7 +88,7 @@ def test_the_age_is_by_the_clock_of_the_store(
 
     years_s = (datetime.now(UTC) - datetime(2010, 11, 10, tzinfo=UTC)).total_seconds()
     monkeypatch.setattr(s3_uploads, "AGE_MIN_S", years_s + 3600)
-    monkeypatch.setattr(s3_uploads, "datetime", Ahead)
+    monkeypatch.setattr(s3_requests, "datetime", Ahead)
     assert abort_unfinished(f"{url}/{mission.id}", lambda _name: True).recent == ("x",)
 
 
@@ -99,24 +100,25 @@ def test_more_uploads_than_one_answer_holds_are_all_aborted(
     for name in names:
         begun(name)
     asked: list[dict[str, str]] = []
-    real = s3_uploads._request
+    real = S3Folder.request
 
-    def two_at_a_time(method: str, bucket: str, key: str, query, credentials):
-        content, now = real(method, bucket, key, query, credentials)
+    def two_at_a_time(self: S3Folder, method: str, name: str | None, query):
+        answer = real(self, method, name, query)
         if method != "GET":
-            return content, now
+            return answer
         asked.append(dict(query))
         after = int(query.get("upload-id-marker", "0"))
-        uploads = [f"<Upload>{one}" for one in content.decode().split("<Upload>")[1:]]
+        uploads = [f"<Upload>{one}" for one in answer.content.decode().split("<Upload>")[1:]]
         uploads = [one.partition("</Upload>")[0] + "</Upload>" for one in uploads]
         is_cut = after + 2 < len(uploads)
         marks = (
             f"<NextKeyMarker>k</NextKeyMarker><NextUploadIdMarker>{after + 2}</NextUploadIdMarker>"
         )
         text = "".join(uploads[after : after + 2]) + (marks if is_cut else "")
-        return f"<R><IsTruncated>{str(is_cut).lower()}</IsTruncated>{text}</R>".encode(), now
+        content = f"<R><IsTruncated>{str(is_cut).lower()}</IsTruncated>{text}</R>".encode()
+        return S3Answer(content, answer.now)
 
-    monkeypatch.setattr(s3_uploads, "_request", two_at_a_time)
+    monkeypatch.setattr(S3Folder, "request", two_at_a_time)
     assert len(abort_unfinished(url, lambda _name: True).aborted) == 5
     assert len(asked) == 3 and unfinished() == []
 
@@ -124,14 +126,14 @@ def test_more_uploads_than_one_answer_holds_are_all_aborted(
 def test_a_server_that_lists_all_uploads_of_the_bucket_aborts_those_of_the_folder(
     store: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    url, real = store(), s3_uploads._request
+    url, real = store(), S3Folder.request
     for name in ("one/x", "one2/x", "two/x"):
         begun(name)
 
-    def unfiltered(method: str, bucket: str, key: str, query, credentials):
-        return real(method, bucket, key, {**query, "prefix": ""} if not key else query, credentials)
+    def unfiltered(self: S3Folder, method: str, name: str | None, query):
+        return real(self, method, name, {**query, "prefix": ""} if name is None else query)
 
-    monkeypatch.setattr(s3_uploads, "_request", unfiltered)
+    monkeypatch.setattr(S3Folder, "request", unfiltered)
     assert abort_unfinished(f"{url}/one", lambda _name: True).aborted == ("x",)
     assert unfinished() == ["one2/x", "two/x"]
 
@@ -146,7 +148,7 @@ def test_a_user_without_the_right_copies_all_the_same_and_reads_the_cure(
     begun(f"{mission.id}/L0/000001/SU00.tif")
     transfer_to_store(mission, ObjectStore(url))
     begun(f"{mission.id}/L0/000001/SU00.tif")
-    real = s3_uploads._request
+    real = S3Folder.request
 
     def refused(*arguments):
         faults.kinds, faults.every = (code,), 1
@@ -156,7 +158,7 @@ def test_a_user_without_the_right_copies_all_the_same_and_reads_the_cure(
             faults.every = 0
 
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(s3_uploads, "_request", refused)
+        patched.setattr(S3Folder, "request", refused)
         report = transfer_to_store(mission, ObjectStore(url))
     assert report.already_present > 10 and report.uploads.aborted == ()
     assert "s3:ListBucketMultipartUploads" in report.uploads.problem
@@ -185,7 +187,8 @@ def test_an_answer_that_is_no_list_of_uploads_aborts_nothing(
 ) -> None:
     url = store()
     begun("a")
-    monkeypatch.setattr(s3_uploads, "_request", lambda *_: (answer, datetime.now(UTC)))
+    content = S3Answer(answer, datetime.now(UTC))
+    monkeypatch.setattr(S3Folder, "request", lambda *_: content)
     found = abort_unfinished(url, lambda _name: True)
     assert found.aborted == () and "could not be listed" in found.problem
     assert unfinished() == ["a"]
@@ -262,7 +265,7 @@ def test_the_signature_is_that_of_the_vendor(
     own = signed_headers(
         method, url, query, Credentials("AK", "se/cret", token), region="eu-central-1", now=now
     )
-    peer = AWSRequest(method=method, url=f"{url}?{s3_uploads.query_text(query)}")
+    peer = AWSRequest(method=method, url=f"{url}?{s3_requests.query_text(query)}")
     peer.headers["X-Amz-Content-SHA256"] = own["x-amz-content-sha256"]
     peer.context["timestamp"] = own["x-amz-date"]
     signer = S3SigV4Auth(Peer("AK", "se/cret", token or None), "s3", "eu-central-1")

@@ -1,0 +1,204 @@
+"""Files sent to an S3 store in parts, continued where an earlier command was killed.
+
+The store lists the parts it has, with size and MD5. A part that equals the file is not sent again;
+the object is read back and compared by SHA-256 as every other one. obstore begins each upload
+again, so the requests are made here; they need the access key of the environment.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import threading
+from collections.abc import Callable, Container
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from http.client import HTTPException
+from typing import Final
+from xml.sax.saxutils import escape
+
+from daemon import DaemonError
+from daemon.mission.foreign_xml import parse_xml
+from daemon.mission.transfer import object_store
+from daemon.mission.transfer.object_store import PART_BYTES, RETRIES, ByteProgress
+from daemon.mission.transfer.s3_requests import S3Folder, S3RefusedError
+from daemon.mission.transfer.s3_uploads import (
+    ELEMENTS_MAX,
+    UnfinishedUploads,
+    Upload,
+    UploadListing,
+    abort_old,
+    text_of,
+)
+
+PARTS_IN_WORK: Final = 2
+"""Of one file; each is in memory while it is sent."""
+_COMPLETED: Final = "CompleteMultipartUploadResult"
+
+ReadPart = Callable[[int, int], bytes]
+"""The content of a file from an offset, so many bytes."""
+
+
+class InterruptedUploadError(DaemonError):
+    """The command ends; parts that were sent are continued by the next one."""
+
+
+class PartUploads:
+    """Uploads in parts below a folder of an S3 store.
+
+    Args:
+        folder: of the store.
+        listing: of the uploads there.
+        continued: names that may be continued; of several uploads of a name the last one is.
+    """
+
+    def __init__(self, folder: S3Folder, listing: UploadListing, continued: Container[str]) -> None:
+        self._folder, self._listing = folder, listing
+        self._begun: dict[str, Upload] = {}
+        for one in sorted(listing.uploads, key=lambda one: -one.age_s):
+            if one.name in continued:
+                self._begun[one.name] = one
+        others = [one for one in listing.uploads if self._begun.get(one.name) != one]
+        self._ended = abort_old(listing, others)
+        self._uploads = {name: one.upload_id for name, one in self._begun.items()}
+        self._completed: set[str] = set()
+        self._reused_nbytes = 0
+        self._lock, self._stopping = threading.Lock(), threading.Event()
+
+    def send(self, name: str, read: ReadPart, nbytes: int, sent: ByteProgress) -> None:
+        """Send the parts that the store does not have, and complete the object.
+
+        Args:
+            name: of the object.
+            read: its content; called by several threads.
+            nbytes: its size.
+            sent: called with the size of each part once the store has it.
+
+        Raises:
+            S3RefusedError: the store refused; the next call begins an upload of its own.
+            OSError, HTTPException: it did not answer in every attempt.
+            InterruptedUploadError: `stop` was called.
+            ValueError: not an answer of S3.
+        """
+        upload = self._uploads.get(name)
+        try:
+            present = self._present(name, upload) if upload else {}
+            if not upload:
+                upload = self._created(name)
+                self._uploads[name] = upload
+            e_tags = self._sent(name, upload, read, nbytes, present, sent)
+            self._complete(name, upload, e_tags)
+        except (S3RefusedError, ValueError) as error:
+            if not isinstance(error, S3RefusedError) or error.status < 500:
+                self._uploads.pop(name, None)
+            raise
+        self._completed.add(upload)
+        self._uploads.pop(name, None)
+
+    def stop(self) -> None:
+        """Begin no further part."""
+        self._stopping.set()
+
+    def end(self) -> UnfinishedUploads:
+        """Abort old uploads that were not continued after all; what happened to all of them."""
+        begun, completed = self._begun.values(), self._completed
+        continued = sorted(one.name for one in begun if one.upload_id in completed)
+        found = abort_old(self._listing, [one for one in begun if one.upload_id not in completed])
+        return replace(
+            found,
+            aborted=(*self._ended.aborted, *found.aborted),
+            recent=(*self._ended.recent, *found.recent),
+            problem=found.problem or self._ended.problem,
+            continued=tuple(continued),
+            reused_nbytes=self._reused_nbytes,
+        )
+
+    def _sent(
+        self,
+        name: str,
+        upload: str,
+        read: ReadPart,
+        nbytes: int,
+        present: dict[int, tuple[int, str]],
+        sent: ByteProgress,
+    ) -> list[str]:
+        """Entity tags of all parts."""
+
+        def part(number: int) -> str:
+            if self._stopping.is_set():
+                raise InterruptedUploadError(f"{name}: interrupted")
+            offset = (number - 1) * PART_BYTES
+            data = read(offset, min(PART_BYTES, nbytes - offset))
+            e_tag = hashlib.md5(data, usedforsecurity=False).hexdigest()
+            if present.get(number) == (len(data), e_tag):
+                with self._lock:
+                    self._reused_nbytes += len(data)
+            else:
+                query = {"partNumber": str(number), "uploadId": upload}
+                e_tag = self._request("PUT", name, query, data)[1]
+            sent(len(data))
+            return e_tag
+
+        pool = ThreadPoolExecutor(PARTS_IN_WORK)
+        try:
+            return list(pool.map(part, range(1, -(-nbytes // PART_BYTES) + 1)))
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+
+    def _present(self, name: str, upload: str) -> dict[int, tuple[int, str]]:
+        """Size and MD5 of the parts that the store has, by number."""
+        found: dict[int, tuple[int, str]] = {}
+        query = {"uploadId": upload}
+        while True:
+            root = parse_xml(self._request("GET", name, query)[0], elements_max=ELEMENTS_MAX)
+            for one in root.iterfind("{*}Part"):
+                number, nbytes = (int(text_of(one, key)) for key in ("PartNumber", "Size"))
+                found[number] = nbytes, text_of(one, "ETag").strip('"')
+            marker = root.findtext("{*}NextPartNumberMarker") or ""
+            is_cut = root.findtext("{*}IsTruncated") == "true"
+            if not is_cut or marker == query.get("part-number-marker"):
+                return found
+            query["part-number-marker"] = marker
+
+    def _created(self, name: str) -> str:
+        answer, _ = self._request("POST", name, {"uploads": ""})
+        return text_of(parse_xml(answer, elements_max=ELEMENTS_MAX), "UploadId")
+
+    def _complete(self, name: str, upload: str, e_tags: list[str]) -> None:
+        """Make the parts an object.
+
+        Raises:
+            ValueError: the store answers that it is complete, with an error in the body.
+        """
+        parts = "".join(
+            f"<Part><PartNumber>{number}</PartNumber><ETag>&quot;{escape(e_tag)}&quot;</ETag></Part>"
+            for number, e_tag in enumerate(e_tags, 1)
+        )
+        text = f"<CompleteMultipartUpload>{parts}</CompleteMultipartUpload>"
+        answer, _ = self._request("POST", name, {"uploadId": upload}, text.encode())
+        root = parse_xml(answer, elements_max=ELEMENTS_MAX)
+        if root.tag.rpartition("}")[2] != _COMPLETED:
+            code = root.findtext("{*}Code") or root.findtext("Code") or root.tag
+            raise ValueError(f"the upload was not completed: {code}")
+
+    def _request(
+        self, method: str, name: str, query: dict[str, str], body: bytes = b""
+    ) -> tuple[bytes, str]:
+        answer = self._folder.request(
+            method, name, query, body,
+            attempts=RETRIES, timeout_s=object_store.REQUEST_TIMEOUT_S,
+        )  # fmt: skip
+        return answer.content, answer.e_tag
+
+
+def part_uploads(listing: UploadListing, continued: Container[str]) -> PartUploads | None:
+    """Uploads that can be continued; None where the store does not permit it.
+
+    Args:
+        listing: of the uploads there.
+        continued: names that may be.
+    """
+    return None if listing.folder is None else PartUploads(listing.folder, listing, continued)
+
+
+ERRORS: Final = (OSError, HTTPException, ValueError)
+"""Of `PartUploads.send`."""
