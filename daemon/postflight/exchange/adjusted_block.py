@@ -6,13 +6,12 @@ motion within an exposure, patterns of stitching) is refused, not left out.
 
 from __future__ import annotations
 
-import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.orientation.local_frame import FRAME_FILE, LocalFrame
 from daemon.postflight.adjustment.adjusted_project import used_network
 from daemon.postflight.adjustment.contradictions import SUSPICIOUS_SIGMA0
 from daemon.postflight.adjustment.project import Project, read_project
@@ -25,6 +24,7 @@ from daemon.postflight.exchange.block import (
     BlockPoints,
 )
 from daemon.postflight.exchange.block_check import check_block
+from daemon.postflight.exchange.coordinate_unit import frame_next_to
 from processing.bundle.adjust import Adjustment
 from processing.bundle.camera_model import ideal_mm, perspective_mm, principal_distance_mm
 from processing.bundle.camera_orientations import camera_orientations
@@ -37,13 +37,17 @@ Array = NDArray[np.float64]
 
 _GRID = 25
 """Pairs of rays and pixels along each side of a camera."""
+_GROWN_FROM_PX = 1e-3
+"""A corner that a correction moves out by less does not make the format larger."""
 
 
-def block_of_project(path: Path) -> tuple[Block, float]:
+def block_of_project(path: Path, *, without_distortion: bool = False) -> tuple[Block, float]:
     """Adjust a project, and take its result as a block.
 
     Args:
         path: project.toml, or its folder.
+        without_distortion: measurements are corrected, and cameras are pinholes whose formats grow
+            on all sides as far as corrected images need it; notes state by how much.
 
     Returns:
         The block, without measurements that the adjustment left out, and sigma0.
@@ -65,6 +69,8 @@ def block_of_project(path: Path) -> tuple[Block, float]:
             "each other; `syntopic adjust` names the likely mistakes"
         )
     block = _block(file, project, result)
+    if without_distortion:
+        block = _corrected(block, used_network(result), result)
     check_block(file, block)
     return block, result.sigma0
 
@@ -113,7 +119,7 @@ def _block(file: Path, project: Project, result: Adjustment) -> Block:
         )
         for k, name in enumerate(network.images.names)
     )
-    frame = _frame_of(file)
+    frame = frame_next_to(file)
     return Block(
         project.name or file.parent.name,
         cameras,
@@ -135,17 +141,59 @@ def _camera(
     )
     pixels = np.stack([columns.ravel(), rows.ravel()], axis=1)
     middle = np.array([(width - 1) / 2.0, (height - 1) / 2.0])
-    try:
-        ideal = ideal_mm(camera, interior, terms, (pixels - middle) * [pitch, -pitch])
-    except NetworkError as error:
-        raise BlockError(f"camera {section.name}: {error}") from error
-    rays = ideal / principal_distance_mm(camera, interior) * [1.0, -1.0]
+    rays = _rays(camera, interior, terms, (pixels - middle) * [pitch, -pitch])
     f_mm, x_mm, y_mm = perspective_mm(camera, interior)
     f_px = f_mm / pitch
-    model = ForwardDistortion(f_px, f_px, middle[0] + x_mm / pitch, middle[1] - y_mm / pitch)
+    cx_px, cy_px = (width - 1) / 2.0 + x_mm / pitch, (height - 1) / 2.0 - y_mm / pitch
+    model = ForwardDistortion(f_px, f_px, cx_px, cy_px)
     return BlockCamera(
         section.name, width, height, model, pitch, ("pan",), rays=rays, pixels=pixels
     )
+
+
+def _rays(camera: CameraModel, interior: Array, terms: Array, xy_mm: Array) -> Array:
+    """x / z and y / z, y down, of measured coordinates, (n, 2)."""
+    try:
+        ideal = ideal_mm(camera, interior, terms, xy_mm)
+    except NetworkError as error:
+        raise BlockError(f"camera {camera.name}: {error}") from error
+    return np.asarray(ideal / principal_distance_mm(camera, interior) * [1.0, -1.0])
+
+
+def _corrected(block: Block, network: Network, result: Adjustment) -> Block:
+    """The block of images without distortion."""
+    points = block.points
+    px = points.px.copy()
+    of = np.array([image.camera for image in block.images], np.int64)[points.image]
+    cameras, notes = [], []
+    for k, (camera, own) in enumerate(zip(block.cameras, network.cameras, strict=True)):
+        size, pitch = np.array([camera.width_px, camera.height_px]), camera.pitch_mm or 1.0
+        model, middle = camera.model, (size - 1) / 2.0
+        xy_mm = (px[of == k] - middle) * [pitch, -pitch]
+        rays = _rays(own, result.state.interior[k], result.state.terms[k], xy_mm)
+        centre = np.array([model.cx_px, model.cy_px])
+        edge = centre + model.fx_px * (camera.rays if camera.rays is not None else rays)
+        beyond = np.maximum(-0.5 - edge.min(axis=0), edge.max(axis=0) - (size - 0.5))
+        grown = np.ceil(np.maximum(beyond - _GROWN_FROM_PX, 0.0)).astype(int)
+        px[of == k] = centre + model.fx_px * rays + grown
+        width, height = (size + 2 * grown).tolist()
+        cx_px, cy_px = (centre + grown).tolist()
+        cameras.append(
+            replace(
+                camera,
+                width_px=width,
+                height_px=height,
+                model=ForwardDistortion(model.fx_px, model.fx_px, cx_px, cy_px),
+                rays=None,
+                pixels=None,
+            )
+        )
+        largest_px = float(np.abs(edge - (edge if camera.pixels is None else camera.pixels)).max())
+        notes.append(
+            f"camera {camera.name}: measurements are corrected for distortion, by "
+            f"{largest_px:.3f} px at most; format without distortion {width} x {height} px"
+        )
+    return replace(block, cameras=tuple(cameras), points=replace(points, px=px), notes=tuple(notes))
 
 
 def _points(network: Network, cameras: tuple[BlockCamera, ...], xyz_m: Array) -> BlockPoints:
@@ -168,17 +216,3 @@ def _points(network: Network, cameras: tuple[BlockCamera, ...], xyz_m: Array) ->
         number[table.point[own]],
         px,
     )
-
-
-def _frame_of(file: Path) -> LocalFrame | None:
-    """The local frame that is stated next to the project; None without."""
-    path = file.parent / FRAME_FILE
-    try:
-        stated = json.loads(path.read_text("utf-8"))
-        return LocalFrame(float(stated["latitude_deg"]), float(stated["longitude_deg"]))
-    except FileNotFoundError:
-        return None
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise BlockError(
-            f"{path}: {error}; remove it, or take that of `syntopic triangulate`"
-        ) from error

@@ -134,7 +134,8 @@ def fitted(
         found.append(f"{form} {worst_px:.3f} px")
     raise BlockError(
         f"camera {camera.name}: its calibration does not fit {', '.join(found)}; {limit_px:g} px "
-        "is the limit. Export images in strict perspective instead: --images perspective"
+        "is the limit. Export images in strict perspective (`export block --images perspective`), "
+        "or measurements without distortion (`export project --to bingo`)"
     )
 
 

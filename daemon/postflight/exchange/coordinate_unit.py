@@ -1,12 +1,14 @@
-"""Whether the stated coordinate system of a block has coordinates in metres."""
+"""The stated coordinate system of a block: whether its coordinates are in metres, its frame."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Final
 
 from daemon.mission.foreign_files import ForeignFileError, read_regular_file
 from daemon.orientation.geodesy import CRS, CRSError
+from daemon.orientation.local_frame import FRAME_FILE, LocalFrame
 from daemon.postflight.exchange.block import BlockError
 
 NOT_STATED: Final = "the files do not state the unit of coordinates"
@@ -51,3 +53,21 @@ def stated_system(folder: Path) -> str:
         return read_regular_file(found[0], _WKT_MAX_BYTES).decode("utf-8-sig", "replace").strip()
     except ForeignFileError as error:
         raise BlockError(str(error)) from error
+
+
+def frame_next_to(file: Path) -> LocalFrame | None:
+    """The local frame that `frame.json` next to a file states; None without.
+
+    Raises:
+        BlockError: it cannot be read.
+    """
+    path = file.parent / FRAME_FILE
+    try:
+        stated = json.loads(path.read_text("utf-8"))
+        return LocalFrame(float(stated["latitude_deg"]), float(stated["longitude_deg"]))
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise BlockError(
+            f"{path}: {error}; remove it, or take that of `syntopic triangulate`"
+        ) from error

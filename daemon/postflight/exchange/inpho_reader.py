@@ -9,8 +9,8 @@ Source: files of ApplicationsMaster (`$PROJECT`, `$CAMERA`, `$PHOTO`, `$EXT_ORI`
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -19,6 +19,9 @@ from numpy.typing import NDArray
 
 from daemon.postflight.exchange.block import Block, BlockCamera, BlockError, BlockImage
 from daemon.postflight.exchange.block_check import is_rotation
+from daemon.postflight.exchange.coordinate_unit import frame_next_to
+from daemon.postflight.exchange.intersected_points import Measured
+from daemon.postflight.exchange.photogrammetry_reader import Oriented, measured_block
 from daemon.postflight.exchange.text_lines import lines_of, numbers_of, only_file
 from processing.geometry.forward_distortion import ForwardDistortion
 
@@ -31,7 +34,7 @@ _READ: Final[Mapping[str, frozenset[str]]] = {
     "$PROJECT": frozenset(
         {"$LINEAR_UNITS_OF_OBJECT", "$LINEAR_UNITS_OF_IMAGE", "$ANGULAR_UNITS"},
     ),
-    "$PHOTO": frozenset({"$PHOTO_NUM", "$CAMERA_ID", "$ORI_STAT", "$EXT_ORI"}),
+    "$PHOTO": frozenset({"$PHOTO_NUM", "$CAMERA_ID", "$ORI_STAT", "$EXT_ORI", "$PHOTO_POINTS"}),
     "$CAMERA": frozenset(
         {
             *("$TYPE", "$KIND", "$CCD_INTERIOR_ORIENTATION", "$CCD_COLUMNS", "$CCD_ROWS"),
@@ -54,6 +57,7 @@ _UNITS: Final = {
 }
 _ORIENTED: Final = ("", "Initial", "Adjusted")
 _MEASUREMENTS: Final = "$PHOTO_POINTS"
+_END_OF_MEASUREMENTS: Final = "$END_POINTS"
 
 
 @dataclass(frozen=True)
@@ -64,10 +68,11 @@ class _Section:
     line: int
     values: Mapping[str, str]
     rows: Mapping[str, list[list[float]]]
+    points: Mapping[str, tuple[float, float]] | None = None
 
 
 def read_inpho(path: Path) -> Block:
-    """Read cameras and photos of an Inpho project (`*.prj`), as `export block` writes it.
+    """Read cameras, photos and their measurements of an Inpho project (`*.prj`), as we write it.
 
     Raises:
         BlockError: no such file, sections, keys, units or states that are not carried, or a photo
@@ -85,7 +90,12 @@ def read_inpho(path: Path) -> Block:
                 f"{path}: line {one.line}: camera {camera.name} is there twice; keep one of them"
             )
         cameras[camera.name] = camera
+    principal_points = {
+        one.values["$TYPE"]: numbers_of(path, one.line, one.values["$PRINCIPAL_POINT_PPA"].split())
+        for one in sections["$CAMERA"]
+    }
     images: dict[str, BlockImage] = {}
+    measured: dict[str, Measured] = {}
     for one in sections["$PHOTO"]:
         image = _photo(path, one, cameras, len(images))
         if image.name in images:
@@ -93,10 +103,23 @@ def read_inpho(path: Path) -> Block:
                 f"{path}: line {one.line}: photo {image.name} is there twice; keep one of them"
             )
         images[image.name] = image
+        if one.points is not None:
+            camera = list(cameras.values())[image.camera]
+            point_mm = principal_points[camera.name]
+            points = _from_middle(camera, point_mm, one.points)
+            measured[image.name] = Measured(camera.name, points)
     if not images:
         raise BlockError(f"{path}: has no $PHOTO with an orientation; there is nothing to import")
+    if measured:
+        oriented = {name: Oriented(one.centre_m, one.rotation) for name, one in images.items()}
+        system = "not stated in the file"
+        block = measured_block(
+            path.parent, cameras, oriented, measured, system, {}, (), is_metric=True
+        )
+        return replace(block, name=path.stem)
     notes = ("coordinate system: not stated in the file",)
-    return Block(path.stem, tuple(cameras.values()), tuple(images.values()), notes=notes)
+    frame = frame_next_to(path)
+    return Block(path.stem, tuple(cameras.values()), tuple(images.values()), frame, notes=notes)
 
 
 def _sections(path: Path) -> dict[str, list[_Section]]:
@@ -104,20 +127,33 @@ def _sections(path: Path) -> dict[str, list[_Section]]:
     kind, begun, key = "", 0, ""
     values: dict[str, str] = {}
     rows: dict[str, list[list[float]]] = {}
+    points: dict[str, tuple[float, float]] | None = None
     for number, words in lines_of(path):
         if not kind:
             kind, begun, key, values, rows = words[0], number, "", {}, {}
+            points = None
             if kind not in _READ:
                 raise BlockError(
                     f"{path}: line {number}: section {kind[:40]} is not carried; remove it"
                 )
         elif words[0] == "$END":
-            found[kind].append(_Section(kind, begun, values, rows))
+            if key == _MEASUREMENTS:
+                raise BlockError(
+                    f"{path}: line {number}: {_MEASUREMENTS} of line {begun} has no "
+                    f"{_END_OF_MEASUREMENTS}; copy it again"
+                )
+            found[kind].append(_Section(kind, begun, values, rows, points))
             kind = ""
+        elif key == _MEASUREMENTS and words[0] == _END_OF_MEASUREMENTS:
+            key = ""
         elif words[0].startswith("$"):
             key = words[0]
             _check_key(path, number, kind, key, values)
             values[key] = " ".join(words[2:])
+            if key == _MEASUREMENTS:
+                points = {}
+        elif key == _MEASUREMENTS and points is not None:
+            _measure(path, number, words, points)
         else:
             rows.setdefault(key, []).append(numbers_of(path, number, words))
     if kind:
@@ -127,8 +163,6 @@ def _sections(path: Path) -> dict[str, list[_Section]]:
 
 def _check_key(path: Path, number: int, kind: str, key: str, values: Mapping[str, str]) -> None:
     where = f"{path}: line {number}: {key[:40]}"
-    if key == _MEASUREMENTS:
-        raise BlockError(f"{where}: measurements are not carried; export the project without them")
     if key not in _READ[kind] and key not in IGNORED[kind]:
         raise BlockError(
             f"{where} of {kind} is not carried; remove the line if it changes neither cameras nor "
@@ -136,6 +170,41 @@ def _check_key(path: Path, number: int, kind: str, key: str, values: Mapping[str
         )
     if key in values:
         raise BlockError(f"{where} is there twice in this {kind}; keep one of them")
+
+
+def _measure(
+    path: Path, number: int, words: list[str], points: dict[str, tuple[float, float]]
+) -> None:
+    """Point, x, y in mm of the photo, weight, and what is not read: kind and description."""
+    where = f"{path}: line {number}: {' '.join(words)[:60]}"
+    if len(words) < 3:
+        raise BlockError(f"{where}: point, x and y are needed; export the project again")
+    if words[0] in points:
+        raise BlockError(f"{path}: line {number}: point {words[0]} is twice in this photo")
+    x, y, *weight = numbers_of(path, number, words[1:4])
+    if weight not in ([], [1.0]):
+        raise BlockError(
+            f"{where}: a weight other than 1 is not carried; give the block one accuracy, and "
+            "--image-sigma states it"
+        )
+    points[words[0]] = (x, y)
+
+
+def _from_middle(
+    camera: BlockCamera,
+    principal_point_mm: Sequence[float],
+    points: Mapping[str, tuple[float, float]],
+) -> dict[str, tuple[float, float]]:
+    """Measurements as mm from the middle of the image, y up.
+
+    In the file they are of the system in which the principal point is stated, and which
+    `$CCD_INTERIOR_ORIENTATION` carries to pixels.
+    """
+    model, pitch_mm = camera.model, camera.pitch_mm or 1.0
+    x0_mm, y0_mm = principal_point_mm
+    right = (model.cx_px - (camera.width_px - 1) / 2.0) * pitch_mm - x0_mm
+    up = ((camera.height_px - 1) / 2.0 - model.cy_px) * pitch_mm - y0_mm
+    return {name: (x + right, y + up) for name, (x, y) in points.items()}
 
 
 def _check_units(path: Path, projects: list[_Section]) -> None:

@@ -10,7 +10,7 @@ Source: PAT-B, BINGO and BLUH manuals, exterior orientation files; files of Appl
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from typing import Final, Literal
 
@@ -45,6 +45,8 @@ DEFAULTS: Final[Mapping[str, tuple[Angles, Unit]]] = {
 MATRIX_PROGRAMS: Final = ("patb", "inpho")
 CAMERAS_FILE: Final = "cameras.txt"
 """The cameras next to files that do not state them: the programs ask for these values."""
+_DECIMALS: Final = 9
+"""Of mm and um of cameras: read and written again they are the same."""
 _GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC)
 
 
@@ -82,10 +84,18 @@ def photogrammetry_texts(
     if program == "inpho":
         texts[f"{block.name}.prj"] = _inpho(block, suffix)
     elif program == "patb":
-        texts["orientation.ori"] = "".join(_patb(n, eo) for n, _, eo in rows)
+        texts["orientation.ori"] = "".join(
+            patb_records(n, eo.centre_m, eo.rotation) for n, _, eo in rows
+        )
     else:
-        write = _LINES[program]
-        lines = (write(n, image, eo, angles_of(eo, order, in_unit)) for n, image, eo in rows)
+        lines = (
+            orientation_line(
+                f"{n:10d}" if program == "bluh" else image.name,
+                eo.centre_m,
+                angles_of(eo, order, in_unit),
+            )
+            for n, image, eo in rows
+        )
         texts[f"orientation.{program}"] = "\n".join(lines) + "\n"
     is_matrix = program in MATRIX_PROGRAMS
     stated = "rotation matrix by rows, grid from camera" if is_matrix else ANGLES[order]
@@ -127,42 +137,41 @@ def angles_of(eo: ExteriorOrientation, order: Angles, unit: Unit) -> tuple[float
     return a, b, c
 
 
-_Line = Callable[[int, BlockImage, ExteriorOrientation, tuple[float, float, float]], str]
+def orientation_line(name: str, centre_m: Array, angles: tuple[float, float, float]) -> str:
+    """Name or number, place with 4 decimals, and three angles with 7, without a line end."""
+    place = "".join(f" {value:14.4f}" for value in centre_m)
+    return name + place + "".join(f" {angle:13.7f}" for angle in angles)
 
 
-def _named(
-    _number: int, image: BlockImage, eo: ExteriorOrientation, angles: tuple[float, float, float]
-) -> str:
-    return f"{image.name}{_place(eo)}" + "".join(f" {angle:13.7f}" for angle in angles)
-
-
-def _numbered(
-    number: int, _image: BlockImage, eo: ExteriorOrientation, angles: tuple[float, float, float]
-) -> str:
-    return f"{number:10d}{_place(eo)}" + "".join(f" {angle:13.7f}" for angle in angles)
-
-
-_LINES: Final[Mapping[str, _Line]] = {
-    "bingo": _named,
-    "imagestation": _named,
-    "bluh": _numbered,
-}
-
-
-def _place(eo: ExteriorOrientation) -> str:
-    return "".join(f" {value:14.4f}" for value in eo.centre_m)
-
-
-def _patb(number: int, eo: ExteriorOrientation) -> str:
-    """Three records (I16,16x,3F16.5 / 5F16.12 / 4F16.12), the matrix by rows."""
-    r = [float(value) for value in eo.rotation.reshape(-1)]
-    place = "".join(f"{value:16.5f}" for value in eo.centre_m)
+def patb_records(number: int, centre_m: Array, rotation: Array) -> str:
+    """Three records (I16,16x,3F16.5 / 5F16.12 / 4F16.12), the matrix (3, 3) by rows."""
+    r = [float(value) for value in rotation.reshape(-1)]
+    place = "".join(f"{value:16.5f}" for value in centre_m)
     first = "".join(f"{value:16.12f}" for value in r[:5])
     second = "".join(f"{value:16.12f}" for value in r[5:])
     return f"{number:16d}{'':16}{place}\n{first}\n{second}\n"
 
 
 def _inpho(block: Block, suffix: str) -> str:
+    photos = []
+    for image in block.images:
+        eo = image.eo
+        if eo is None:
+            raise BlockError(f"image {image.name} has no orientation in a coordinate system")
+        seconds = eo.gps_ns // 1_000_000_000 - leap_seconds_at(eo.gps_ns)
+        at = f"{_GPS_EPOCH + timedelta(seconds=seconds):%H:%M:%S %d/%m/%Y}"
+        camera = block.cameras[image.camera]
+        file = f"images/{image.name}{suffix}"
+        photos.append(inpho_photo(image.name, file, camera, at, eo.centre_m, eo.rotation))
+    return inpho_project(block, photos)
+
+
+def inpho_project(block: Block, photos: Sequence[Sequence[str]]) -> str:
+    """A project of photos, with the cameras of the block.
+
+    Raises:
+        BlockError: a camera without a pixel size.
+    """
     lines = [
         "$PROJECT 5.0.0",
         f"  $PROJECT_NAME : {block.name}",
@@ -171,35 +180,41 @@ def _inpho(block: Block, suffix: str) -> str:
         "  $ANGULAR_UNITS : deg",
         "$END",
     ]
-    for image in block.images:
-        lines += _photo(block, image, suffix)
+    for photo in photos:
+        lines += photo
     for camera in block.cameras:
         lines += _camera(camera)
     return "\n".join(lines) + "\n"
 
 
-def _photo(block: Block, image: BlockImage, suffix: str) -> list[str]:
-    camera, eo = block.cameras[image.camera], image.eo
-    if eo is None:
-        raise BlockError(f"image {image.name} has no orientation in a coordinate system")
-    seconds = eo.gps_ns // 1_000_000_000 - leap_seconds_at(eo.gps_ns)
-    at = _GPS_EPOCH + timedelta(seconds=seconds)
-    place = " ".join(f"{value:.5f}" for value in eo.centre_m)
+def inpho_photo(
+    name: str,
+    file: str,
+    camera: BlockCamera,
+    at: str,
+    centre_m: Array,
+    rotation: Array,
+    points: Sequence[str] = (),
+) -> list[str]:
+    """Lines of a photo: its file, its orientation of an instant, and its measurements."""
+    place = " ".join(f"{value:.5f}" for value in centre_m)
+    measured = ["  $PHOTO_POINTS :", *(f"    {row}" for row in points), "  $END_POINTS"]
     return [
         "$PHOTO",
-        f"  $PHOTO_NUM : {image.name}",
-        f"  $PHOTO_FILE : images/{image.name}{suffix}",
+        f"  $PHOTO_NUM : {name}",
+        f"  $PHOTO_FILE : {file}",
         f"  $CAMERA_ID : {camera.name}",
         "  $ORI_STAT : Initial",
-        f"  $EXT_ORI : {at:%H:%M:%S %d/%m/%Y}",
-        f"    {_focal_mm(camera):.6f} {place}",
-        *("    " + " ".join(f"{value:.12f}" for value in row) for row in eo.rotation.tolist()),
+        f"  $EXT_ORI : {at}".rstrip(),
+        f"    {focal_mm(camera):.6f} {place}",
+        *("    " + " ".join(f"{value:.12f}" for value in row) for row in rotation.tolist()),
+        *(measured if points else ()),
         "$END",
     ]
 
 
 def _camera(camera: BlockCamera) -> list[str]:
-    per_mm = 1.0 / _pitch_mm(camera)
+    per_mm = 1.0 / pitch_mm(camera)
     model = camera.model
     return [
         "$CAMERA",
@@ -212,7 +227,7 @@ def _camera(camera: BlockCamera) -> list[str]:
         f"  $CCD_COLUMNS : {camera.width_px}",
         f"  $CCD_ROWS : {camera.height_px}",
         "  $PIXEL_REFERENCE : CenterTopLeft",
-        f"  $FOCAL_LENGTH : {_focal_mm(camera):.6f}",
+        f"  $FOCAL_LENGTH : {focal_mm(camera):.6f}",
         "  $PRINCIPAL_POINT_PPA : 0.000000 0.000000",
         "  $GPS_ANTENNA_OFFSET : 0.000000 0.000000 0.000000",
         "  $CAMERA_MOUNT_ROTATION : 0.000000",
@@ -222,18 +237,25 @@ def _camera(camera: BlockCamera) -> list[str]:
 
 def _camera_row(camera: BlockCamera) -> str:
     """A line of `cameras.txt`: the principal point from the middle of the image, y up."""
-    model, pitch = camera.model, _pitch_mm(camera)
+    model, pitch = camera.model, pitch_mm(camera)
     x0_mm = (model.cx_px - (camera.width_px - 1) / 2.0) * pitch
     y0_mm = ((camera.height_px - 1) / 2.0 - model.cy_px) * pitch
-    numbers = f"{_focal_mm(camera)!r} {x0_mm!r} {y0_mm!r} {pitch * 1e3!r}"
+    values = (focal_mm(camera), x0_mm, y0_mm, pitch * 1e3)
+    numbers = " ".join(repr(round(float(value), _DECIMALS) + 0.0) for value in values)
     return f"{camera.name} {numbers} {camera.width_px} {camera.height_px}\n"
 
 
-def _pitch_mm(camera: BlockCamera) -> float:
+def pitch_mm(camera: BlockCamera) -> float:
+    """Pixel size, mm.
+
+    Raises:
+        BlockError: it is not known.
+    """
     if camera.pitch_mm is None:
         raise BlockError(f"camera {camera.name} has no pixel size")
     return camera.pitch_mm
 
 
-def _focal_mm(camera: BlockCamera) -> float:
-    return camera.model.fx_px * _pitch_mm(camera)
+def focal_mm(camera: BlockCamera) -> float:
+    """Principal distance, mm."""
+    return camera.model.fx_px * pitch_mm(camera)

@@ -27,7 +27,7 @@ from daemon.postflight.exchange.block import (
     BlockError,
     BlockImage,
 )
-from daemon.postflight.exchange.coordinate_unit import NOT_STATED, is_in_metres
+from daemon.postflight.exchange.coordinate_unit import NOT_STATED, frame_next_to, is_in_metres
 from daemon.postflight.exchange.intersected_points import (
     Measured,
     OtherConventionError,
@@ -405,9 +405,11 @@ def measured_block(
         f"{median_px:.2f} px"
     )
     name = folder.resolve().name
+    frame = frame_next_to(folder / CAMERAS_FILE)
+    is_metric = is_metric or frame is not None
     if not is_metric:
         notes.insert(0, NOT_STATED)
-    return Block(name, every, images, points=points, notes=tuple(notes), is_metric=is_metric)
+    return Block(name, every, images, frame, points=points, notes=tuple(notes), is_metric=is_metric)
 
 
 def _by_names_of(

@@ -8,10 +8,14 @@ Source: Pix4D support, "Input files", "How are yaw, pitch, roll and omega, phi, 
 
 from __future__ import annotations
 
+from typing import Final
+
 from daemon.orientation.exterior_orientation import ExteriorOrientation
 from daemon.postflight.exchange.block import Block, BlockError, BlockImage, fitted
 from daemon.postflight.exchange.colmap import CENTRE_PX
 from processing.geometry.forward_distortion import ForwardDistortion
+
+EXTERNAL_HEADER: Final = "imageName X Y Z Omega Phi Kappa"
 
 
 def pix4d_texts(block: Block, suffix: str) -> tuple[dict[str, str], dict[str, float]]:
@@ -33,8 +37,10 @@ def pix4d_texts(block: Block, suffix: str) -> tuple[dict[str, str], dict[str, fl
     for camera in block.cameras:
         _, model, residuals[camera.name] = fitted(camera, ("pinhole", "brown"))
         pitch_mm = camera.pitch_mm if camera.pitch_mm is not None else 1.0
-        texts[f"{camera.name}.cam"] = _camera(model, pitch_mm, camera.width_px, camera.height_px)
-    geolocation, external = [], ["imageName X Y Z Omega Phi Kappa"]
+        texts[f"{camera.name}.cam"] = camera_text(
+            model, pitch_mm, camera.width_px, camera.height_px
+        )
+    geolocation, external = [], [EXTERNAL_HEADER]
     for image in block.images:
         eo = _oriented(image)
         place = [f"{value:.4f}" for value in eo.centre_m]
@@ -56,7 +62,7 @@ def _oriented(image: BlockImage) -> ExteriorOrientation:
     return image.eo
 
 
-def _camera(model: ForwardDistortion, pitch_mm: float, width_px: int, height_px: int) -> str:
+def camera_text(model: ForwardDistortion, pitch_mm: float, width_px: int, height_px: int) -> str:
     """Pix4D's camera file: principal point from the upper left corner, radial and tangential."""
     width_mm, height_mm = width_px * pitch_mm, height_px * pitch_mm
     return "\n".join(

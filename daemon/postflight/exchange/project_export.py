@@ -16,28 +16,47 @@ from daemon.mission.store.publication import published
 from daemon.postflight.exchange.adjusted_block import block_of_project
 from daemon.postflight.exchange.block import Block, BlockError
 from daemon.postflight.exchange.colmap import colmap_texts
+from daemon.postflight.exchange.measured_texts import (
+    MEASURED_PROGRAMS,
+    measured_texts,
+    what_to_know,
+)
 from daemon.postflight.exchange.opensfm import reconstruction_of
 from daemon.postflight.exchange.opensfm_tracks import TRACKS_FILE
+from daemon.postflight.exchange.photogrammetry import Angles, Unit
 
-PROGRAMS: Final = ("colmap", "opensfm")
+PROGRAMS: Final = ("colmap", "opensfm", *MEASURED_PROGRAMS)
 
 
 @dataclass(frozen=True)
 class ExportedProject:
-    """The block that was written, sigma0 of its adjustment, and residuals of cameras, px."""
+    """The block that was written, sigma0 of its adjustment, and residuals of cameras, px.
+
+    `notes` state what differs in the files from the project.
+    """
 
     block: Block
     sigma0: float
     residuals_px: Mapping[str, float]
+    notes: tuple[str, ...] = ()
 
 
-def export_project(path: Path, program: str, out: Path) -> ExportedProject:
+def export_project(
+    path: Path,
+    program: str,
+    out: Path,
+    *,
+    angles: Angles | None = None,
+    unit: Unit | None = None,
+) -> ExportedProject:
     """Adjust a project, and write cameras, orientations, points and measurements.
 
     Args:
         path: project.toml, or its folder.
         program: of `PROGRAMS`.
         out: new folder.
+        angles: order of angles for BINGO; None is its own.
+        unit: of these angles; None is its own.
 
     Raises:
         ProjectError: the project cannot be read.
@@ -46,8 +65,15 @@ def export_project(path: Path, program: str, out: Path) -> ExportedProject:
     """
     if out.exists():
         raise BlockError(f"{out}: is there already; give a new folder with --out")
-    block, sigma0 = block_of_project(path)
-    if program == "colmap":
+    if program not in MEASURED_PROGRAMS and (angles is not None or unit is not None):
+        raise BlockError(f"{program} has no angles; leave --angles and --unit out")
+    has_distortion = program not in MEASURED_PROGRAMS or program == "pix4d"
+    block, sigma0 = block_of_project(path, without_distortion=not has_distortion)
+    notes: tuple[str, ...] = ()
+    if program in MEASURED_PROGRAMS:
+        texts, residuals = measured_texts(program, block, angles, unit)
+        notes = what_to_know(program, block)
+    elif program == "colmap":
         texts, residuals = colmap_texts(block, None)
     else:
         reconstruction, residuals = reconstruction_of(block)
@@ -63,7 +89,7 @@ def export_project(path: Path, program: str, out: Path) -> ExportedProject:
     with published(out) as part:
         for name, text in texts.items():
             create_file(part / name, [text.encode("utf-8")], mode=0o644)
-    return ExportedProject(block, sigma0, residuals)
+    return ExportedProject(block, sigma0, residuals, notes)
 
 
 def tracks_text(block: Block) -> str:

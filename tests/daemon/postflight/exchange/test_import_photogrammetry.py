@@ -422,7 +422,7 @@ def grouped(text: str) -> list[list[str]]:
     [
         ("$PIXEL_REFERENCE : CenterTopLeft", "$PIXEL_REFERENCE : OriginTopLeft", "CenterTopLeft"),
         ("  $FOCAL_LENGTH", "  $DISTORTION_TYPE : 2\n  $FOCAL_LENGTH", "without distortion"),
-        ("  $ORI_STAT", "  $PHOTO_POINTS :\n  $ORI_STAT", "measurements are not carried"),
+        ("  $ORI_STAT", "  $PHOTO_POINTS :\n  $ORI_STAT", "no point is measured in two"),
         ("$PROJECT 5.0.0", "$POINTS\n$END\n$PROJECT 5.0.0", "section .POINTS is not carried"),
         ("$CAMERA_ID : nadir", "$CAMERA_ID : other", "camera 'other' is not in the file"),
         ("$EXT_ORI :", "$ORI_STAT :", "line 12: .ORI_STAT is there twice"),

@@ -252,7 +252,7 @@ def test_a_folder_that_is_there_and_another_program_are_refused(project, tmp_pat
     (tmp_path / "there").mkdir()
     for program, out, sentence in (
         ("colmap", "there", "is there already"),
-        ("bingo", "new", "colmap, opensfm are right"),
+        ("bluh", "new", "colmap, opensfm, bingo, patb, pix4d, inpho are right"),
     ):
         done = RUN.invoke(
             app, ["export", "project", str(project), "--to", program, "--out", str(tmp_path / out)]
