@@ -86,6 +86,27 @@ def polygon(corners: Ring | None) -> dict[str, Any] | None:
     }
 
 
+def line_parts(line: Ring) -> list[list[tuple[float, float]]]:
+    """A line of (longitude, latitude) cut at the antimeridian; one part where it does not cross.
+
+    Example:
+        >>> line_parts([(179.0, 0.0), (-179.0, 2.0)])
+        [[(179.0, 0.0), (180.0, 1.0)], [(-180.0, 1.0), (-179.0, 2.0)]]
+    """
+    parts = [[line[0]]]
+    for longitude, y1 in line[1:]:
+        x0, y0 = parts[-1][-1]
+        x1 = near(longitude, x0)
+        if abs(x1) > HALF_DEG:
+            edge = HALF_DEG if x1 > 0.0 else -HALF_DEG
+            y = y0 + (y1 - y0) * (edge - x0) / (x1 - x0)
+            parts[-1].append((edge, y))
+            parts.append([(-edge, y)])
+            x1 = wrapped(x1)
+        parts[-1].append((x1, y1))
+    return parts
+
+
 def bbox_of(rings: Sequence[Ring]) -> list[float]:
     """West, south, east, north of rings, degrees; west is larger where they cross 180 degrees."""
     latitudes = [latitude for ring in rings for _, latitude in ring]

@@ -1,6 +1,7 @@
 """Layers as KMZ, for Google Earth and other viewers of KML.
 
-Shapes are clamped to the ground. Colours are those of the GeoPackage's styles.
+Shapes are clamped to the ground, and cut at the antimeridian. Colours are those of the GeoPackage's
+styles.
 """
 
 from __future__ import annotations
@@ -10,7 +11,8 @@ import zipfile
 from collections.abc import Sequence
 from xml.etree import ElementTree as Xml
 
-from daemon.postflight.export.gis_layers import GisFeature, GisLayer
+from daemon.orientation.antimeridian import line_parts, polygon
+from daemon.postflight.export.gis_layers import GisFeature, GisLayer, Kind, Places
 from daemon.postflight.export.qgis_styles import UNKNOWN_COLOUR, VERDICT_COLOURS
 
 KML = "http://www.opengis.net/kml/2.2"
@@ -65,17 +67,30 @@ def _placemark(folder: Xml.Element, layer: GisLayer, feature: GisFeature) -> Non
         if value is not None and value != "":
             entry = Xml.SubElement(data, "Data", name=column)
             Xml.SubElement(entry, "value").text = _printable(str(value))
-    shape = Xml.SubElement(mark, layer.kind)
-    if layer.kind == "LineString":
-        Xml.SubElement(shape, "tessellate").text = "1"
-    places = feature.places
-    if layer.kind == "Polygon":
-        places = (*places, places[0])
-        shape = Xml.SubElement(Xml.SubElement(shape, "outerBoundaryIs"), "LinearRing")
-    # A photograph's height above the ellipsoid is among its data: KML counts from the geoid.
-    Xml.SubElement(shape, "coordinates").text = " ".join(
-        f"{longitude:.9f},{latitude:.9f}" for longitude, latitude in places
-    )
+    parts = _parts(layer.kind, feature.places)
+    parent = mark if len(parts) == 1 else Xml.SubElement(mark, "MultiGeometry")
+    for places in parts:
+        shape = Xml.SubElement(parent, layer.kind)
+        if layer.kind == "LineString":
+            Xml.SubElement(shape, "tessellate").text = "1"
+        if layer.kind == "Polygon":
+            shape = Xml.SubElement(Xml.SubElement(shape, "outerBoundaryIs"), "LinearRing")
+        # A photograph's height above the ellipsoid is among its data: KML counts from the geoid.
+        Xml.SubElement(shape, "coordinates").text = " ".join(
+            f"{longitude:.9f},{latitude:.9f}" for longitude, latitude in places
+        )
+
+
+def _parts(kind: Kind, places: Places) -> list[Sequence[tuple[float, float]]]:
+    """Shapes that do not cross the antimeridian: KML's longitudes end there. Rings are closed."""
+    if kind == "Point":
+        return [places]
+    if kind == "LineString":
+        return list(line_parts(places))
+    whole = polygon(places)
+    if whole is None or whole["type"] == "Polygon":
+        return [(*places, places[0])]
+    return [rings[0] for rings in whole["coordinates"]]
 
 
 def _style(document: Xml.Element, name: str, colour: str) -> None:

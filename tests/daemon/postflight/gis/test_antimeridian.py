@@ -6,12 +6,16 @@ import csv
 import io
 import json
 import shutil
+import zipfile
 from dataclasses import dataclass
+from xml.etree import ElementTree as Xml
 
 import numpy as np
 import pytest
 
 from daemon.orientation.antimeridian import bbox_of, continuous, mean_longitude, polygon
+from daemon.postflight.export.gis_layers import GisFeature, GisLayer
+from daemon.postflight.export.kmz import KML, kmz_bytes
 from tests.daemon.postflight.exchange.flown_block import FlownBlock
 from tests.daemon.postflight.gis.conftest import Exported, run
 from tests.daemon.postflight.gis.test_stac import problems
@@ -138,3 +142,34 @@ def test_a_polygon_is_cut_at_the_antimeridian_from_any_corner(shift) -> None:
     ]
     assert polygon(None) is None
     assert polygon(((1.0, 2.0), (3.0, 2.0), (3.0, 4.0)))["type"] == "Polygon"
+
+
+def shapes_of(kind: str, places: tuple[tuple[float, float], ...]) -> list[np.ndarray]:
+    """Coordinates of each shape of a KMZ with one feature, (n, 2)."""
+    layer = GisLayer("lines", "Lines", kind, {"line": "TEXT"}, (GisFeature(places, ("L1",)),))
+    with zipfile.ZipFile(io.BytesIO(kmz_bytes("mission", [layer]))) as archive:
+        root = Xml.fromstring(archive.read("doc.kml"))
+    found = root.findall(f".//{{{KML}}}{kind}//{{{KML}}}coordinates")
+    return [np.array([p.split(",") for p in one.text.split()], float) for one in found]
+
+
+def test_shapes_of_a_kmz_are_cut_at_the_antimeridian() -> None:
+    west, east = sorted(shapes_of("Polygon", SQUARE), key=lambda ring: ring[0, 0])
+    for ring in (west, east):
+        assert np.ptp(ring[:, 0]) < 1.01 and np.abs(ring).max() <= 180.0
+        assert (ring[0] == ring[-1]).all()
+    areas = [shapely.Polygon(ring).area for ring in (west, east)]
+    assert areas == pytest.approx([1.0, 0.5])
+    line = ((179.0, 0.0), (-179.0, 2.0), (-178.0, 2.0), (179.0, -4.0))
+    parts = shapes_of("LineString", line)
+    assert [part.tolist() for part in parts] == [
+        [[179.0, 0.0], [180.0, 1.0]],
+        [[-180.0, 1.0], [-179.0, 2.0], [-178.0, 2.0], [-180.0, -2.0]],
+        [[180.0, -2.0], [179.0, -4.0]],
+    ]
+    (at_the_edge,) = shapes_of("LineString", ((180.0, 0.0), (-180.0, 1.0), (179.0, 2.0)))
+    assert at_the_edge[:, 0].tolist() == [180.0, 180.0, 179.0]
+    (ring,) = shapes_of("Polygon", ((1.0, 2.0), (3.0, 2.0), (3.0, 4.0)))
+    assert ring.tolist() == [[1.0, 2.0], [3.0, 2.0], [3.0, 4.0], [1.0, 2.0]]
+    (point,) = shapes_of("Point", ((-179.0, 2.0),))
+    assert point.tolist() == [[-179.0, 2.0]]
