@@ -125,6 +125,7 @@ def process(
             radiometry=radiometry and radiometry.absolute(),
             identity=software_identity(),
             recomputes=again,
+            folder_inode=folder.path.stat().st_ino,
         )
         with nullcontext() if dry_run else source.writing():
             present = folder.numbers()

@@ -66,7 +66,7 @@ class Upload:
 
 @dataclass(frozen=True)
 class UploadListing:
-    """Uploads below a folder; `folder` is None where they cannot be listed, `problem` is the cause."""
+    """Uploads below a folder; `folder` is None where `problem` keeps them from being listed."""
 
     url: str
     folder: S3Folder | None = None

@@ -7,15 +7,12 @@ tasks that were in work are submitted again, and what was finished meanwhile is 
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import pickle
 import queue
-import threading
 import time
 import uuid
 import warnings
-from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import Any, Final
@@ -38,16 +35,17 @@ from daemon.postflight.batch.cluster_checks import (
     unsuitable_workers,
 )
 from daemon.postflight.batch.dask_losses import TASK_PREFIX, ReturnLostTasks
+from daemon.postflight.batch.dask_tasks import WorkRefused, run_on_worker
 from daemon.postflight.batch.executor import (
-    BatchAction,
     BatchTask,
     BatchWork,
+    DataAbsentError,
     TaskFailed,
     TaskLost,
     TaskOutcome,
     is_passing,
 )
-from daemon.postflight.batch.local_processes import OPEN_TIMEOUT_S, outcome_of, picklable
+from daemon.postflight.batch.local_processes import OPEN_TIMEOUT_S
 from daemon.postflight.batch.memory_kills import ClusterLosses
 
 CONNECT_TIMEOUT_S: Final = 15.0
@@ -59,52 +57,6 @@ AWAY_TIMEOUT_S: Final = 120.0
 RESULT_TIMEOUT_S: Final = 60.0
 QUEUED_FACTOR: Final = 2
 """Tasks submitted for each thread of a worker: one in work, one waiting next to it."""
-WORKS_MAX: Final = 2
-"""Works that a worker has open: one ends while the next begins."""
-
-
-class WorkRefused:
-    """A worker that cannot do the work at all, why, and its address."""
-
-    def __init__(self, error: Exception, worker: str = "") -> None:
-        self.error, self.worker = error, worker
-
-
-_actions: OrderedDict[str, dict[int, BatchAction]] = OrderedDict()
-"""Opened works by hash, the last used one at the end; of each, an action for every thread."""
-_lock = threading.Lock()
-
-
-def run_on_worker(pickled_work: bytes, task: BatchTask | None) -> TaskOutcome | WorkRefused | None:
-    """Compute one task in a worker; the work is opened once for each of its threads.
-
-    Args:
-        pickled_work: the work.
-        task: None opens the work only.
-    """
-    work, thread = hashlib.sha256(pickled_work).hexdigest(), threading.get_ident()
-    with _lock:
-        own = _actions.setdefault(work, {})
-        _actions.move_to_end(work)
-        # Calibrations and buffers of works that ended are freed; a worker outlives many commands.
-        while len(_actions) > WORKS_MAX:
-            _actions.popitem(last=False)
-        action = own.get(thread)
-        if action is None:
-            first = next(iter(own.values()), None)
-            try:
-                action = first.clone() if first else pickle.loads(pickled_work).open()
-            except Exception as error:  # noqa: BLE001 - the command states it
-                return WorkRefused(picklable(error), _own_address())
-            own[thread] = action
-    return None if task is None else outcome_of(action, task)
-
-
-def _own_address() -> str:
-    try:
-        return str(distributed.get_worker().address)
-    except ValueError:
-        return ""  # not in a worker
 
 
 def security_of(address: ClusterAddress, role: str) -> distributed.Security | None:
@@ -192,26 +144,45 @@ class DaskExecutor:
         self._losses.note(client, self._suitable)
         client.register_plugin(ReturnLostTasks())
         self._workers_seen_s = time.monotonic()
-        # One worker opens the work before all others, so that kernels are compiled once.
-        opening: Any = client.submit(run_on_worker, self._work, None, pure=False)
-        try:
-            refused = opening.result(timeout=OPEN_TIMEOUT_S)
-        except distributed.KilledWorker as error:
-            raise ClusterError(
-                f"workers of {self._address.url} died while they loaded the work; the last one is "
-                f"{error.last_worker}. See its messages; the kernel may have ended it for memory"
-            ) from error
-        except (ImportError, AttributeError, RuntimeError, TimeoutError) as error:
-            raise ClusterError(
-                f"the cluster cannot load the code of this command ({error}). Install the same "
-                "version of syntopic[cluster] on all machines, and start workers with: "
-                "syntopic worker"
-            ) from error
-        if isinstance(refused, WorkRefused):
-            raise refused.error
+        self._open(client)
         self._count_threads()
         dashboard = f"dashboard {self.dashboard}" if self.dashboard else "no dashboard"
         self._announce(f"{self.description}, {self._threads} threads; {dashboard}")
+
+    def _open(self, client: distributed.Client) -> None:
+        """Open the work on one worker before all others, so that kernels are compiled once.
+
+        A worker that does not have the data is set aside, as long as others are there.
+
+        Raises:
+            ClusterError: workers died, or have other code.
+            Exception: what `BatchWork.open` raised on a worker.
+        """
+        while True:
+            opening: Any = client.submit(
+                run_on_worker, self._work, None, pure=False, workers=self._permitted()
+            )
+            try:
+                refused = opening.result(timeout=OPEN_TIMEOUT_S)
+            except distributed.KilledWorker as error:
+                raise ClusterError(
+                    f"workers of {self._address.url} died while they loaded the work; the last one "
+                    f"is {error.last_worker}. See its messages; the kernel may have ended it for "
+                    "memory"
+                ) from error
+            except (ImportError, AttributeError, RuntimeError, TimeoutError) as error:
+                raise ClusterError(
+                    f"the cluster cannot load the code of this command ({error}). Install the same "
+                    "version of syntopic[cluster] on all machines, and start workers with: "
+                    "syntopic worker"
+                ) from error
+            if not isinstance(refused, WorkRefused):
+                return
+            if isinstance(refused.error, DataAbsentError) and refused.worker:
+                self._set_aside(refused.worker, f"{refused.error}")
+                if self._permitted():
+                    continue
+            raise refused.error
 
     def submit(self, task: BatchTask) -> None:
         if self._client is None or not self._is_connected():

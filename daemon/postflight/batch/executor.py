@@ -25,6 +25,10 @@ class ExecutorEndedError(DaemonError):
     """
 
 
+class DataAbsentError(DaemonError):
+    """A machine that does not have the data of the command: other machines may have it."""
+
+
 def is_passing(error: Exception) -> bool:
     """Whether the same call may succeed a few seconds later."""
     if isinstance(error, TimeoutError | ConnectionError):

@@ -23,7 +23,7 @@ from daemon.orientation.ground_model import ground_of
 from daemon.planning.overlaps import Overlaps, OverlapShares
 from daemon.postflight.batch.batch_run import BatchOutcome
 from daemon.postflight.batch.capacity import exposure_nbytes
-from daemon.postflight.batch.executor import BatchTask
+from daemon.postflight.batch.executor import BatchTask, DataAbsentError
 from daemon.postflight.batch.product_key import (
     frame_nbytes,
     input_identity,
@@ -64,6 +64,7 @@ class Level2Work:
     """What all exposures of a run have in common; it can be pickled.
 
     `identity` is `software_identity` of the command: a worker with another one refuses the work.
+    `folder_inode` is that of the folder where the command has it; None for no comparison.
     `threads` is of one process and takes the place of that of `processing`. `shares_maps`: the
     processes of one machine have one copy of the calibration maps.
     """
@@ -77,6 +78,7 @@ class Level2Work:
     recomputes: bool = False
     threads: int = 1
     shares_maps: bool = False
+    folder_inode: int | None = None
 
     @property
     def memory_nbytes(self) -> int:
@@ -90,6 +92,7 @@ class Level2Work:
         """Build the processor and load its kernels.
 
         Raises:
+            DataAbsentError: this machine does not have the folder of the command.
             VersionMismatchError: code, libraries or CPU differ from those of the command.
             CalibrationError, ValueError: a calibration does not fit the rig.
         """
@@ -98,6 +101,7 @@ class Level2Work:
                 f"worker on {socket.gethostname()} has {differences}. Install the same versions "
                 "on all machines and use one CPU family; otherwise the bytes of products differ"
             )
+        check_same_folder(self.mission, self.folder_inode)
         mission = Mission.open(self.mission, checks_subfolders=False)
         rig = load_rig(self.rig_file or mission.rig_path)
         device = with_same_pixels(self.processing.device)
@@ -241,6 +245,32 @@ class Level2Action:
             "finished_unix_s": int(time.time()),
             "versions": dict(self._work.identity),
         }
+
+
+def check_same_folder(folder: Path, inode: int | None) -> None:
+    """Compare a folder with the one that the command has at this path.
+
+    A copy at the same path would be computed from, and its products would stay there.
+
+    Args:
+        folder: of a mission.
+        inode: of the folder of the command; a network file system states the same one everywhere.
+
+    Raises:
+        DataAbsentError: there is no such folder, or another one.
+    """
+    if inode is None:
+        return
+    try:
+        found = folder.stat().st_ino
+    except FileNotFoundError:
+        found = None
+    if found != inode:
+        what = "has no folder" if found is None else "has another folder than the command at"
+        raise DataAbsentError(
+            f"worker on {socket.gethostname()} {what} {folder}. Mount that of the command there, "
+            "or transfer the mission to an object store."
+        )
 
 
 @dataclass(frozen=True)

@@ -99,6 +99,7 @@ class StoreLevel2Work:
         return replace(
             self.local,
             mission=mission,
+            folder_inode=None,
             plan=plan,
             radiometry=moved(self.local.radiometry),
             threads=self.threads,

@@ -65,6 +65,18 @@ def free_port() -> int:
         return int(server.getsockname()[1])
 
 
+def wait_until_open(url: str, process: subprocess.Popen[bytes]) -> None:
+    """Until a scheduler listens, however late the machine gives it a core."""
+    limit_s = time.monotonic() + 240.0
+    while True:
+        try:
+            socket.create_connection(("127.0.0.1", int(url.rpartition(":")[2]))).close()
+            return
+        except ConnectionRefusedError:
+            assert process.poll() is None and time.monotonic() < limit_s
+            time.sleep(0.2)
+
+
 @pytest.fixture
 def cluster(tmp_path: Path) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
     """The address of a scheduler, and the command whose two workers joined it."""
@@ -78,6 +90,7 @@ def cluster(tmp_path: Path) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
             subprocess.Popen(command, cwd=ROOT, stdout=log, stderr=log)
             for command in ([*dask, *quiet], own)
         ]
+    wait_until_open(url, parts[0])
     yield url, parts[1]
     parts[1].send_signal(signal.SIGINT)
     assert parts[1].wait(60) == 130

@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 
 from daemon.cli import app
 from daemon.mission.transfer.object_store import ObjectStoreUnavailableError
-from daemon.postflight.batch import dask_executor
+from daemon.postflight.batch import dask_executor, dask_tasks
 from daemon.postflight.batch.batch_run import LOSSES_MAX, run_batch
 from daemon.postflight.batch.cluster_address import (
     ClusterAddress,
@@ -25,10 +25,17 @@ from daemon.postflight.batch.cluster_address import (
     cluster_address,
 )
 from daemon.postflight.batch.cluster_checks import ClusterError, check_versions, unsuitable_workers
-from daemon.postflight.batch.dask_executor import DaskExecutor, WorkRefused, run_on_worker
-from daemon.postflight.batch.executor import BatchTask, TaskDone, TaskFailed, TaskLost
+from daemon.postflight.batch.dask_executor import DaskExecutor
+from daemon.postflight.batch.dask_tasks import WorkRefused, run_on_worker
+from daemon.postflight.batch.executor import (
+    BatchTask,
+    DataAbsentError,
+    TaskDone,
+    TaskFailed,
+    TaskLost,
+)
 from tests.daemon.diverging_camera import ROOT
-from tests.daemon.postflight.batch.test_cluster import free_port
+from tests.daemon.postflight.batch.test_cluster import free_port, wait_until_open
 from tests.daemon.postflight.batch.toy_work import ToyWork, attempts_of
 
 LOCAL = cluster_address("tcp://127.0.0.1:1", None, None, None)
@@ -72,6 +79,7 @@ def encrypted(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ClusterAddre
         parts = [
             subprocess.Popen(command, cwd=ROOT, stdout=log, stderr=log) for command in (dask, own)
         ]
+    wait_until_open(address.url, parts[0])
     yield address
     parts[1].send_signal(signal.SIGINT)
     parts[1].wait(60)
@@ -133,6 +141,29 @@ def test_workers_that_die_while_they_load_the_work_are_named(
         executor.close(1.0)
 
 
+def test_a_worker_without_the_data_is_set_aside_as_long_as_others_have_it(tmp_path: Path) -> None:
+    absent = DataAbsentError("worker on b has no folder /m. Mount that of the command there.")
+    for answers, is_open in (([WorkRefused(absent, "tcp://b"), None], True), ([None], True), (
+        [WorkRefused(absent, "tcp://b"), WorkRefused(absent, "tcp://a")], False,
+    ), ([WorkRefused(ValueError("no calibration"), "tcp://b"), None], False)):  # fmt: skip
+        given, asked, sentences = iter(answers), list[Any](), list[str]()
+
+        def submit(*_arguments: Any, pure: bool, workers: Any, given=given, asked=asked) -> Any:
+            asked.append(workers)
+            return SimpleNamespace(result=lambda timeout: next(given))
+
+        executor = DaskExecutor(LOCAL, announce=sentences.append)
+        executor._suitable = {"tcp://a": "", "tcp://b": ""}
+        client = cast(Any, SimpleNamespace(submit=submit))
+        if is_open:
+            executor._open(client)
+            assert asked == [None, ["tcp://a"]][: len(answers)]
+            assert len(sentences) == len(answers) - 1
+        else:
+            with pytest.raises(type(answers[0].error)):  # type: ignore[union-attr]
+                executor._open(client)
+
+
 def client_with(**packages: str) -> Any:
     """A client of a scheduler and one worker, which has other versions."""
     own = {"dask": "1", "distributed": "2", "msgpack": "3", "cloudpickle": "4", "python": "3.11.7"}
@@ -177,11 +208,11 @@ def test_a_run_without_workers_ends_with_what_it_waited_for() -> None:
 
 def test_a_worker_has_only_the_last_works_open(tmp_path: Path) -> None:
     works = [pickle.dumps(ToyWork(tmp_path, threads=n)) for n in (1, 2, 3)]
-    dask_executor._actions.clear()
+    dask_tasks._actions.clear()
     for work in works:
         for _ in range(2):
             assert isinstance(run_on_worker(work, BatchTask(1)), TaskDone)
-    assert len(dask_executor._actions) == dask_executor.WORKS_MAX
+    assert len(dask_tasks._actions) == dask_tasks.WORKS_MAX
 
 
 def test_processes_of_this_machine_do_not_go_with_a_cluster(tmp_path: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -23,7 +22,7 @@ from daemon.postflight.batch.executor import BatchTask, TaskLost
 from daemon.postflight.batch.local_processes import LocalProcessExecutor
 from daemon.postflight.batch.memory_kills import ClusterLosses
 from tests.daemon.diverging_camera import ROOT
-from tests.daemon.postflight.batch.test_cluster import free_port
+from tests.daemon.postflight.batch.test_cluster import free_port, wait_until_open
 from tests.daemon.postflight.batch.toy_work import ToyWork, attempts_of, memory_groups
 
 A1, A2, A3, B1 = "tcp://10.0.0.1:1", "tcp://10.0.0.1:2", "tcp://10.0.0.1:3", "tcp://10.0.0.2:1"
@@ -114,14 +113,7 @@ def scheduler(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
         parts = [
             subprocess.Popen(command, cwd=ROOT, stdout=log, stderr=log) for command in (dask, own)
         ]
-    limit_s = time.monotonic() + 90.0
-    while True:
-        try:
-            socket.create_connection(("127.0.0.1", int(url.rpartition(":")[2]))).close()
-            break
-        except ConnectionRefusedError:
-            assert time.monotonic() < limit_s
-            time.sleep(0.2)
+    wait_until_open(url, parts[0])
     yield url
     parts[1].send_signal(signal.SIGINT)
     parts[1].wait(60)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -18,6 +19,8 @@ from daemon.mission.store.product_manifests import (
     provenance_of,
 )
 from daemon.postflight.batch import capacity
+from daemon.postflight.batch.executor import DataAbsentError
+from daemon.postflight.batch.level2_work import Level2Work
 from tests.daemon.diverging_camera import copied, flown_mission
 
 
@@ -59,6 +62,27 @@ def test_a_duration_that_cannot_be_right_is_unknown(
     assert [one["duration_s"] for one in content["exposures"]] == [0.0, 0.0]
     dry = run("process", str(mission.path), "--again", "--dry-run", "--json")
     assert json.loads(dry.stdout, parse_constant=pytest.fail)["expected_s"] is None
+
+
+def test_a_folder_at_the_same_path_that_is_another_one_is_refused(
+    processed: Mission, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    works: list[Level2Work] = []
+
+    def noted(work: Level2Work) -> None:
+        works.append(work)
+        raise DataAbsentError("noted")
+
+    monkeypatch.setattr(Level2Work, "open", noted)
+    command = ("process", str(processed.path), "--processes", "0", "--again", "--only", "1")
+    assert "noted" in sentence(run(*command))
+    monkeypatch.undo()
+    (work,) = works
+    with pytest.raises(DataAbsentError, match="has another folder than the command at"):
+        replace(work, mission=copied(processed, tmp_path).path).open()
+    with pytest.raises(DataAbsentError, match=r"has no folder .*gone\. Mount that of the command"):
+        replace(work, mission=tmp_path / "gone").open()
+    work.open()
 
 
 def test_a_dry_run_refuses_an_exposure_that_is_not_there(processed: Mission) -> None:
