@@ -213,6 +213,13 @@ def block(
             "--metric", help="Coordinates are in metres, although the files do not state it."
         ),
     ] = False,
+    photographs_folder: Annotated[
+        Path | None,
+        typer.Option(
+            "--photographs",
+            help="Folder of the images, whose positions in EXIF show feet and other units.",
+        ),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     from daemon.configuration.model import ConfigurationError
@@ -229,6 +236,7 @@ def block(
         sigma_px=image_sigma,
         position_sigma_m=position_sigma,
         is_metric=metric,
+        photographs=photographs_folder,
     )
     block = done.block
     counts = {

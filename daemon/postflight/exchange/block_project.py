@@ -31,6 +31,7 @@ from daemon.postflight.exchange.metashape_reader import read_metashape
 from daemon.postflight.exchange.opensfm import read_opensfm
 from daemon.postflight.exchange.photogrammetry_reader import read_bingo, read_patb
 from daemon.postflight.exchange.pix4d_reader import read_pix4d
+from daemon.postflight.exchange.position_scale import scale_by_photographs, scale_notes
 from daemon.postflight.exchange.reprojections import refuse_other_convention
 from processing.bundle.network import (
     INTERIOR,
@@ -88,6 +89,7 @@ def import_block(
     sigma_px: float = 0.5,
     position_sigma_m: tuple[float, float, float] | None = None,
     is_metric: bool = False,
+    photographs: Path | None = None,
 ) -> ImportedBlock:
     """Write an adjustment project of another program's files.
 
@@ -98,6 +100,7 @@ def import_block(
         sigma_px: standard deviation of image coordinates.
         position_sigma_m: of the projection centres as observations, x, y, z; None: free network.
         is_metric: coordinates are in metres, although the files do not state it.
+        photographs: folder of the images, whose positions in EXIF show the unit of coordinates.
 
     Raises:
         BlockError: files that cannot be read, numbers that no camera, image or point has, a
@@ -114,7 +117,8 @@ def import_block(
             "that --position-sigma in metres does not hold; leave it out, georeference the block "
             "in the other program, or state with --metric that its coordinates are in metres"
         )
-    notes = refuse_other_convention(path, block, sigma_px)
+    notes = _unit_notes(path, block, photographs, is_metric=is_metric)
+    notes += refuse_other_convention(path, block, sigma_px)
     block = replace(block, notes=(*block.notes, *notes, *upward_notes(block)))
     pitches = [camera.pitch_mm or NOMINAL_PITCH_MM for camera in block.cameras]
     fits = [_lens_of(c, pitch) for c, pitch in zip(block.cameras, pitches, strict=True)]
@@ -144,6 +148,25 @@ def import_block(
         block = replace(block, notes=(*block.notes, NO_POINTS))
     residuals = {c.name: worst for c, (_, worst) in zip(block.cameras, fits, strict=True)}
     return ImportedBlock(block, residuals)
+
+
+def _unit_notes(
+    path: Path, block: Block, photographs: Path | None, *, is_metric: bool
+) -> tuple[str, ...]:
+    """What positions of photographs show about the unit of coordinates.
+
+    Raises:
+        BlockError: it is not the stated one, or no photograph is of the block.
+    """
+    if photographs is None:
+        return ()
+    scale = scale_by_photographs(photographs, block)
+    if scale is None:
+        return (
+            f"positions in EXIF of {photographs} do not show the unit of coordinates: fewer than "
+            "three, or too near to each other",
+        )
+    return scale_notes(path, scale, is_metric=block.is_metric or is_metric)
 
 
 def _lens_of(camera: BlockCamera, pitch_mm: float) -> tuple[Lens, float]:
