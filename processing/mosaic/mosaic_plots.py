@@ -7,17 +7,24 @@ The drawings need no fonts or scripts; they are shown by a browser, in the repor
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from functools import lru_cache
 from html import escape
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.geometry.placement import nominal_placements, vip_mm_from_raw, vip_px_from_mm
+from processing.geometry.placement import (
+    SensorPlacement,
+    nominal_placements,
+    vip_mm_from_raw,
+    vip_px_from_mm,
+)
 from processing.geometry.topology import Rectangle, corners, footprint, outline, overlaps
 from processing.matching.tie_points import PAN_TO_COLOUR, PAN_TO_PAN, TiePoints
 from processing.mosaic.free_mosaic import Mosaic
+from processing.mosaic.residual_vectors import places_px
 from processing.mosaic.validity import Validity
 from processing.rig import Cone, Rig, VirtualImage
 
@@ -32,6 +39,8 @@ _VECTOR: Final = "#1f5fa8"
 _OUTLIER: Final = "#e08a00"
 _DISPLACED: Final = "#c62f2f"
 _MAX_VECTORS: Final = 2500
+_RIGS: Final = 8
+"""Whose outlines are kept."""
 
 
 def focal_planes_svg(rig: Rig) -> str:
@@ -95,11 +104,6 @@ def residuals_svg(
     gap, panel = 20.0, 520.0
     scale = panel / image.width_px
     height = image.height_px * scale
-    px = np.empty((len(tie_points), 2))
-    for index in np.unique(tie_points.sensor_a):
-        rows = tie_points.sensor_a == index
-        placement = mosaic.placements[tie_points.names[index]]
-        px[rows] = vip_px_from_mm(image, vip_mm_from_raw(placement, tie_points.raw_a[rows]))
     body = [
         _text(gap, 28, f"{rig.name}: residuals of the {mosaic.method} mosaic", 17, weight="bold"),
         _text(
@@ -114,16 +118,9 @@ def residuals_svg(
     y = 84.0
     panels = ((PAN_TO_PAN, "P/P tie points"), (PAN_TO_COLOUR, "P/C tie points"))
     for k, (kind, title) in enumerate(panels):
-        rows = tie_points.kind == kind
-        body += _vector_panel(
-            rig,
-            image,
-            (gap + k * (panel + gap), y, scale),
-            title,
-            px[rows],
-            mosaic.residuals_px[rows],
-            mosaic.outliers[rows],
-        )
+        frame = (gap + k * (panel + gap), y, scale)
+        rows = np.flatnonzero(tie_points.kind == kind)
+        body += _vector_panel(rig, image, frame, title, tie_points, mosaic, rows)
     if validity is not None and validity.residuals:
         body += _master_panel(rig, image, (gap + 2 * (panel + gap), y, scale), validity)
         count = 3
@@ -279,12 +276,14 @@ def _vector_panel(
     image: VirtualImage,
     frame: tuple[float, float, float],
     title: str,
-    px: Array,
-    residuals: Array,
-    outliers: Array,
+    tie_points: TiePoints,
+    mosaic: Mosaic,
+    rows: NDArray[np.int64],
 ) -> list[str]:
+    """The panel of the tie points `rows`."""
     x, y, scale = frame
     width, height = image.width_px * scale, image.height_px * scale
+    residuals, outliers = mosaic.residuals_px[rows], mosaic.outliers[rows]
     parts = [*_outline(rig, image, frame)]
     known = np.isfinite(residuals).all(axis=1)
     used = known & ~outliers
@@ -293,13 +292,13 @@ def _vector_panel(
     parts.append(_text(x, y - 8, f"{title}: {len(lengths)} used, rms {rms:.3f} px", 13, _INK))
     enlarge = 14.0 / max(float(np.percentile(lengths, 90)), 1e-6) if len(lengths) else 1.0
     step = max(1, math.ceil(int(known.sum()) / _MAX_VECTORS))
-    for colour, rows in ((_VECTOR, used), (_OUTLIER, known & outliers)):
-        chosen = np.flatnonzero(rows)[:: step if colour == _VECTOR else 1][:_MAX_VECTORS]
+    for colour, of_colour in ((_VECTOR, used), (_OUTLIER, known & outliers)):
+        chosen = np.flatnonzero(of_colour)[:: step if colour == _VECTOR else 1][:_MAX_VECTORS]
         ends = np.clip(residuals[chosen] * enlarge, -60.0, 60.0)
-        path = " ".join(
-            f"M{(c + 0.5) * scale:.1f} {(r + 0.5) * scale:.1f}l{dx:.1f} {-dy:.1f}"
-            for (c, r), (dx, dy) in zip(px[chosen].tolist(), ends.tolist(), strict=True)
-        )
+        at = (places_px(image, tie_points, mosaic, rows[chosen]) + 0.5) * scale
+        numbers = np.column_stack([at, ends[:, 0], -ends[:, 1]]).ravel().tolist()
+        # One format for all of them: thousands of short ones take several times as long.
+        path = " ".join(["M%.1f %.1fl%.1f %.1f"] * len(chosen)) % tuple(numbers)
         if path:
             parts.append(
                 f'<svg x="{x:.1f}" y="{y:.1f}" width="{width:.1f}" height="{height:.1f}">'
@@ -333,7 +332,7 @@ def _master_panel(
     ]
     longest = max(math.hypot(r.dx_px, r.dy_px) for r in validity.residuals)
     enlarge = 70.0 / max(longest, 3.0 * max(r.sigma_x_px for r in validity.residuals), 1e-6)
-    places = nominal_placements(rig, {}, {})
+    places = _calibrated(rig)
     for residual in validity.residuals:
         sensor = places[residual.sensor].sensor
         middle = np.array([[(sensor.width_px - 1) / 2.0, (sensor.height_px - 1) / 2.0]])
@@ -367,22 +366,30 @@ def _outline(rig: Rig, image: VirtualImage, frame: tuple[float, float, float]) -
     parts = [
         _rect(x, y, image.width_px * scale, image.height_px * scale, fill="#f6f8fa", stroke=_INK)
     ]
-    places = nominal_placements(rig, {}, {})
-    for cone in rig.pan_cones:
-        for sensor in cone.sensors:
-            r = footprint(places[sensor.name])
-            ends = np.array([[r.x_min_mm, r.y_max_mm], [r.x_max_mm, r.y_min_mm]])
-            (left, upper), (right, lower) = np.clip(
-                (vip_px_from_mm(image, ends) + 0.5) * scale,
-                0.0,
-                [image.width_px * scale, image.height_px * scale],
-            )
-            parts.append(
-                _rect(
-                    x + left, y + upper, right - left, lower - upper, fill="none", stroke="#cfd7df"
-                )
-            )
+    for ends in _footprints_px(rig, image):
+        (left, upper), (right, lower) = np.clip(
+            (ends + 0.5) * scale, 0.0, [image.width_px * scale, image.height_px * scale]
+        ).tolist()
+        parts.append(
+            _rect(x + left, y + upper, right - left, lower - upper, fill="none", stroke="#cfd7df")
+        )
     return parts
+
+
+@lru_cache(maxsize=_RIGS)
+def _calibrated(rig: Rig) -> Mapping[str, SensorPlacement]:
+    """Placements by calibration alone, which all exposures share."""
+    return nominal_placements(rig, {}, {})
+
+
+@lru_cache(maxsize=_RIGS)
+def _footprints_px(rig: Rig, image: VirtualImage) -> tuple[Array, ...]:
+    """Upper left and lower right corner (2, 2) of every PAN sensor in the virtual image, px."""
+    boxes = [footprint(_calibrated(rig)[s.name]) for cone in rig.pan_cones for s in cone.sensors]
+    return tuple(
+        vip_px_from_mm(image, np.array([[r.x_min_mm, r.y_max_mm], [r.x_max_mm, r.y_min_mm]]))
+        for r in boxes
+    )
 
 
 def _bar(x: float, y: float, enlarge: float, width: float) -> list[str]:

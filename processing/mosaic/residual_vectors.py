@@ -9,11 +9,12 @@ import math
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from processing.geometry.placement import vip_mm_from_raw, vip_px_from_mm
 from processing.matching.tie_points import PAN_TO_PAN, TiePoints
 from processing.mosaic.free_mosaic import Mosaic
-from processing.rig import Rig
+from processing.rig import Rig, VirtualImage
 
 VECTORS_MAX: Final = 600
 
@@ -42,12 +43,7 @@ def residual_vectors(rig: Rig, tie_points: TiePoints, mosaic: Mosaic) -> dict[st
     used = known & ~mosaic.outliers
     step = max(1, math.ceil(int(known.sum()) / VECTORS_MAX))
     chosen = np.flatnonzero(known)[::step]
-    at = np.zeros((len(chosen), 2))
-    for index in np.unique(tie_points.sensor_a[chosen]):
-        rows = tie_points.sensor_a[chosen] == index
-        placement = mosaic.placements[tie_points.names[index]]
-        raw = tie_points.raw_a[chosen[rows]]
-        at[rows] = vip_px_from_mm(image, vip_mm_from_raw(placement, raw))
+    at = places_px(image, tie_points, mosaic, chosen)
     kinds = np.where(tie_points.kind == PAN_TO_PAN, 0, 1)
     kinds[mosaic.outliers] = 2
     return {
@@ -63,6 +59,30 @@ def residual_vectors(rig: Rig, tie_points: TiePoints, mosaic: Mosaic) -> dict[st
             )
         ],
     }
+
+
+def places_px(
+    image: VirtualImage, tie_points: TiePoints, mosaic: Mosaic, chosen: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Where some tie points are in the virtual image, by the first of their two sensors.
+
+    Args:
+        image: the virtual image.
+        tie_points: those the mosaic is of.
+        mosaic: the adjustment.
+        chosen: numbers of the points, (n,).
+
+    Returns:
+        Column and row, (n, 2), px.
+    """
+    at = np.zeros((len(chosen), 2))
+    sensors = tie_points.sensor_a[chosen]
+    for index in np.unique(sensors):
+        rows = sensors == index
+        placement = mosaic.placements[tie_points.names[index]]
+        raw = tie_points.raw_a[chosen[rows]]
+        at[rows] = vip_px_from_mm(image, vip_mm_from_raw(placement, raw))
+    return at
 
 
 def _overlap(tie_points: TiePoints, mosaic: Mosaic, index: int, used: Any) -> dict[str, Any]:
