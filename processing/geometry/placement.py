@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -48,6 +49,11 @@ class SensorPlacement:
     physical: Similarity
     f_ratio: float
     tdi_shifts: int
+
+    @cached_property
+    def start_similarity(self) -> Similarity:
+        """S at calibration + TDM, whatever `similarity` has become by adjustment."""
+        return _start_similarity(self.cone, self.physical, self.f_ratio)
 
 
 def head_placement(
@@ -151,7 +157,7 @@ def start_similarity(placement: SensorPlacement) -> Similarity:
     Returns:
         layer_from_sensor in the calibrated (ideal) layer, mm.
     """
-    return _start_similarity(placement.cone, placement.physical, placement.f_ratio)
+    return placement.start_similarity
 
 
 def _start_similarity(cone: Cone, physical: Similarity, f_ratio: float) -> Similarity:

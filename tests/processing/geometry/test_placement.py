@@ -64,6 +64,15 @@ def test_an_adjusted_placement_is_p_times_s_times_u_of_equation_1() -> None:
     assert start_similarity(adjusted) == start.similarity
 
 
+def test_the_start_of_a_placement_follows_its_principal_distance() -> None:
+    rig = find_rig("ultracam-x-mini")
+    start = nominal_placements(rig, {}, {})["SU10"]
+    assert start_similarity(start) == start.similarity
+    scaled = dataclasses.replace(start, f_ratio=1.25 * start.f_ratio)
+    assert start_similarity(scaled).scale == pytest.approx(1.25 * start.similarity.scale)
+    assert start_similarity(scaled).x_mm == pytest.approx(1.25 * start.similarity.x_mm)
+
+
 def test_raw_pixels_come_back_from_the_virtual_image_to_a_millionth_of_a_pixel() -> None:
     for name in ("ultracam-x", "ultracam-x-mini"):
         rig = find_rig(name)
