@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from processing.geometry.placement import SensorPlacement, vip_mm_from_raw
 from processing.geometry.projective import (
     apply_projective,
+    chained_jacobian,
     projective_jacobian,
     rotation_homography,
 )
@@ -168,7 +169,7 @@ def vip_and_design(
         vip_mm = apply_projective(homography, start_mm)
         further = small_rotation_design(vip_mm, model.f_mm)
         design[-3:] = np.einsum("ajn,jk->kan", further, _left_jacobian(rotation))
-        jacobian = projective_jacobian(homography, start_mm) @ jacobian
+        jacobian = chained_jacobian(projective_jacobian(homography, start_mm), jacobian)
     if first_layer is not None:
         x, y = start_mm[:, 0] / size, start_mm[:, 1] / size
         scaled = np.stack([x, y], axis=1)
@@ -183,7 +184,7 @@ def vip_and_design(
             d[3 * axis + 2, axis] = by_w
             np.multiply(d[3 * axis, axis], -moved[:, axis], out=d[6, axis])
             np.multiply(d[3 * axis + 1, axis], -moved[:, axis], out=d[7, axis])
-        jacobian = projective_jacobian(correction, scaled) @ jacobian
+        jacobian = chained_jacobian(projective_jacobian(correction, scaled), jacobian)
     if first_sensor is not None:
         arm_x = layer_mm[:, 0] - similarity.x_mm
         arm_y = layer_mm[:, 1] - similarity.y_mm

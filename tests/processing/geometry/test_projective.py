@@ -7,6 +7,7 @@ import pytest
 
 from processing.geometry.projective import (
     apply_projective,
+    chained_jacobian,
     projective_jacobian,
     rotation_homography,
 )
@@ -31,6 +32,14 @@ def test_the_jacobian_agrees_with_numeric_differences() -> None:
         ahead, behind = apply_projective(H, POINTS + off), apply_projective(H, POINTS - off)
         numeric[:, :, axis] = (ahead - behind) / (2.0 * step)
     np.testing.assert_allclose(projective_jacobian(H, POINTS), numeric, rtol=1e-7)
+
+
+def test_the_jacobian_of_two_homographies_is_the_chained_one() -> None:
+    second = np.array([[0.8, -0.3, 0.1], [0.25, 1.1, 0.6], [-0.01, 0.04, 1.2]])
+    chained = chained_jacobian(
+        projective_jacobian(second, apply_projective(H, POINTS)), projective_jacobian(H, POINTS)
+    )
+    np.testing.assert_allclose(chained, projective_jacobian(second @ H, POINTS), rtol=1e-13)
 
 
 def test_a_rotation_homography_meets_what_the_rotated_ray_meets() -> None:
