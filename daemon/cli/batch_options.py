@@ -137,6 +137,7 @@ class ExecutorOptions:
         tasks: int,
         tasks_per_process: int = 1,
         further_nbytes: int | None = None,
+        shared_nbytes: int = 0,
     ) -> Placement:
         """An executor for so many tasks: the cluster, processes, or this process.
 
@@ -145,6 +146,7 @@ class ExecutorOptions:
             tasks: their number.
             tasks_per_process: as many as take longer than the start of a process.
             further_nbytes: memory of a further task in one process; None for that of a process.
+            shared_nbytes: of `task_nbytes`, what all processes have in memory once.
 
         Raises:
             ConfigurationError: more processes than memory, or a cluster that cannot be used.
@@ -154,7 +156,7 @@ class ExecutorOptions:
             from daemon.postflight.batch.capacity import ProcessAllocation
 
             return Placement(self.cluster(), ProcessAllocation(0, self.threads or 1, "its workers"))
-        plan = self._allocation(task_nbytes, tasks, tasks_per_process)
+        plan = self._allocation(task_nbytes, -(-tasks // tasks_per_process), shared_nbytes)
         if self.processes == 0 or (self.processes is None and plan.processes == 1):
             from daemon.postflight.batch import capacity
             from daemon.postflight.batch.in_process import InProcessExecutor
@@ -208,17 +210,18 @@ class ExecutorOptions:
         return compute
 
     def _allocation(
-        self, task_nbytes: int, tasks: int, tasks_per_process: int
+        self, task_nbytes: int, processes_max: int, shared_nbytes: int
     ) -> ProcessAllocation:
         from daemon.postflight.batch import capacity
 
         cores, available = capacity.usable_cores(), capacity.available_memory_nbytes()
         plan = capacity.plan_processes(
             task_nbytes,
-            -(-tasks // tasks_per_process),
+            processes_max,
             cores=cores,
             available_nbytes=available,
             threads=self.threads,
+            shared_nbytes=shared_nbytes,
         )
         if self.threads is not None and self.threads > cores:
             Console(stderr=True, soft_wrap=True).print(
@@ -230,10 +233,11 @@ class ExecutorOptions:
         count = self.processes
         if count is None:
             return plan
-        if count * task_nbytes > available and count > 1:
+        needed = shared_nbytes + count * (task_nbytes - shared_nbytes)
+        if needed > available and count > 1:
             raise ConfigurationError(
                 [
-                    f"--processes {count} needs {count * task_nbytes / 1e9:.1f} GB of memory; "
+                    f"--processes {count} needs {needed / 1e9:.1f} GB of memory; "
                     f"{available / 1e9:.1f} GB are available. Give --processes {plan.processes}"
                 ]
             )

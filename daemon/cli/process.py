@@ -93,7 +93,7 @@ def process(
 ) -> None:
     from daemon.mission.transfer.object_store import is_store_url
     from daemon.planning.overlaps import overlaps_of
-    from daemon.postflight.batch.capacity import further_exposure_nbytes
+    from daemon.postflight.batch.capacity import further_exposure_nbytes, shared_maps_nbytes
     from daemon.postflight.batch.in_process import InProcessExecutor
     from daemon.postflight.batch.level2_sources import level2_source
     from daemon.postflight.batch.level2_work import Level2Work
@@ -139,6 +139,7 @@ def process(
                 work.memory_nbytes,
                 len(found.pending),
                 further_nbytes=further_exposure_nbytes(work.rig),
+                shared_nbytes=shared_maps_nbytes(work.rig),
             )
             if dry_run:
                 on_cluster = where.scheduler is not None

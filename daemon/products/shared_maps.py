@@ -79,6 +79,19 @@ def share_maps(correctors: dict[str, Corrector]) -> bool:
     return True
 
 
+def has_room(nbytes: int) -> bool:
+    """Whether a file for maps of this size would be written now.
+
+    Args:
+        nbytes: of all maps.
+    """
+    try:
+        disk = os.statvfs(tempfile.gettempdir())
+    except OSError:
+        return False
+    return nbytes >= LEAST_NBYTES and disk.f_bavail * disk.f_frsize >= FREE_FACTOR * nbytes
+
+
 def _maps(correctors: dict[str, Corrector]) -> Iterator[tuple[str, str, Array]]:
     for name, corrector in sorted(correctors.items()):
         for key in _MAPS:

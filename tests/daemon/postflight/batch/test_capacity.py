@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from daemon.cli.batch_options import ExecutorOptions
+from daemon.configuration.model import ConfigurationError
 from daemon.postflight.batch import capacity
 from daemon.postflight.batch.control_groups import group_free_nbytes
 from processing.rig import find_rig
@@ -113,3 +115,40 @@ def test_two_exposures_in_one_process_need_what_was_measured(
         capacity.exposure_nbytes(rig), 20, further_nbytes=capacity.further_exposure_nbytes(rig)
     )
     assert placed.executor.capacity == count
+
+
+def test_maps_that_processes_share_are_planned_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    rig = find_rig("ultracam-x")
+    task, shared = capacity.exposure_nbytes(rig), capacity.shared_maps_nbytes(rig)
+    assert shared == pytest.approx(824 * 2**20, rel=0.01)  # shared-maps.json
+    for available_gb in (2, 4, 8, 16, 64, 128):
+        planned = [
+            capacity.plan_processes(
+                task, 1000, cores=64, available_nbytes=available_gb * 10**9, shared_nbytes=nbytes
+            ).processes
+            for nbytes in (0, shared)
+        ]
+        needed = shared + planned[1] * (task - shared)
+        limit = available_gb * 1e9 * capacity.MEMORY_SHARE
+        assert planned[1] == 1 or needed <= limit < needed + task - shared
+        assert planned[1] >= planned[0]
+    assert planned == [34, 48]
+    monkeypatch.setattr(capacity, "available_memory_nbytes", lambda: 10**10)
+    monkeypatch.setattr(capacity, "usable_cores", lambda: 64)
+    placed = ExecutorOptions(processes=4).place(task, 20, shared_nbytes=shared)
+    assert placed.allocation.processes == 4  # 9.3 GB
+    with pytest.raises(ConfigurationError, match=r"--processes 5 needs 11\.4 GB"):
+        ExecutorOptions(processes=5).place(task, 20, shared_nbytes=shared)
+    with pytest.raises(ConfigurationError, match=r"--processes 4 needs 11\.9 GB"):
+        ExecutorOptions(processes=4).place(task, 20)
+
+
+def test_without_room_for_their_file_each_process_has_maps_of_its_own(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rig = find_rig("ultracam-x")
+    maps_nbytes = capacity.shared_maps_nbytes(rig)
+    for blocks, expected in ((2 * maps_nbytes, maps_nbytes), (2 * maps_nbytes - 1, 0), (0, 0)):
+        disk = SimpleNamespace(f_bavail=blocks, f_frsize=1)
+        monkeypatch.setattr("daemon.products.shared_maps.os.statvfs", lambda _path, d=disk: d)
+        assert capacity.shared_maps_nbytes(rig) == expected
