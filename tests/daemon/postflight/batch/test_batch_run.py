@@ -96,6 +96,17 @@ def test_killed_processes_cost_their_own_exposure_one_more_attempt(tmp_path: Pat
     assert outcome.counts.lost_processes == 1 + 2 + 3 + 1 + 2 + 1
 
 
+@pytest.mark.trust
+@pytest.mark.parametrize("kind", EXECUTORS)
+def test_what_finds_no_memory_next_to_another_exposure_is_computed_alone(
+    kind: str, tmp_path: Path
+) -> None:
+    outcome = ran(EXECUTORS[kind](), tmp_path, {2: "memory 1", 4: "memory 9"})
+    assert outcome.results == {1: 10, 2: 20, 3: 30, 5: 50, 6: 60}
+    assert "could not allocate memory, the last time with no other" in causes(outcome)[4]
+    assert [attempts_of(tmp_path, number) for number in (2, 4)] == [2, 2]
+
+
 class OneProcess:
     """One process with two tasks in work, both of which end with it: as a worker of a cluster."""
 
