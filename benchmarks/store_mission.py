@@ -4,7 +4,8 @@ A mission is uploaded to moto's S3 server while each 20th request fails: refused
 answer lost, hung, or its body cut short. It is verified there. Then two worker processes process it
 in the bucket, with a disk (a tmpfs, which root mounts) smaller than one of its exposures. Products
 are compared with those of a folder. With `--upload-only` it is uploaded and verified, which needs
-three times its size of disk. The status is 1 where something does not hold.
+three times its size of disk. With `--kills` the upload is killed so often, evenly over its bytes,
+and continued. The status is 1 where something does not hold.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -83,6 +85,33 @@ def compared(mission: Mission, place: ObjectStore) -> tuple[dict[int, str], dict
     return folder, stored
 
 
+def killed_uploads(mission: Mission, url: str, kills: int, faults: Faults) -> None:
+    """Run `syntopic transfer` so often, each time killed a step further on.
+
+    Args:
+        mission: to be uploaded.
+        url: of the folder in the bucket.
+        kills: their number.
+        faults: of the store, which counts the bytes that were sent.
+    """
+    nbytes = sum(path.stat().st_size for path in mission.path.rglob("*") if path.is_file())
+    command = [sys.executable, "-m", "daemon", "transfer", str(mission.path), url]
+    for number in range(1, kills + 1):
+        child = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+
+        def kill_when_due(
+            _method: str, _path: str, number: int = number, pid: int = child.pid
+        ) -> bool:
+            if sum(faults.sent.values()) >= number * nbytes / (kills + 1):
+                os.kill(pid, signal.SIGKILL)  # it is not waited for yet: the id is its own
+                faults.is_for = lambda _method, _path: True
+            return True
+
+        faults.is_for = kill_when_due
+        if child.wait() != -signal.SIGKILL:
+            raise RuntimeError(f"upload {number} ended with status {child.returncode}")
+
+
 def measured(options: argparse.Namespace) -> tuple[dict[str, Any], list[str]]:
     """Figures, and what does not hold."""
     object_store.REQUEST_TIMEOUT_S = REQUEST_TIMEOUT_S  # type: ignore[misc]  # hangs are short
@@ -100,7 +129,9 @@ def measured(options: argparse.Namespace) -> tuple[dict[str, Any], list[str]]:
             "AWS_SECRET_ACCESS_KEY": "test",
         }
         begun_s = time.monotonic()
-        report = transfer_to_store(mission, ObjectStore(f"s3://{BUCKET}/missions"))
+        place_url = f"s3://{BUCKET}/missions"
+        killed_uploads(mission, place_url, options.kills, faults)
+        report = transfer_to_store(mission, ObjectStore(place_url))
         upload_s = time.monotonic() - begun_s
         upload_faults = dict(faults.counts)
         sent = sum(n for path, n in faults.sent.items() if not path.endswith("transfer.json"))
@@ -113,6 +144,8 @@ def measured(options: argparse.Namespace) -> tuple[dict[str, Any], list[str]]:
             "exposures": options.exposures,
             "mission_nbytes": report.nbytes,
             "exposure_nbytes": exposure_nbytes,
+            "upload_kills": options.kills,
+            "reused_nbytes_after_last_kill": report.uploads.reused_nbytes,
             "upload_s": round(upload_s, 1),
             "upload_faults": upload_faults,
             "sent_share": round(sent / report.nbytes, 4),
@@ -148,6 +181,7 @@ def main() -> None:
     parser.add_argument("--exposures", type=int, default=20)
     parser.add_argument("--side", type=int, default=2048, help="pixels of a frame's side")
     parser.add_argument("--upload-only", action="store_true", help="verify, do not process")
+    parser.add_argument("--kills", type=int, default=0, help="of the upload")
     options = parser.parse_args()
     options.folder.mkdir(parents=True)
     figures, problems = measured(options)
