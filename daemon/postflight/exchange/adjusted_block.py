@@ -35,6 +35,10 @@ from processing.geometry.forward_distortion import ForwardDistortion
 
 Array = NDArray[np.float64]
 
+FREE_SCALE = (
+    "the project is a free network without frame.json: its scale and axes are those of its "
+    "starting values, also where files state metres"
+)
 _GRID = 25
 """Pairs of rays and pixels along each side of a camera."""
 _GROWN_FROM_PX = 1e-3
@@ -126,6 +130,7 @@ def _block(file: Path, project: Project, result: Adjustment) -> Block:
         images,
         frame,
         points=_points(network, cameras, result.state.points),
+        notes=(FREE_SCALE,) if project.file.adjust.minimum_norm and frame is None else (),
         is_metric=True,
     )
 
@@ -193,7 +198,9 @@ def _corrected(block: Block, network: Network, result: Adjustment) -> Block:
             f"camera {camera.name}: measurements are corrected for distortion, by "
             f"{largest_px:.3f} px at most; format without distortion {width} x {height} px"
         )
-    return replace(block, cameras=tuple(cameras), points=replace(points, px=px), notes=tuple(notes))
+    return replace(
+        block, cameras=tuple(cameras), points=replace(points, px=px), notes=(*block.notes, *notes)
+    )
 
 
 def _points(network: Network, cameras: tuple[BlockCamera, ...], xyz_m: Array) -> BlockPoints:

@@ -69,7 +69,7 @@ def export_project(
         raise BlockError(f"{program} has no angles; leave --angles and --unit out")
     has_distortion = program not in MEASURED_PROGRAMS or program == "pix4d"
     block, sigma0 = block_of_project(path, without_distortion=not has_distortion)
-    notes: tuple[str, ...] = ()
+    notes = block.notes
     if program in MEASURED_PROGRAMS:
         texts, residuals = measured_texts(program, block, angles, unit)
         notes = what_to_know(program, block)

@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 
 from daemon.cli import app
 from daemon.postflight.adjustment.project import read_project
+from daemon.postflight.exchange.adjusted_block import FREE_SCALE
 from daemon.postflight.exchange.block import BlockError
 from daemon.postflight.exchange.block_project import READERS, import_block
 from daemon.postflight.exchange.project_export import export_project
@@ -183,12 +184,15 @@ def test_names_that_patb_does_not_know_become_numbers(project, tmp_path) -> None
         if path.name == "image_points.csv":
             text = text.replace(",12,", ",church,")
         (named / path.name).write_text(text)
+    (named / "frame.json").unlink()
     assert "church" in read_project(named / "project.toml").network.points.names
     done = RUN.invoke(
         app, ["export", "project", str(named), "--to", "patb", "--out", str(tmp_path / "out")]
     )
     assert done.exit_code == 0, done.output
     assert "points have numbers in PATB's files" in done.output.replace("\n", " ")
+    assert FREE_SCALE in done.output.replace("\n", " ")
+    assert f"note: {FREE_SCALE}\n" in (tmp_path / "out" / "angles.txt").read_text()
     rows = (tmp_path / "out" / "object_points.txt").read_text().splitlines()
     (row,) = [row.split() for row in rows if row.endswith(" church")]
     assert row[0].isdigit() and f"\n{row[0]:>10} " in (tmp_path / "out" / "block.im").read_text()
