@@ -20,6 +20,8 @@ from http.client import HTTPException
 from typing import Final
 from urllib.parse import quote, urlsplit
 
+from daemon import DaemonError
+
 TIMEOUT_S: Final = 30.0
 """Without an answer, or a byte of one."""
 ATTEMPTS: Final = 4
@@ -29,7 +31,7 @@ _ANSWER_MAX_BYTES: Final = 5_000_000
 _CODE = re.compile(rb"<Code>(\w+)</Code>")
 
 
-class S3RefusedError(OSError):
+class S3RefusedError(DaemonError, OSError):
     """A request that the store refused; `code` is that of S3, such as NoSuchUpload."""
 
     def __init__(self, status: int, code: str) -> None:
