@@ -99,11 +99,22 @@ def served(
         emulated.close()
 
 
-CASES = [(name, state) for name in names() for state in InitialState]
+STATES: Final = tuple(InitialState)
+CASES: Final = [(name, state) for name in names() for state in STATES]
+
+
+def _marks(number: int) -> list[pytest.MarkDecorator]:
+    """Each camera in one state, in turn; `make soak` has all."""
+    camera, state = divmod(number, len(STATES))
+    return [] if state == camera % len(STATES) else [pytest.mark.soak]
 
 
 @pytest.mark.parametrize(
-    ("name", "state"), CASES, ids=[f"{name}-{state.value}" for name, state in CASES]
+    ("name", "state"),
+    [
+        pytest.param(name, state, id=f"{name}-{state.value}", marks=_marks(number))
+        for number, (name, state) in enumerate(CASES)
+    ],
 )
 def test_a_real_camera_arms_or_is_refused_with_what_is_missing(
     name: str, state: InitialState

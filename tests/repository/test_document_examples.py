@@ -44,8 +44,12 @@ PAGE_TIMEOUT_S: Final = 7200
 END_TIMEOUT_S: Final = 300
 SYSTEM_PATH: Final = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin"
 
-LONG: Final = {"how-to/processing/calibration.md"}
-"""Pages that render whole laboratory series; `make soak` runs them."""
+LONG: Final = {
+    "how-to/processing/calibration.md",
+    "how-to/processing/midas.md",
+    "how-to/processing/triangulation.md",
+}
+"""Pages that render a laboratory series or several flights; `make soak` runs them."""
 
 OWN_NETWORK: Final = {"tutorials/your-own-hardware.md"}
 """Pages that search for heads or change addresses; they run in a network namespace of their own."""
