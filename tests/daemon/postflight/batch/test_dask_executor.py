@@ -100,7 +100,9 @@ def test_over_tls_a_poisonous_exposure_ends_as_many_processes_as_stated(
     (failure,) = outcome.failures
     assert failure.exposure == 3
     assert f"quarantined after {LOSSES_MAX} attempts: its process was killed" in failure.cause
-    assert attempts_of(tmp_path, 3) == LOSSES_MAX == outcome.counts.lost_processes
+    # A busy scheduler may lose it once without a process that ends.
+    assert attempts_of(tmp_path, 3) in (LOSSES_MAX, LOSSES_MAX + 1)
+    assert outcome.counts.lost_processes == LOSSES_MAX
     (sentence,) = sentences
     assert sentence.startswith(f"cluster at {encrypted.url}, ") and " threads; " in sentence
     assert "dashboard" in sentence
@@ -160,7 +162,9 @@ def test_a_worker_without_the_data_is_set_aside_as_long_as_others_have_it(tmp_pa
             assert asked == [None, ["tcp://a"]][: len(answers)]
             assert len(sentences) == len(answers) - 1
         else:
-            with pytest.raises(type(answers[0].error)):  # type: ignore[union-attr]
+            refused = answers[0]
+            assert isinstance(refused, WorkRefused)
+            with pytest.raises(type(refused.error)):
                 executor._open(client)
 
 
