@@ -266,10 +266,14 @@ def check_same_folder(folder: Path, inode: int | None) -> None:
     except FileNotFoundError:
         found = None
     if found != inode:
-        what = "has no folder" if found is None else "has another folder than the command at"
+        what = (
+            f"has no folder {folder}"
+            if found is None
+            else f"has another folder than the command at {folder} (inode {found}, not {inode})"
+        )
         raise DataAbsentError(
-            f"worker on {socket.gethostname()} {what} {folder}. Mount that of the command there, "
-            "or transfer the mission to an object store."
+            f"worker on {socket.gethostname()} {what}. Mount that of the command there, by a file "
+            "system that keeps inodes, such as NFS, or transfer the mission to an object store."
         )
 
 
