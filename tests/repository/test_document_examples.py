@@ -47,9 +47,12 @@ SYSTEM_PATH: Final = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin"
 LONG: Final = {
     "how-to/processing/calibration.md",
     "how-to/processing/midas.md",
+    "how-to/processing/multispectral.md",
+    "how-to/processing/replay.md",
     "how-to/processing/triangulation.md",
 }
-"""Pages that render a laboratory series or several flights; `make soak` runs them."""
+"""Pages with a laboratory series, several flights, or full-size recordings; `make soak` runs them.
+The tests of their commands run without it."""
 
 OWN_NETWORK: Final = {"tutorials/your-own-hardware.md"}
 """Pages that search for heads or change addresses; they run in a network namespace of their own."""

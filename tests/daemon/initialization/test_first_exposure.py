@@ -18,7 +18,13 @@ LIMIT_S = 180.0
 @pytest.mark.peer
 @pytest.mark.realtime
 @pytest.mark.timeout(600)
-@pytest.mark.parametrize(("arrangement", "heads"), first_exposure.ARRANGEMENTS)
+@pytest.mark.parametrize(
+    ("arrangement", "heads"),
+    [
+        pytest.param(*one, marks=[] if one[0] == "nadir-oblique" else [pytest.mark.soak])
+        for one in first_exposure.ARRANGEMENTS
+    ],
+)
 def test_the_first_exposure_is_stored_within_minutes(arrangement: str, heads: int) -> None:
     needed = first_exposure.missing()
     if needed is not None:

@@ -63,6 +63,7 @@ def test_paced_heads_lose_no_frame_and_fill_no_buffer(tmp_path: Path) -> None:
     assert found["switch"]["packets_dropped"] <= 0.005 * found["packets_sent"]
 
 
+@pytest.mark.soak
 def test_unpaced_heads_lose_packets_of_every_exposure(tmp_path: Path) -> None:
     found = flown(tmp_path, 3, "--unpaced")
     assert found["switch"]["packets_dropped"] > 0.5 * found["packets_sent"]
