@@ -100,9 +100,11 @@ def test_over_tls_a_poisonous_exposure_ends_as_many_processes_as_stated(
     (failure,) = outcome.failures
     assert failure.exposure == 3
     assert f"quarantined after {LOSSES_MAX} attempts: its process was killed" in failure.cause
-    # A busy scheduler may lose it once without a process that ends.
-    assert attempts_of(tmp_path, 3) in (LOSSES_MAX, LOSSES_MAX + 1)
-    assert outcome.counts.lost_processes == LOSSES_MAX
+    # A busy scheduler may lose it once and not state that its process ended; an exposure that
+    # waited next to it may have it stated.
+    attempts = attempts_of(tmp_path, 3)
+    assert attempts in (LOSSES_MAX, LOSSES_MAX + 1)
+    assert LOSSES_MAX <= outcome.counts.lost_processes <= attempts
     (sentence,) = sentences
     assert sentence.startswith(f"cluster at {encrypted.url}, ") and " threads; " in sentence
     assert "dashboard" in sentence
