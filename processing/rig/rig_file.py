@@ -5,7 +5,6 @@ from __future__ import annotations
 import datetime
 import hashlib
 import json
-import stat
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
@@ -42,11 +41,10 @@ from processing.rig.problem_sentences import (
     sentences,
     shown,
 )
-from processing.rig.toml_text import TomlError, parse_toml
+from processing.rig.toml_text import TomlError, read_toml
 from processing.rig.value_types import Name, Positive, Text
 
 RIG_FORMAT: Final = 1
-RIG_FILE_MAX_BYTES: Final = 1_000_000
 CONES_MAX, SENSORS_MAX = 64, 256
 DIRECTION: Final = "ideal_from_measured"
 """Of the lens corrections of a rig file; another one is refused."""
@@ -212,7 +210,7 @@ def load_rig(path: Path) -> Rig:
     """Read and validate a rig file.
 
     Args:
-        path: of a TOML file of at most `RIG_FILE_MAX_BYTES`.
+        path: of a TOML file of at most `toml_text.FILE_MAX_BYTES`.
 
     Returns:
         The rig.
@@ -221,18 +219,9 @@ def load_rig(path: Path) -> Rig:
         RigError: with one sentence per mistake: file, key, value, and what would be right.
     """
     try:
-        status = path.stat()
-        if not stat.S_ISREG(status.st_mode):
-            raise RigError([f"{path}: not a regular file; give a rig file"])
-        if status.st_size > RIG_FILE_MAX_BYTES:
-            raise RigError([f"{path.name}: larger than {RIG_FILE_MAX_BYTES} bytes; not a rig file"])
-        data = path.read_bytes()
-        content = parse_toml(data)
-    except OSError as error:
-        reason = error.strerror or type(error).__name__
-        raise RigError([f"{path}: cannot be read ({reason}); give a readable file"]) from error
+        content, data = read_toml(path, "a rig file")
     except TomlError as error:
-        raise RigError([f"{path.name}: not valid TOML ({error})"]) from error
+        raise RigError([str(error)]) from error
     return rig_from_mapping(content, path.name, line_finder(data))
 
 

@@ -5,14 +5,17 @@ What the keys mean is the business of the readers.
 
 from __future__ import annotations
 
+import stat
 import tomllib
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, Final
 
 from processing import ProcessingError
 
 DEPTH_MAX: Final = 32
 """Tables and lists within one another; no file of ours has more than six."""
+FILE_MAX_BYTES: Final = 1_000_000
 
 
 class TomlError(ProcessingError, ValueError):
@@ -41,6 +44,35 @@ def parse_toml(data: bytes) -> dict[str, Any]:
     if is_nested_deeper(content, DEPTH_MAX):
         raise TomlError("nested too deeply")
     return content
+
+
+def read_toml(path: Path, what: str) -> tuple[dict[str, Any], bytes]:
+    """Read and parse a TOML file.
+
+    Args:
+        path: of a file of at most `FILE_MAX_BYTES`.
+        what: it should be, with its article.
+
+    Returns:
+        Its tables, and its bytes.
+
+    Raises:
+        TomlError: no readable regular file, too large, or not TOML; the message names the file.
+    """
+    try:
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):
+            raise TomlError(f"{path}: not a regular file; give {what}")
+        if status.st_size > FILE_MAX_BYTES:
+            raise TomlError(f"{path.name}: larger than {FILE_MAX_BYTES} bytes; not {what}")
+        data = path.read_bytes()
+    except OSError as error:
+        reason = error.strerror or type(error).__name__
+        raise TomlError(f"{path}: cannot be read ({reason}); give {what}") from error
+    try:
+        return parse_toml(data), data
+    except TomlError as error:
+        raise TomlError(f"{path.name}: not valid TOML: {error}") from error
 
 
 def is_nested_deeper(content: object, depth: int) -> bool:

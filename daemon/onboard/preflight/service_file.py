@@ -5,7 +5,6 @@ The keys are in `daemon.configuration.model`.
 
 from __future__ import annotations
 
-import stat
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -36,9 +35,7 @@ from processing.rig.problem_sentences import (
     sentences,
     shown,
 )
-from processing.rig.toml_text import TomlError, parse_toml
-
-CONFIGURATION_MAX_BYTES = 1_000_000
+from processing.rig.toml_text import TomlError, read_toml
 
 
 def load(path: Path) -> tuple[Configuration, Rig]:
@@ -50,20 +47,9 @@ def load(path: Path) -> tuple[Configuration, Rig]:
         ConfigurationError: with one sentence per error: file, line, key, value, and the correction.
     """
     try:
-        status = path.stat()
-        if not stat.S_ISREG(status.st_mode):
-            raise ConfigurationError([f"{path}: not a regular file; give a service.toml"])
-        if status.st_size > CONFIGURATION_MAX_BYTES:
-            raise ConfigurationError([f"{path.name}: too large for a configuration"])
-        data = path.read_bytes()
-        content = parse_toml(data)
-    except OSError as error:
-        reason = error.strerror or type(error).__name__
-        raise ConfigurationError(
-            [f"{path}: cannot be read ({reason}); give the path of a service.toml"]
-        ) from error
+        content, data = read_toml(path, "a service.toml")
     except TomlError as error:
-        raise ConfigurationError([f"{path.name}: not valid TOML: {error}"]) from error
+        raise ConfigurationError([str(error)]) from error
     return from_mapping(content, path, line_finder(data))
 
 

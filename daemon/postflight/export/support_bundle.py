@@ -25,7 +25,7 @@ from daemon.mission.store import durable
 from daemon.mission.store.output_places import refuse_foreign_file
 from daemon.mission.verification.verification import VerifyReport
 from daemon.postflight.export.redaction import REDACTED, text_without_secrets, without_secrets
-from processing.rig.rig_file import RIG_FILE_MAX_BYTES
+from processing.rig.toml_text import FILE_MAX_BYTES
 
 TOPICS = ("event/", "ledger", "audit", "trigger", "mark/", "log/")
 """Included topics of the flight log; navigation and raw bytes would reveal where somebody flew."""
@@ -80,9 +80,7 @@ def write_bundle(
         put(_FIRST_FILE, json.dumps(_versions(), indent=1))
         put("mission.json", json.dumps(without_secrets(mission.about()), indent=1))
         if mission.rig_path.exists():
-            text = read_regular_file(mission.rig_path, RIG_FILE_MAX_BYTES).decode(
-                "utf-8", "replace"
-            )
+            text = read_regular_file(mission.rig_path, FILE_MAX_BYTES).decode("utf-8", "replace")
             put("rig.toml", text_without_secrets(text))
         put("service.json", _configuration(mission))
         put("exposures.jsonl", "".join(_records(mission)))
