@@ -32,6 +32,7 @@ from processing.quality.figures.image import (
     OtherGroundFigures,
     RelativeSharpnessFigures,
     RepeatedLineFigures,
+    ResponseFigures,
     SignalStepFigures,
     UnreadFigures,
     WordFormatFigures,
@@ -249,12 +250,14 @@ def _signal_causes(figures: QualityFigures) -> dict[str, frozenset[str]]:
     block, local = figures.of(BlockFigures), figures.of(LocalBlurFigures)
     clipping, unread = figures.of(ClippingFigures), figures.of(UnreadFigures)
     relative, balance = figures.of(RelativeSharpnessFigures), figures.of(BalanceFigures)
+    response = figures.of(ResponseFigures)
     found = {
         "gain": _names(_one(balance.gain_outlier), balance.gain_outlier_alternatives),
         "blur": _names(_one(relative.blurred_sensor)),
         "noise": _names(_one(relative.noisy_sensor)),
         "line": _names(_one(figures.of(DefectLineFigures).defect_line_sensor)),
         "step": _names(_one(figures.of(SignalStepFigures).signal_step_sensor)),
+        "response": _names(_one(response.response_sensor), response.response_alternatives),
         "repeated": _names(_one(figures.of(RepeatedLineFigures).repeated_lines_sensor)),
     }
     if abs(block.block_step or 0.0) > limits.block_step:

@@ -1,4 +1,4 @@
-"""Wrong inputs of whole frames and of the record: no light, rows sent twice, counts lost."""
+"""Wrong inputs of whole frames and of the record: no light, another response, counts lost."""
 
 from __future__ import annotations
 
@@ -15,9 +15,11 @@ from benchmarks.silent_errors.planting import (
     FaultInjector,
     Random,
     any_of,
+    any_sign,
     colour_sensors,
     of_frame,
     pan_sensors,
+    scaled,
 )
 
 SHUT_NOISE_DN: Final = 3.0
@@ -71,10 +73,47 @@ def _group_other(emulated: EmulatedExposure, _: float, random: Random) -> Fault:
     return Fault(changed, frozenset({*group, *cones}), f"{', '.join(group)} of the next exposure")
 
 
+def _offset_pan(emulated: EmulatedExposure, dn: float, random: Random) -> Fault:
+    name = any_of(random, pan_sensors(emulated.rig))
+    sensor, off = emulated.rig.sensor(name), dn * 2.0 ** (emulated.rig.sensor(name).bits - 12)
+
+    def change(frame: Array) -> Array:
+        return np.asarray(np.clip(frame + round(off), 0, sensor.full_scale_dn), np.uint16)
+
+    return of_frame(emulated, name, change, f"{off:.0f} DN more: dark signal not subtracted")
+
+
+def _tone_pan(emulated: EmulatedExposure, percent: float, random: Random) -> Fault:
+    """Another tone curve that keeps the brightest percent where it is."""
+    name = any_of(random, pan_sensors(emulated.rig))
+    sensor, exponent = emulated.rig.sensor(name), 1.0 + any_sign(random) * percent / 100.0
+
+    def change(frame: Array) -> Array:
+        signal = np.maximum(frame.astype(np.float64) - sensor.black_dn, 0.0)
+        bright = max(float(np.percentile(signal, 99.0)), 1.0)
+        signal = bright * (signal / bright) ** exponent + sensor.black_dn
+        return np.asarray(np.clip(np.rint(signal), 0, sensor.full_scale_dn), np.uint16)
+
+    return of_frame(emulated, name, change, f"tone curve with an exponent of {exponent:.2f}")
+
+
+def _slope_pan(emulated: EmulatedExposure, percent: float, random: Random) -> Fault:
+    name, axis = any_of(random, pan_sensors(emulated.rig)), int(random.integers(0, 2))
+    sensor, off = emulated.rig.sensor(name), any_sign(random) * percent / 100.0
+    shape = (sensor.height_px, 1) if axis == 0 else (1, sensor.width_px)
+    factor = 1.0 + off * np.linspace(-0.5, 0.5, max(shape)).reshape(shape)
+    along = ("rows", "columns")[axis]
+    description = f"signal changes slowly by {100 * off:+.1f} % along {along}"
+    return of_frame(emulated, name, lambda f: scaled(sensor, f, factor), description)
+
+
 EXPOSURE_FAULTS: Final[Mapping[str, FaultInjector]] = {
     "dark-head": _dark_head,
     "block-repeated": _block_repeated,
     "tdi-lost": _tdi_lost,
     "group-other": _group_other,
+    "offset-pan": _offset_pan,
+    "tone-pan": _tone_pan,
+    "slope-pan": _slope_pan,
 }
 """How these kinds of `benchmarks.silent_errors.limits` are planted."""

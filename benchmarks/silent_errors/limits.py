@@ -133,6 +133,16 @@ LIMITS: Final[Mapping[str, Limit]] = {
     "group-other": Limit(
         "all PAN or all colour frames of another exposure", "", _same_limit(STITCHED, 1.0)
     ),
+    "offset-pan": Limit(
+        "an offset of a whole PAN frame (of 12 bits)", "DN", _same_limit(STITCHED, 50.0)
+    ),
+    "tone-pan": Limit(
+        "another exponent of the tone curve of a PAN head", "%", _same_limit(STITCHED, 15.0)
+    ),
+    "slope-pan": Limit(
+        "signal of a PAN frame that changes slowly along rows or columns", "%",
+        {X: 15.0, L: 25.0, DMC: 15.0},
+    ),
 }  # fmt: skip
 
 

@@ -18,6 +18,7 @@ from numba import prange
 from numpy.typing import NDArray
 
 from processing.image.compiled_kernel import compiled_kernel
+from processing.image.head_response import OverlapCells, overlap_cells
 from processing.image.lattice import OUTSIDE
 from processing.image.resampling import WEIGHT_STEP_PX
 
@@ -77,12 +78,14 @@ class Balance:
     """Gains by sensor (the mean of their logarithms is zero) and the measurement of every overlap.
 
     Balanced signal is gain * signal + offset; `offsets` are in Level-1 counts and zero where no
-    overlap of a sensor spans enough light and dark to separate them from its gain.
+    overlap of a sensor spans enough light and dark to separate them from its gain. `cells` show
+    whether a sensor responds to light as its neighbours do (`processing.image.head_response`).
     """
 
     gains: Mapping[str, float]
     pairs: tuple[PairBalance, ...]
     offsets: Mapping[str, float] = field(default_factory=dict)
+    cells: tuple[OverlapCells, ...] = ()
 
     def outlier_without(self, changed: Collection[str]) -> GainOutlier | None:
         """The sensor whose gain is farthest from the median.
@@ -179,7 +182,7 @@ def balance_gains(names: Sequence[str], means: Array) -> Balance:
 
     Source: docs/explanation/mathematics/radiometry.md#balance-between-heads.
     """
-    pairs, samples = [], []
+    pairs, samples, cells = [], [], []
     boxes = [covered_box(one) for one in means]
     for a, b in itertools.combinations(range(len(names)), 2):
         both = tuple(
@@ -200,6 +203,11 @@ def balance_gains(names: Sequence[str], means: Array) -> Balance:
         low, high = np.percentile(light_a, (2.0, 98.0))
         span = float(high / low)
         pairs.append(PairBalance(names[a], names[b], median, float(sigma), count, span))
+        row, column = np.nonzero(common)
+        places = np.stack([column + both[1].start, row + both[0].start], axis=1)
+        cells.append(
+            overlap_cells(names[a], names[b], light_a, light_b, places / means.shape[:0:-1])
+        )
         samples.append((a, b, light_a, light_b))
     logs = _log_gains(names, pairs)
     offsets = np.zeros(len(names))
@@ -222,6 +230,7 @@ def balance_gains(names: Sequence[str], means: Array) -> Balance:
         dict(zip(names, gains, strict=True)),
         tuple(pairs),
         dict(zip(names, offsets.tolist(), strict=True)),
+        tuple(cells),
     )
 
 

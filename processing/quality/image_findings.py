@@ -17,6 +17,7 @@ from processing.quality.figures.image import (
     LocalBlurFigures,
     RelativeSharpnessFigures,
     RepeatedLineFigures,
+    ResponseFigures,
     SaturationFigures,
     SharpnessFigures,
     SignalFigures,
@@ -82,6 +83,7 @@ def signal_findings(figures: QualityFigures, thresholds: Thresholds) -> list[Fin
             )
         flag = Flag.UNDEREXPOSED if signal < 1.0 else Flag.OVEREXPOSED
         findings.append(Finding(flag, Verdict.USABLE, sentence, signal, 1.0))
+    findings += _response(figures.of(ResponseFigures))
     findings += _block(figures.of(BlockFigures), thresholds)
     findings += _clipping(figures.of(ClippingFigures), thresholds)
     return findings + _blur(
@@ -127,6 +129,36 @@ def _defect_line(line: DefectLineFigures) -> list[Finding]:
             line.defect_line,
         )
     ]
+
+
+def _response(response: ResponseFigures) -> list[Finding]:
+    """A PAN head whose signal against its neighbours depends on the light or on the place."""
+    if response.response_sensor is None:
+        return []
+    heads = response.response_sensor
+    if others := ", ".join(response.response_alternatives):
+        heads = f"{heads}, or of {others} (the overlaps cannot show which),"
+    offset_dn, slope = response.response_offset_dn, response.response_slope
+    value: float | None
+    if offset_dn is not None:
+        value, what, cure = (
+            offset_dn,
+            f"differs by {offset_dn:+.0f} DN in the dark, or by another tone curve: its dark "
+            "signal was not subtracted, or its lookup table is another",
+            "Check black level, gain and lookup table of the head, and its calibration.",
+        )
+    else:
+        value, what, cure = (
+            slope,
+            f"changes by {slope or 0.0:+.0%} from one side of its frame to the other along the "
+            f"{response.response_axis} of the image",
+            "Look for dew or shade on lens and filter; check aperture and calibration of the head.",
+        )
+    sentence = (
+        f"The signal of {heads} against its neighbours {what}. Radiometry of this frame is wrong. "
+        f"{cure}"
+    )
+    return [Finding(Flag.FRAME_CORRUPT, Verdict.USABLE, sentence, value)]
 
 
 def _block(block: BlockFigures, thresholds: Thresholds) -> list[Finding]:

@@ -8,11 +8,12 @@ import numpy as np
 
 from processing.image.balance import Balance
 from processing.image.colour import BandRegistration
+from processing.image.head_response import HeadResponse, head_response
 from processing.matching.tie_points import PAN_TO_COLOUR, PAN_TO_PAN, TiePoints
 from processing.mosaic.free_mosaic import Mosaic
 from processing.mosaic.validity import Validity
 from processing.quality.figures import FigureGroup
-from processing.quality.figures.image import BalanceFigures
+from processing.quality.figures.image import BalanceFigures, ResponseFigures
 from processing.quality.figures.stitching import (
     AdjustmentFigures,
     BandFitFigures,
@@ -24,6 +25,7 @@ from processing.quality.figures.stitching import (
     PoorestOverlapFigures,
     TiePointFigures,
 )
+from processing.radiometry.level1 import level1_counts_per_dn
 from processing.rig import Rig
 
 
@@ -54,7 +56,12 @@ def stitching_figures(
         Groups of figures.
     """
     yield _adjustment(mosaic)
-    outlier = balance.outlier_without(changed)
+    response = head_response(balance.cells, changed)
+    if response is not None:
+        yield _response(rig, response)
+    # An offset draws the gains, a gain no offset.
+    odd = {response.sensor} if response is not None and response.sensor else set()
+    outlier = balance.outlier_without({*changed, *odd})
     yield (
         BalanceFigures(balance.spread)
         if outlier is None
@@ -68,6 +75,20 @@ def stitching_figures(
     yield BandFitFigures(
         points_by_band={band.band: band.points for band in bands},
         rms_px_by_band={band.band: band.rms_px for band in bands},
+    )
+
+
+def _response(rig: Rig, response: HeadResponse) -> ResponseFigures:
+    counts = max(level1_counts_per_dn(s.bits) for cone in rig.pan_cones for s in cone.sensors)
+    if response.sensor:
+        counts = level1_counts_per_dn(rig.sensor(response.sensor).bits)
+    return ResponseFigures(
+        response_sensor=response.sensor or None,
+        response_offset_dn=None if response.offset is None else response.offset / counts,
+        response_slope=response.slope,
+        response_axis=None if response.slope is None else response.axis,
+        response_alternatives=response.alternatives,
+        response_limit_dn=response.offset_limit / counts,
     )
 
 

@@ -168,6 +168,34 @@ class BalanceFigures(FigureGroup):
 
 
 @dataclass(frozen=True)
+class ResponseFigures(FigureGroup):
+    """How the PAN heads respond to the light they share."""
+
+    response_sensor: Annotated[
+        str | None,
+        "PAN sensor whose signal against its neighbours depends on the light or on the place in "
+        "its frame",
+    ] = None
+    response_offset_dn: Annotated[
+        float | None, "its offset against them, DN; another tone curve looks like one, too"
+    ] = None
+    response_slope: Annotated[
+        float | None, "change of its signal from one side of its frame to the other, relative"
+    ] = None
+    response_axis: Annotated[
+        str | None, "along which the slope is: rows or columns of the image"
+    ] = None
+    response_alternatives: Annotated[
+        Names, "sensors whose response may be wrong instead: the overlaps show it as well"
+    ] = ()
+    response_limit_dn: Annotated[
+        float | None,
+        "offset of a PAN frame, of that with the least light and dark in its overlaps, below "
+        "which it is not distinguished from another gain, DN",
+    ] = None
+
+
+@dataclass(frozen=True)
 class SignalStepFigures(FigureGroup):
     """Steps of the signal from line to line."""
 
