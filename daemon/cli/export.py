@@ -190,15 +190,23 @@ def pictures(
             else (attitude_sigma[0] * 1e-3, attitude_sigma[1] * 1e-3, attitude_sigma[2] * 1e-3),
             compute=where.compute("writing", PICTURES_PER_PROCESS),
         )
+    out = folder.export_dir / kind
+    names = [path.relative_to(out) for path in files]
     if as_json:
         content = {
-            "folder": str(files[0].parent),
-            "files": [f.name for f in files],
+            "folder": str(out),
+            "files": [name.as_posix() for name in names],
             "failures": [failure.as_json() for failure in failures],
         }
         typer.echo(json.dumps(content))
     else:
-        Console().print(f"{len(files)} pictures in {files[0].parent}", soft_wrap=True)
+        Console().print(f"{len(files)} pictures in {out}", soft_wrap=True)
+        if products := sorted({name.parts[0] for name in names if len(name.parts) > 1}):
+            Console().print(
+                f"Products have a folder each: {', '.join(products)}. Give a program one of them: "
+                "several together look like the bands of one rig.",
+                soft_wrap=True,
+            )
     exit_if_failed(failures)
 
 

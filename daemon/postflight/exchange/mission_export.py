@@ -41,7 +41,12 @@ from daemon.postflight.exchange.photogrammetry import (
     table_texts,
 )
 from daemon.postflight.exchange.pix4d import pix4d_texts
-from daemon.postflight.export.level2_export import Level2Image, jpeg_with_metadata, metadata_of
+from daemon.postflight.export.level2_export import (
+    Level2Image,
+    jpeg_with_metadata,
+    metadata_of,
+    rig_place,
+)
 
 Program = Literal[
     "colmap",
@@ -128,8 +133,10 @@ def export_block(
             sync_file(part / "database.db")
         if images:
             (part / "images").mkdir()
+            tagged = chosen or _rigid_heads(read, rig)
+            names_bands = program != "opensfm" or _is_one_camera_a_band(block)
             for done, image in enumerate(block.images, 1):
-                data = picture_of(read, block, image)
+                data = picture_of(read, block, image, rig=tagged, names_bands=names_bands)
                 create_file(part / "images" / (image.name + SUFFIX), [data], mode=0o644)
                 progress(done)
             sync_directory(part / "images")
@@ -145,8 +152,19 @@ def _own_files(texts: Mapping[str, str]) -> re.Pattern[str]:
     return re.compile("|".join([*names, *tables, *others, rf"images/.*{re.escape(SUFFIX)}"]))
 
 
-def picture_of(read: MissionBlock, block: Block, image: BlockImage) -> bytes:
-    """An image as 8-bit JPEG with EXIF and XMP.
+def picture_of(
+    read: MissionBlock,
+    block: Block,
+    image: BlockImage,
+    *,
+    rig: BlockRig | None = None,
+    names_bands: bool = True,
+) -> bytes:
+    """An image as 8-bit JPEG with EXIF and XMP; a raw frame of a Bayer head in its colours.
+
+    Args:
+        rig: that of the tags; None writes none.
+        names_bands: whether the tags name bands.
 
     Raises:
         BlockError: the image belongs to no mission.
@@ -155,11 +173,28 @@ def picture_of(read: MissionBlock, block: Block, image: BlockImage) -> bytes:
     if image.eo is None or image.source is None or camera.pitch_mm is None:
         raise BlockError(f"image {image.name} has no file in the mission")
     f_mm = camera.model.fx_px * camera.pitch_mm
+    is_raw = camera.rays is not None
     picture = Level2Image(
         image.source, image.name, image.eo, f_mm, camera.pitch_mm, None, camera.bands,
-        (camera.width_px, camera.height_px), is_perspective=camera.rays is None,
+        (camera.width_px, camera.height_px), is_perspective=not is_raw,
+        colour_filter_array=read.rig.sensor(camera.name).colour_filter_array if is_raw else "none",
+        principal_point_px=(camera.model.cx_px, camera.model.cy_px) if is_raw else None,
     )  # fmt: skip
-    shot = metadata_of(read.rig, picture, read.crs, simulated=read.simulated, mission_id=block.name)
+    shot = metadata_of(read.rig, picture, read.crs, simulated=read.simulated)
+    place = None
+    if rig is not None:
+        place = rig_place(
+            read.rig.title or read.rig.name,
+            image.camera,
+            rig.reference,
+            rig.rotation[image.camera],
+            f"{block.name}/{image.frame}",
+        )
+    # Frames of one size differ in their principal points: programs take one camera a model.
+    model = f"{shot.camera} {camera.name}" if is_raw else shot.camera
+    shot = replace(shot, rig=place, camera=model)
+    if not names_bands:
+        shot = replace(shot, bands=(), wavelengths_nm=())
     return jpeg_with_metadata(picture, shot)
 
 
@@ -181,12 +216,37 @@ def _rigged(
             raise
         return block, None, str(error)
     change = f"{rig.change_px:.3f} px and {rig.change_m * 1e3:.2f} mm between exposures"
-    if choice == "auto" and (rig.change_px > RIG_LIMIT_PX or rig.change_m > RIG_LIMIT_M):
+    if choice == "auto" and not _is_rigid(rig):
         return block, None, (
             f"heads change against each other by {change}, more than {RIG_LIMIT_PX:g} px or "
             f"{RIG_LIMIT_M * 1e3:g} mm; --rig yes writes a rig nevertheless"
         )  # fmt: skip
     return with_rig(block, rig), rig, f"heads change against each other by {change} at most"
+
+
+def _is_one_camera_a_band(block: Block) -> bool:
+    """Whether no band has two cameras.
+
+    OpenDroneMap registers images of different bands with each other, and refuses bands with
+    different numbers of images.
+    """
+    bands = [band for camera in block.cameras for band in camera.bands]
+    return len(set(bands)) == len(bands)
+
+
+def _rigid_heads(read: MissionBlock, choice: RigChoice) -> BlockRig | None:
+    """The rig that tags of images state where the program's files have none."""
+    if choice == "no" or len(read.block.cameras) == 1:
+        return None
+    try:
+        rig = rig_of(read.block, _reference(read))
+    except BlockError:
+        return None
+    return rig if choice == "yes" or _is_rigid(rig) else None
+
+
+def _is_rigid(rig: BlockRig) -> bool:
+    return rig.change_px <= RIG_LIMIT_PX and rig.change_m <= RIG_LIMIT_M
 
 
 def _reference(read: MissionBlock) -> int:

@@ -54,7 +54,8 @@ class PictureMetadata:
 
     `height_m` is above the ellipsoid (EXIF 2.32 knows no such reference: `remark` states it);
     sigmas are None where they are not known, `serial` is the rig's, `lens_serial` of one lens,
-    `wavelengths_nm` are those of `bands` or empty; angles are of the image's camera against the
+    `wavelengths_nm` are those of `bands` or empty; `principal_point_px` is None where the image
+    is perspective, and the point in its middle; angles are of the image's camera against the
     local level (yaw from true north) and omega, phi, kappa against the grid `crs`.
     """
 
@@ -84,6 +85,7 @@ class PictureMetadata:
     rig: RigPlace | None = None
     lens_serial: str = ""
     is_perspective: bool = True
+    principal_point_px: tuple[float, float] | None = None
 
     @property
     def utc_text(self) -> str:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from daemon import DaemonError
 from daemon.mission.exposure import Exposure
@@ -34,8 +35,10 @@ from daemon.products.level3 import IMAGES as LEVEL3_IMAGES
 from daemon.products.level3 import level3_root
 from processing.geometry.orientation import BODY_FROM_CAMERA, ENU_FROM_NED, on_level_ground
 from processing.geometry.rotation import omega_phi_kappa, roll_pitch_heading, rotation_matrix
+from processing.radiometry.demosaic import demosaic
 from processing.rig import Rig
 
+Array = NDArray[np.float64]
 KINDS = tuple(SUFFIXES)
 GRID = 5
 """Ground control points along each side of a COG."""
@@ -57,7 +60,12 @@ class PictureError(DaemonError):
 
 @dataclass(frozen=True)
 class Level2Image:
-    """One raster of Level-2 and its orientation."""
+    """One raster of Level-2 and its orientation.
+
+    `product` is the folder of a stitched product, whose images are cameras of no rig; it is empty
+    for a head's own image. Pixels of a raw frame are behind `colour_filter_array`, and its
+    principal point (column, row) is `principal_point_px`.
+    """
 
     path: Path
     name: str
@@ -68,6 +76,9 @@ class Level2Image:
     bands: tuple[str, ...] = ()
     size_px: tuple[int, int] = (0, 0)
     is_perspective: bool = True
+    product: str = ""
+    colour_filter_array: str = "none"
+    principal_point_px: tuple[float, float] | None = None
 
 
 def pictures_of(
@@ -112,9 +123,12 @@ def pictures_of(
                 files = [(f"{name}-{depth}.tif", 1.0) for name in LEVEL3_IMAGES]
             for file, scale in files:
                 if (folder / file).exists():
-                    name = f"{eo.name}_{file.removesuffix('.tif')}"
+                    product = file.removesuffix(".tif")
                     pitch_mm = image.pitch_mm * scale
-                    yield _image(folder / file, name, eo, image.f_mm, pitch_mm, seconds)
+                    found = _image(
+                        folder / file, f"{eo.name}_{product}", eo, image.f_mm, pitch_mm, seconds
+                    )
+                    yield replace(found, product=product)
         elif level == 2 and (folder / f"{eo.cone}.tif").exists():
             path, pitch_mm = folder / f"{eo.cone}.tif", cone.sensors[0].pitch_mm
             yield _image(path, eo.name, eo, cone.lens.f_mm, pitch_mm, seconds)
@@ -149,7 +163,12 @@ def jpeg_with_metadata(picture: Level2Image, shot: PictureMetadata) -> bytes:
             bands=shot.bands[:shown],
             wavelengths_nm=shot.wavelengths_nm[:shown],
         )
-    return with_metadata(jpeg_picture(read_planes(picture.path), picture.bands), shot)
+    planes = read_planes(picture.path)
+    if picture.colour_filter_array != "none":
+        colours = np.zeros((3, *planes.shape[1:]), np.uint16)
+        demosaic(planes[0], picture.colour_filter_array, out=colours)
+        planes = colours
+    return with_metadata(jpeg_picture(planes, picture.bands), shot)
 
 
 def metadata_of(
@@ -200,6 +219,7 @@ def metadata_of(
         rig=_rig_place(rig, eo, mission_id),
         lens_serial=lenses.pop() if len(lenses) == 1 else "",
         is_perspective=picture.is_perspective,
+        principal_point_px=picture.principal_point_px,
     )
 
 
@@ -222,15 +242,31 @@ def _rig_place(rig: Rig, eo: ExteriorOrientation, mission_id: str) -> RigPlace |
     turn = rotation_matrix(*reference.rotation_rad).T @ rotation_matrix(
         *rig.cone(eo.cone).rotation_rad
     )
-    angles = np.degrees(omega_phi_kappa(VISION_FROM_CAMERA @ turn @ VISION_FROM_CAMERA))
-    capture = uuid.uuid5(uuid.NAMESPACE_URL, f"syntopic:{mission_id}/{eo.exposure}")
-    return RigPlace(
+    return rig_place(
         rig.title or rig.name,
         names.index(eo.cone),
         names.index(reference.name),
-        (float(angles[0]), float(angles[1]), float(angles[2])),
-        str(capture),
+        turn,
+        f"{mission_id}/{eo.exposure}",
     )
+
+
+def rig_place(
+    name: str, index: int, reference: int, reference_from_camera: Array, capture: str
+) -> RigPlace:
+    """Place of a camera in a rig.
+
+    Args:
+        name: of the rig.
+        index: of the camera; every camera has its own.
+        reference: index of the reference camera.
+        reference_from_camera: rotation (3, 3) in axes x right, y up, z back.
+        capture: text that all cameras of one exposure have in common.
+    """
+    turn = VISION_FROM_CAMERA @ reference_from_camera @ VISION_FROM_CAMERA
+    omega, phi, kappa = (math.degrees(angle) for angle in omega_phi_kappa(turn))
+    identity = uuid.uuid5(uuid.NAMESPACE_URL, f"syntopic:{capture}")
+    return RigPlace(name, index, reference, (omega, phi, kappa), str(identity))
 
 
 def write_picture(

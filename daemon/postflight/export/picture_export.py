@@ -32,6 +32,9 @@ def export_pictures(
 ) -> tuple[list[Path], tuple[ExposureFailure, ...]]:
     """Write every raster of a level as `kind` into `export/<kind>/`.
 
+    Stitched products have a folder each, named after the product: programs that read several bands
+    take images of different bands in one folder as those of one rig.
+
     Args:
         mission: whose pictures.
         kind: "cog", "tiff", "jp2" or "jpeg".

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from daemon.mission.layout import Mission
-from daemon.mission.store.durable import replace_file
+from daemon.mission.store.durable import make_directories, replace_file
 from daemon.orientation.orientation_inputs import OrientationInputs
 from daemon.postflight.batch.capacity import PROCESS_NBYTES
 from daemon.postflight.batch.executor import BatchTask
@@ -69,7 +69,7 @@ class PictureAction:
         return self
 
     def __call__(self, task: BatchTask) -> list[str]:
-        """Names of the files that were written.
+        """Files that were written, relative to the folder of the export.
 
         Raises:
             RasterError: a raster cannot be read.
@@ -86,12 +86,14 @@ class PictureAction:
                 mission_id=self._mission.id,
                 roll_pitch_yaw_sigma_deg=work.roll_pitch_yaw_sigma_deg,
             )  # fmt: skip
-            final = work.folder / f"{picture.name}{SUFFIXES[work.kind]}"
+            folder = work.folder / picture.product
+            make_directories(folder)
+            final = folder / f"{picture.name}{SUFFIXES[work.kind]}"
             if work.kind == "jpeg":
                 replace_file(final, jpeg_with_metadata(picture, shot))
             else:
                 write_picture(
                     work.kind, picture, shot, inputs.georeference, inputs.ground_height_m, final
                 )
-            written.append(final.name)
+            written.append(final.relative_to(work.folder).as_posix())
         return written

@@ -173,13 +173,13 @@ def _cog_assets(mission: Mission, eo: ExteriorOrientation) -> dict[str, Any]:
         folders = mission.level2(eo.exposure), level3_root(mission) / exposure_name(eo.exposure)
         sources = [(f"_{p.stem}", p) for folder in folders for p in sorted(folder.glob("*.tif"))]
     for suffix, source in sources:
-        path = mission.export_dir / "cog" / f"{eo.name}{suffix}.tif"
+        path = mission.export_dir / "cog" / suffix[1:] / f"{eo.name}{suffix}.tif"
         if not path.exists() or not source.exists():
             continue
         bands = [str(band) for band in read_description(source).get("bands", ("pan",))]
         assets[f"cog{suffix}".replace("-", "_")] = raster_asset(
             path,
-            f"{_TO_MISSION}/export/cog/{path.name}",
+            f"{_TO_MISSION}/{path.relative_to(mission.path).as_posix()}",
             media_type=COG_TYPE,
             title=f"{', '.join(bands)}: perspective image with control points",
             roles=["data"],

@@ -66,6 +66,10 @@ def _camera(shot: PictureMetadata) -> dict[str, str]:
             f"{side_px * shot.pixel_um * 5e-4:.6f}" for side_px in (shot.width_px, shot.height_px)
         )
         camera["PerspectiveDistortion"] = "0,0,0,0,0"
+    elif shot.principal_point_px is not None:
+        camera["PrincipalPoint"] = ",".join(
+            f"{(place_px + 0.5) * shot.pixel_um * 1e-3:.6f}" for place_px in shot.principal_point_px
+        )
     if shot.position_sigma_m is not None:
         camera["GPSXYAccuracy"] = f"{shot.position_sigma_m:.4f}"
     if shot.height_sigma_m is not None:

@@ -99,7 +99,7 @@ def test_rasters_have_bands_interpretation_and_the_pixels_of_level_2(
         assert [i.name for i in raster.colorinterp] == ["gray"]
     plain = tifffile.imread(stitched.path / "L2/000001/rgbn.tif")
     assert (pixels == plain).all(), "lossless"
-    assert not list((stitched.path / "export" / kind).glob(".*")), "nothing of a writer is left"
+    assert not list((stitched.path / "export" / kind).rglob(".*")), "nothing of a writer is left"
 
 
 def test_rio_cogeo_finds_every_cog_valid(stitched) -> None:
@@ -244,7 +244,7 @@ def test_accuracies_of_the_receiver_reach_the_tags(stitched, tmp_path) -> None:
     )
     assert done.exit_code == 0, done.output
     content = json.loads(done.stdout)
-    found = tags(Path(content["folder"]) / "000001_pan.jpg")
+    found = tags(Path(content["folder"]) / "pan/000001_pan.jpg")
     # At least those of the receiver (formats.md): 0.02 m and 0.03 m.
     assert 0.02 <= found["XMP-Camera:GPSXYAccuracy"] < 0.03
     assert 0.03 <= found["XMP-Camera:GPSZAccuracy"] < 0.04

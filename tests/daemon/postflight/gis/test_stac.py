@@ -206,7 +206,7 @@ def test_an_orthoimage_has_its_transform_and_a_perspective_one_is_refused(
     assert item.properties["proj:code"] == CRS and item.properties["gsd"] == pytest.approx(0.1)
     to_wgs = pyproj.Transformer.from_crs(CRS, 4326, always_xy=True)
     assert item.bbox[:2] == pytest.approx(to_wgs.transform(677000, 5214997), abs=2e-6)
-    shutil.copy(mission / "export/cog/000001_pan.tif", ortho / "perspective.tif")
+    shutil.copy(mission / "export/cog/pan/000001_pan.tif", ortho / "perspective.tif")
     refused = CliRunner().invoke(app, ["export", "stac", str(mission), *options])
     assert refused.exit_code != 0 and "no orthoimage" in str(refused.exception)
     assert (mission / "export/stac/collection.json").exists(), "the earlier export is kept"
