@@ -17,6 +17,8 @@ from processing.image.head_response import (
     overlap_cells,
 )
 
+pytestmark = pytest.mark.trust
+
 Array = Any
 Change = Callable[[Array, Array], Array]
 NAMES = ("A", "B", "C", "D")
