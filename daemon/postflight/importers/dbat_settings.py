@@ -8,6 +8,7 @@ Strasbourg).
 from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, TypeVar
@@ -77,8 +78,9 @@ def read_settings(script: str, root: ElementTree.Element) -> DbatSettings:
     base = HERE if given is None else given.get("base_dir", HERE)
     if base not in (HERE, ".") and not base.startswith(f"{HERE}/"):
         problems.append(f"{script}: base_dir {base} is not read; use {HERE} or a folder in it")
-    free: list[str] | None = None
-    is_loaded, notes = False, []
+    # DBAT begins with no parameter estimated, and each operation changes those that it names.
+    free: dict[str, bool] = dict.fromkeys(_PARAMETERS["all"], False)
+    is_stated, is_loaded, notes = False, False, []
     has_prior = root.find("input/prior_eo") is not None
     for operation in root.findall("operations/operation"):
         children = [child for child in operation if child.tag != REMARK]
@@ -89,7 +91,8 @@ def read_settings(script: str, root: ElementTree.Element) -> DbatSettings:
             if child.tag == "set_initial_values":
                 is_loaded |= _is_loaded(script, child, problems, has_prior=has_prior)
             elif child.tag == "set_bundle_estimate_params":
-                free = _free(script, child, problems)
+                is_stated = True
+                _set_free(script, child, free, problems)
             elif child.tag == "set_datum":
                 datum = (child.text or "").strip()
                 note = f"set_datum {datum}: imported as a free network (minimum norm)"
@@ -98,16 +101,27 @@ def read_settings(script: str, root: ElementTree.Element) -> DbatSettings:
                 notes.append(note)
             else:
                 problems.append(f"{script}: operation <{child.tag}> is not read")
+    if not is_stated:
+        problems.append(
+            f"{script}: no <set_bundle_estimate_params>, so that it does not state which parameters "
+            "are estimated; add it, with <all> of io, eo and op"
+        )
     if problems:
         raise ProjectError(problems)
     if harmless := ignored(root):
         notes.append(f"ignored: {', '.join(harmless)}")
-    every = [name for name in _PARAMETERS["all"] if name != "b2"]
-    return DbatSettings(tuple(every if free is None else free), is_loaded, tuple(notes))
+    estimated = tuple(name for name, is_free in free.items() if is_free)
+    return DbatSettings(estimated, is_loaded, tuple(notes))
 
 
-def _values(part: ElementTree.Element) -> dict[str, str]:
+def _values(script: str, part: ElementTree.Element, problems: list[str]) -> dict[str, str]:
     """Values by the names in a part; text in the part itself is that of all."""
+    counts = Counter(child.tag for child in part if child.tag != REMARK)
+    problems += [
+        f"{script}: <{name}> is {count} times in <{part.tag}>; keep one of them"
+        for name, count in counts.items()
+        if count > 1
+    ]
     named = {child.tag: (child.text or "").strip() for child in part if child.tag != REMARK}
     return named or {"all": (part.text or "").strip()}
 
@@ -120,7 +134,7 @@ def _is_loaded(
     for part in element:
         if part.tag not in _PARTS:
             continue
-        values = _values(part)
+        values = _values(script, part, problems)
         if not _is_all(values, ("default", "loaded")):
             problems.append(f"{script}: initial values of {part.tag}: {values} are not read")
         elif part.tag == "io":
@@ -137,12 +151,14 @@ def _is_all(values: Mapping[str, str], allowed: Sequence[str]) -> bool:
     return set(values) == {"all"} and values["all"] in allowed
 
 
-def _free(script: str, element: ElementTree.Element, problems: list[str]) -> list[str]:
-    free: dict[str, bool] = dict.fromkeys(_PARAMETERS["all"], False)
+def _set_free(
+    script: str, element: ElementTree.Element, free: dict[str, bool], problems: list[str]
+) -> None:
+    """Change which interior parameters are free, in the order of the script."""
     for part in element:
         if part.tag not in _PARTS:
             continue
-        values = _values(part)
+        values = _values(script, part, problems)
         if part.tag != "io":
             if not _is_all(values, ("true", "default")):
                 listed = ", ".join(f"{name} {value!r}" for name, value in values.items())
@@ -153,7 +169,6 @@ def _free(script: str, element: ElementTree.Element, problems: list[str]) -> lis
                 free |= dict.fromkeys(_PARAMETERS[name], value == "true")
             else:
                 problems.append(f"{script}: estimation of io {name} {value!r} is not read")
-    return [name for name, is_free in free.items() if is_free]
 
 
 def filtered(

@@ -8,6 +8,7 @@ import pytest
 
 from daemon.postflight.adjustment.csv_tables import ProjectError
 from daemon.postflight.importers.dbat import import_dbat
+from processing.bundle.network import INTERIOR
 from tests.daemon.postflight.dbat_project import SCRIPT, write_dbat_project
 
 PRIOR = '<prior_eo><file format="id,x,y,z,omega,phi,kappa" units="degrees">eo.txt</file></prior_eo>'
@@ -52,6 +53,7 @@ def refused(folder: Path, sentence: str) -> None:
         (IO_LOADED, "<lens>loaded</lens>", "<lens> in <set_initial_values>"),
         ("<eo><all>true</all></eo>", "<ro><all>true</all></ro>", "<ro> in <set_bundle_est"),
         ("<eo><all>true</all></eo>", "<eo>false</eo>", "eo all 'false' is not read"),
+        ("<K3>false</K3>", "<K3>false</K3><K3>true</K3>", "<K3> is 2 times in <io>"),
         ("<input ", "<settings/><input ", "<settings> in <document>"),
         ('version="1.0"', 'version="9.0"', "dbat_script_version is '9.0'; 1.0 is read"),
         ("<input ", "<meta><project_unit>ft</project_unit></meta><input ", "unit> is 'ft'; m is"),
@@ -144,3 +146,33 @@ def test_a_parameter_in_the_text_of_its_part_is_that_of_all(folder) -> None:
     path.write_text(SCRIPT[:begin] + "<io>false" + SCRIPT[end:])
     (camera,) = import_dbat(path).network.cameras
     assert not camera.free
+
+
+@pytest.mark.parametrize(
+    ("more", "free"),
+    [
+        ("<io><cc>false</cc></io>", {"dx0", "dy0", "k1", "k2", "p1", "p2", "b1"}),
+        ("<eo>true</eo>", {"df", "dx0", "dy0", "k1", "k2", "p1", "p2", "b1"}),
+        ("<io><K3>false</K3><all>true</all></io>", set(INTERIOR)),
+        ("<io><all>false</all><P1>true</P1></io>", {"p1"}),
+    ],
+)
+def test_a_second_operation_changes_what_it_names(folder, more, free) -> None:
+    second = f"<set_bundle_estimate_params>{more}</set_bundle_estimate_params>"
+    bundle = "<operation>bundle_adjustment"
+    changed(folder / "script.xml", bundle, f"<operation>{second}</operation>{bundle}")
+    (camera,) = import_dbat(folder / "script.xml").network.cameras
+    assert camera.free == free
+
+
+def test_a_script_that_does_not_state_what_is_estimated_is_refused(folder) -> None:
+    text = (folder / "script.xml").read_text()
+    begin = text.index("    <operation><set_bundle_estimate_params>")
+    end = text.index("    <operation>bundle_adjustment")
+    (folder / "script.xml").write_text(text[:begin] + text[end:])
+    refused(folder, "no <set_bundle_estimate_params>, so that it does not state which")
+    part = "<operation><set_bundle_estimate_params><io><K3>false</K3></io>"
+    operation = f"{part}</set_bundle_estimate_params></operation>"
+    (folder / "script.xml").write_text(text[:begin] + operation + text[end:])
+    (camera,) = import_dbat(folder / "script.xml").network.cameras
+    assert camera.free == set(), "nothing is estimated at the beginning"
