@@ -10,7 +10,6 @@ only with the length that the store states. Credentials and the endpoint come fr
 from __future__ import annotations
 
 import hashlib
-import os
 import re
 import time
 from collections.abc import Callable, Iterator
@@ -20,7 +19,7 @@ from datetime import timedelta
 from typing import Any, Final, TypeVar
 
 from daemon import DaemonError
-from daemon.mission.transfer.s3_requests import S3RefusedError
+from daemon.mission.transfer.store_requests import StoreRefusedError, is_http_permitted
 
 SCHEMES: Final = ("s3", "gs", "az")
 PART_BYTES: Final = 16_000_000
@@ -32,11 +31,6 @@ CONNECT_TIMEOUT_S: Final = 10.0
 RETRIES: Final = 8
 RETRY_TIMEOUT_S: Final = 180.0
 _FIRST_PAUSE_S: Final = 0.1
-_ALLOW_HTTP: Final = {
-    "s3": "AWS_ALLOW_HTTP",
-    "gs": "GOOGLE_ALLOW_HTTP",
-    "az": "AZURE_ALLOW_HTTP",
-}
 _ACCESS_CURES: Final = {
     "ExpiredToken": "The credentials have expired. Set new ones",
     "TokenRefreshRequired": "The credentials have expired. Set new ones",
@@ -107,7 +101,7 @@ class ObjectStore:
                 "timeout": timedelta(seconds=REQUEST_TIMEOUT_S),
                 "connect_timeout": timedelta(seconds=CONNECT_TIMEOUT_S),
                 # Options given here take the place of those in the environment.
-                "allow_http": os.environ.get(_ALLOW_HTTP[match[1]], "").lower() in ("1", "true"),
+                "allow_http": is_http_permitted(match[1]),
             },
             "retry_config": {
                 "max_retries": RETRIES,
@@ -369,7 +363,7 @@ def _is_final(error: Exception) -> bool:
     import obstore
 
     absent = FileNotFoundError | obstore.exceptions.NotFoundError
-    is_absent = isinstance(error, S3RefusedError) and error.status == 404
+    is_absent = isinstance(error, StoreRefusedError) and error.status == 404
     return is_absent or isinstance(error, absent) or bool(_access_cure(error))
 
 

@@ -1,4 +1,4 @@
-"""Files sent to an S3 store in parts, continued where an earlier command was killed.
+"""Files sent to S3 or Google in parts, continued where an earlier command was killed.
 
 The store lists the parts it has, with size and MD5. A part that equals the file is not sent again;
 the object is read back and compared by SHA-256 as every other one. obstore begins each upload
@@ -8,19 +8,16 @@ again, so the requests are made here; they need the access key of the environmen
 from __future__ import annotations
 
 import hashlib
-import threading
-from collections.abc import Callable, Container
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Container
 from dataclasses import replace
-from http.client import HTTPException
 from typing import Final
 from xml.sax.saxutils import escape
 
-from daemon import DaemonError
 from daemon.mission.foreign_xml import parse_xml
 from daemon.mission.transfer import object_store
-from daemon.mission.transfer.object_store import PART_BYTES, RETRIES, ByteProgress
-from daemon.mission.transfer.s3_requests import S3Folder, S3RefusedError
+from daemon.mission.transfer.object_store import RETRIES, ByteProgress
+from daemon.mission.transfer.part_sender import PartSender, ReadPart
+from daemon.mission.transfer.s3_requests import S3Folder
 from daemon.mission.transfer.s3_uploads import (
     ELEMENTS_MAX,
     UnfinishedUploads,
@@ -29,21 +26,13 @@ from daemon.mission.transfer.s3_uploads import (
     abort_old,
     text_of,
 )
+from daemon.mission.transfer.store_requests import StoreRefusedError
 
-PARTS_IN_WORK: Final = 2
-"""Of one file; each is in memory while it is sent."""
 _COMPLETED: Final = "CompleteMultipartUploadResult"
 
-ReadPart = Callable[[int, int], bytes]
-"""The content of a file from an offset, so many bytes."""
 
-
-class InterruptedUploadError(DaemonError):
-    """The command ends; parts that were sent are continued by the next one."""
-
-
-class PartUploads:
-    """Uploads in parts below a folder of an S3 store.
+class S3PartUploads:
+    """Uploads in parts below a folder of a bucket.
 
     Args:
         folder: of the store.
@@ -61,42 +50,38 @@ class PartUploads:
         self._ended = abort_old(listing, others)
         self._uploads = {name: one.upload_id for name, one in self._begun.items()}
         self._completed: set[str] = set()
-        self._reused_nbytes = 0
-        self._lock, self._stopping = threading.Lock(), threading.Event()
+        self._sender = PartSender()
 
     def send(self, name: str, read: ReadPart, nbytes: int, sent: ByteProgress) -> None:
         """Send the parts that the store does not have, and complete the object.
 
-        Args:
-            name: of the object.
-            read: its content; called by several threads.
-            nbytes: its size.
-            sent: called with the size of each part once the store has it.
-
-        Raises:
-            S3RefusedError: the store refused; the next call begins an upload of its own.
-            OSError, HTTPException: it did not answer in every attempt.
-            InterruptedUploadError: `stop` was called.
-            ValueError: not an answer of S3.
+        After a refusal the next call begins an upload of its own.
         """
-        upload = self._uploads.get(name)
+        begun = self._uploads.get(name)
         try:
-            present = self._present(name, upload) if upload else {}
-            if not upload:
-                upload = self._created(name)
-                self._uploads[name] = upload
-            e_tags = self._sent(name, upload, read, nbytes, present, sent)
+            present = self._present(name, begun) if begun else {}
+            upload = begun or self._created(name)
+            self._uploads[name] = upload
+
+            def there(number: int, data: bytes) -> str:
+                e_tag = hashlib.md5(data, usedforsecurity=False).hexdigest()
+                return e_tag if present.get(number) == (len(data), e_tag) else ""
+
+            def put(number: int, data: bytes) -> str:
+                query = {"partNumber": str(number), "uploadId": upload}
+                return self._request("PUT", name, query, data)[1]
+
+            e_tags = self._sender.send(read, nbytes, sent, present=there, put=put)
             self._complete(name, upload, e_tags)
-        except (S3RefusedError, ValueError) as error:
-            if not isinstance(error, S3RefusedError) or error.status < 500:
+        except (StoreRefusedError, ValueError) as error:
+            if not isinstance(error, StoreRefusedError) or error.status < 500:
                 self._uploads.pop(name, None)
             raise
         self._completed.add(upload)
         self._uploads.pop(name, None)
 
     def stop(self) -> None:
-        """Begin no further part."""
-        self._stopping.set()
+        self._sender.stop()
 
     def end(self) -> UnfinishedUploads:
         """Abort old uploads that were not continued after all; what happened to all of them."""
@@ -109,40 +94,8 @@ class PartUploads:
             recent=(*self._ended.recent, *found.recent),
             problem=found.problem or self._ended.problem,
             continued=tuple(continued),
-            reused_nbytes=self._reused_nbytes,
+            reused_nbytes=self._sender.reused_nbytes,
         )
-
-    def _sent(
-        self,
-        name: str,
-        upload: str,
-        read: ReadPart,
-        nbytes: int,
-        present: dict[int, tuple[int, str]],
-        sent: ByteProgress,
-    ) -> list[str]:
-        """Entity tags of all parts."""
-
-        def part(number: int) -> str:
-            if self._stopping.is_set():
-                raise InterruptedUploadError(f"{name}: interrupted")
-            offset = (number - 1) * PART_BYTES
-            data = read(offset, min(PART_BYTES, nbytes - offset))
-            e_tag = hashlib.md5(data, usedforsecurity=False).hexdigest()
-            if present.get(number) == (len(data), e_tag):
-                with self._lock:
-                    self._reused_nbytes += len(data)
-            else:
-                query = {"partNumber": str(number), "uploadId": upload}
-                e_tag = self._request("PUT", name, query, data)[1]
-            sent(len(data))
-            return e_tag
-
-        pool = ThreadPoolExecutor(PARTS_IN_WORK)
-        try:
-            return list(pool.map(part, range(1, -(-nbytes // PART_BYTES) + 1)))
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
 
     def _present(self, name: str, upload: str) -> dict[int, tuple[int, str]]:
         """Size and MD5 of the parts that the store has, by number."""
@@ -188,17 +141,3 @@ class PartUploads:
             attempts=RETRIES, timeout_s=object_store.REQUEST_TIMEOUT_S,
         )  # fmt: skip
         return answer.content, answer.e_tag
-
-
-def part_uploads(listing: UploadListing, continued: Container[str]) -> PartUploads | None:
-    """Uploads that can be continued; None where the store does not permit it.
-
-    Args:
-        listing: of the uploads there.
-        continued: names that may be.
-    """
-    return None if listing.folder is None else PartUploads(listing.folder, listing, continued)
-
-
-ERRORS: Final = (OSError, HTTPException, ValueError)
-"""Of `PartUploads.send`."""

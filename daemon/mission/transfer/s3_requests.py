@@ -1,6 +1,9 @@
-"""Signed requests to an S3 store, for what obstore has no function: uploads in parts.
+"""Signed requests to S3 and to Google Cloud Storage, whose XML interface accepts the same ones.
 
-Credentials, region and endpoint are those of the environment, as obstore reads them.
+Credentials, region and endpoint are those of the environment, as obstore reads them; the key for
+Google, an HMAC key, has the names that GDAL gives it.
+
+Source: Google Cloud Storage, Simple migration from Amazon S3.
 """
 
 from __future__ import annotations
@@ -8,35 +11,21 @@ from __future__ import annotations
 import hashlib
 import hmac
 import os
-import re
-import time
-import urllib.error
 import urllib.request
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from email.utils import parsedate_to_datetime
-from http.client import HTTPException
 from typing import Final
 from urllib.parse import quote, urlsplit
 
-from daemon import DaemonError
+from daemon.mission.transfer.store_requests import ATTEMPTS, TIMEOUT_S, StoreAnswer, answer_to
 
-TIMEOUT_S: Final = 30.0
-"""Without an answer, or a byte of one."""
-ATTEMPTS: Final = 4
-_FIRST_PAUSE_S: Final = 0.1
-_PAUSE_MAX_S: Final = 5.0
-_ANSWER_MAX_BYTES: Final = 5_000_000
-_CODE = re.compile(rb"<Code>(\w+)</Code>")
-
-
-class S3RefusedError(DaemonError, OSError):
-    """A request that the store refused; `code` is that of S3, such as NoSuchUpload."""
-
-    def __init__(self, status: int, code: str) -> None:
-        super().__init__(f"status code: {status} {code}")
-        self.status, self.code = status, code
+KEY_NAMES: Final = {
+    "s3": ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"),
+    "gs": ("GS_ACCESS_KEY_ID", "GS_SECRET_ACCESS_KEY"),
+}
+"""Variables with the access key, by scheme of the address."""
+_GOOGLE: Final = "https://storage.googleapis.com"
 
 
 @dataclass(frozen=True)
@@ -49,35 +38,34 @@ class Credentials:
 
 
 @dataclass(frozen=True)
-class S3Answer:
-    """Body and entity tag of an answer, and the time of the store."""
-
-    content: bytes
-    now: datetime
-    e_tag: str = ""
-
-
-@dataclass(frozen=True)
 class S3Folder:
     """A folder of a bucket: the bucket's address, and the prefix of its keys, ending in '/'."""
 
     bucket: str
     prefix: str
     credentials: Credentials
+    region: str
+    scheme: str = "s3"
 
     @classmethod
     def of(cls, url: str) -> S3Folder | None:
         """The folder of an address; None without an access key in the environment.
 
         Args:
-            url: such as "s3://bucket/missions/one".
+            url: such as "s3://bucket/missions/one" or "gs://bucket/missions/one".
         """
-        parts, credentials = urlsplit(url), _credentials(os.environ)
+        parts = urlsplit(url)
+        scheme = parts.scheme
+        credentials = _credentials(scheme, os.environ)
         if credentials is None:
             return None
         prefix = parts.path.strip("/")
+        prefix = f"{prefix}/" if prefix else ""
+        if scheme == "gs":
+            base = os.environ.get("GOOGLE_BASE_URL", "").rstrip("/") or _GOOGLE
+            return cls(f"{base}/{parts.netloc}", prefix, credentials, "auto", scheme)
         bucket = _bucket_url(parts.netloc, os.environ)
-        return cls(bucket, f"{prefix}/" if prefix else "", credentials)
+        return cls(bucket, prefix, credentials, _region(os.environ))
 
     def request(
         self,
@@ -88,7 +76,7 @@ class S3Folder:
         *,
         attempts: int = ATTEMPTS,
         timeout_s: float = TIMEOUT_S,
-    ) -> S3Answer:
+    ) -> StoreAnswer:
         """The answer to a request; what passes is tried again.
 
         Args:
@@ -100,40 +88,24 @@ class S3Folder:
             timeout_s: of each attempt.
 
         Raises:
-            S3RefusedError: the store refused.
+            StoreRefusedError: the store refused.
             OSError, HTTPException: it did not answer in every attempt.
         """
         url = self.bucket if name is None else f"{self.bucket}/{quote(self.prefix + name)}"
-        is_plain = os.environ.get("AWS_ALLOW_HTTP", "").lower() in ("1", "true")
-        if urlsplit(url).scheme != "https" and not is_plain:
-            raise OSError("the endpoint has no TLS")
         body_sha256 = hashlib.sha256(body).hexdigest()
-        for attempt in range(1, attempts + 1):
+
+        def signed() -> urllib.request.Request:
             headers = signed_headers(
                 method, url, query, self.credentials,
-                region=_region(os.environ), now=datetime.now(UTC), body_sha256=body_sha256,
+                region=self.region, now=datetime.now(UTC), body_sha256=body_sha256,
             )  # fmt: skip
             if body:
                 headers["content-type"] = "application/octet-stream"
-            asked = urllib.request.Request(
+            return urllib.request.Request(
                 f"{url}?{query_text(query)}", data=body or None, method=method, headers=headers
             )
-            try:
-                with urllib.request.urlopen(asked, timeout=timeout_s) as answer:
-                    date = answer.headers["Date"]
-                    now = parsedate_to_datetime(date) if date else datetime.now(UTC)
-                    content = answer.read(_ANSWER_MAX_BYTES)
-                    e_tag = (answer.headers["ETag"] or "").strip('"')
-                    return S3Answer(content, now.astimezone(UTC), e_tag)
-            except urllib.error.HTTPError as error:
-                refused = _refusal(error)
-                if error.code < 500 or attempt == attempts:
-                    raise refused from error
-            except (OSError, HTTPException):
-                if attempt == attempts:
-                    raise
-            time.sleep(min(_PAUSE_MAX_S, _FIRST_PAUSE_S * 2**attempt))
-        raise AssertionError  # the last attempt returns or raises
+
+        return answer_to(signed, self.scheme, attempts=attempts, timeout_s=timeout_s)
 
 
 def signed_headers(
@@ -190,18 +162,10 @@ def query_text(query: Mapping[str, str]) -> str:
     return "&".join(f"{quote(n, safe='')}={quote(v, safe='')}" for n, v in sorted(query.items()))
 
 
-def _refusal(error: urllib.error.HTTPError) -> S3RefusedError:
-    try:
-        found = _CODE.search(error.read(_ANSWER_MAX_BYTES))
-    except (OSError, HTTPException):
-        found = None
-    return S3RefusedError(error.code, found[1].decode() if found else str(error.reason))
-
-
-def _credentials(environment: Mapping[str, str]) -> Credentials | None:
-    key, secret = (environment.get(f"AWS_{n}", "") for n in ("ACCESS_KEY_ID", "SECRET_ACCESS_KEY"))
+def _credentials(scheme: str, environment: Mapping[str, str]) -> Credentials | None:
+    key, secret = (environment.get(name, "") for name in KEY_NAMES[scheme])
     token = environment.get("AWS_SESSION_TOKEN") or environment.get("AWS_TOKEN") or ""
-    return Credentials(key, secret, token) if key and secret else None
+    return Credentials(key, secret, token if scheme == "s3" else "") if key and secret else None
 
 
 def _region(environment: Mapping[str, str]) -> str:

@@ -1,8 +1,8 @@
-"""Uploads in parts that a killed command left in an S3 store: listed, and aborted.
+"""Uploads in parts that a killed command left in S3 or at Google: listed, and aborted.
 
 Their parts are stored and paid for, and no listing of objects shows them. Those that a transfer
-continues are in `daemon.mission.transfer.s3_parts`. Google and Azure are not asked: a rule of the
-bucket ends such uploads there, Azure discards them after a week.
+continues are in `daemon.mission.transfer.s3_parts`. Azure is not asked: it discards them after a
+week.
 """
 
 from __future__ import annotations
@@ -15,12 +15,17 @@ from typing import Final
 from xml.etree import ElementTree
 
 from daemon.mission.foreign_xml import parse_xml
-from daemon.mission.transfer.s3_requests import S3Folder, S3RefusedError
+from daemon.mission.transfer.s3_requests import KEY_NAMES, S3Folder
+from daemon.mission.transfer.store_requests import StoreRefusedError
 
 AGE_MIN_S: Final = 3600.0
 """Uploads that began later may be of a command that runs now, and are left."""
 ELEMENTS_MAX: Final = 50_000
 _RULE: Final = "give the bucket a rule AbortIncompleteMultipartUpload"
+_RIGHTS: Final = {
+    "s3": "s3:ListBucketMultipartUploads and s3:AbortMultipartUpload",
+    "gs": "storage.multipartUploads.list and storage.multipartUploads.abort",
+}
 
 
 @dataclass(frozen=True)
@@ -81,14 +86,16 @@ def list_unfinished(url: str, is_own: Callable[[str], bool]) -> UploadListing:
         url: of a folder, such as "s3://bucket/missions/one".
         is_own: whether an object of this name below the folder is written by these commands.
     """
-    if not url.startswith("s3://"):
+    scheme = url.partition("://")[0]
+    if scheme not in KEY_NAMES:
         return UploadListing(url)
     folder = S3Folder.of(url)
     if folder is None:
         return UploadListing(
             url,
-            problem="Unfinished uploads were not looked for, because AWS_ACCESS_KEY_ID is not set: "
-            f"{_RULE}.",
+            problem="Unfinished uploads were not looked for, because "
+            f"{KEY_NAMES[scheme][0]} is not set. A file in work at a kill is sent "
+            f"again from its start; {_RULE}.",
         )
     try:
         found = tuple(one for one in _listed(folder) if is_own(one.name))
@@ -114,7 +121,7 @@ def abort_old(listing: UploadListing, uploads: Iterable[Upload]) -> UnfinishedUp
             listing.folder.request("DELETE", one.name, {"uploadId": one.upload_id})
         except (OSError, HTTPException) as error:
             # 404: it ended meanwhile.
-            if not isinstance(error, S3RefusedError) or error.status != 404:
+            if not isinstance(error, StoreRefusedError) or error.status != 404:
                 return replace(result, problem=_problem(listing.url, error))
         result = replace(result, aborted=(*result.aborted, one.name))
     return result
@@ -134,7 +141,7 @@ def abort_unfinished(url: str, is_own: Callable[[str], bool]) -> UnfinishedUploa
 def _problem(url: str, error: Exception) -> str:
     return (
         f"Unfinished uploads below {url} could not be listed or aborted ({error}). Permit "
-        f"s3:ListBucketMultipartUploads and s3:AbortMultipartUpload, or {_RULE}."
+        f"{_RIGHTS[url.partition('://')[0]]}, or {_RULE}."
     )
 
 

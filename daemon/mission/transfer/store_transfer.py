@@ -17,8 +17,10 @@ from pathlib import Path
 
 from daemon.mission.layout import Mission
 from daemon.mission.store.file_tree import FileEntry, FileTree
+from daemon.mission.transfer.azure_parts import AzureFolder, AzurePartUploads
 from daemon.mission.transfer.object_store import PART_BYTES, ObjectStore, StoredObject
-from daemon.mission.transfer.s3_parts import ERRORS, PartUploads, part_uploads
+from daemon.mission.transfer.part_sender import ERRORS, PartUploads
+from daemon.mission.transfer.s3_parts import S3PartUploads
 from daemon.mission.transfer.s3_uploads import UnfinishedUploads, list_unfinished
 from daemon.mission.transfer.store_products import is_processed
 from daemon.mission.transfer.store_verification import check_store_copy, read_store_manifest
@@ -45,6 +47,9 @@ from daemon.mission.verification.verification import VerifyReport, verify
 
 WORKERS = 4
 """Files in work at a time; each holds at most three parts in memory."""
+NO_ACCOUNT_KEY = (
+    "AZURE_STORAGE_ACCOUNT_KEY is not set. A file in work at a kill is sent again from its start."
+)
 
 
 @dataclass(frozen=True)
@@ -178,14 +183,9 @@ class _StoreCopying:
             },
         )
         self._target.replace_small(MANIFEST_FILE, note.to_bytes())
-        listing = list_unfinished(
-            self._target.url, lambda name: name in note.files or is_processed(name)
-        )
-        self._parts = part_uploads(
-            listing, {e.name for e in self._entries if e.nbytes > PART_BYTES}
-        )
+        problem = self._begin_uploads(set(note.files))
         done = self._copy_all(present)
-        uploads = self._parts.end() if self._parts else UnfinishedUploads(problem=listing.problem)
+        uploads = self._parts.end() if self._parts else UnfinishedUploads(problem=problem)
         for name in removed:
             self._target.delete(name)
         self._refuse_changed_source()
@@ -230,6 +230,22 @@ class _StoreCopying:
             self._target.url, 0, len(manifest.files), manifest.nbytes, self._verified, remove,
             manifest.sealed_utc,
         )  # fmt: skip
+
+    def _begin_uploads(self, own: set[str]) -> str:
+        """Look for uploads in parts of earlier runs; a sentence where that is not possible.
+
+        Args:
+            own: names of the files of the transfer.
+        """
+        url, large = self._target.url, {e.name for e in self._entries if e.nbytes > PART_BYTES}
+        if url.startswith("az://"):
+            folder = AzureFolder.of(url)
+            self._parts = AzurePartUploads(folder) if folder else None
+            return NO_ACCOUNT_KEY if large and folder is None else ""
+        listing = list_unfinished(url, lambda name: name in own or is_processed(name))
+        if listing.folder is not None:
+            self._parts = S3PartUploads(listing.folder, listing, large)
+        return listing.problem
 
     def _copy_all(self, present: dict[str, StoredObject]) -> dict[str, tuple[str, bool]]:
         pool = ThreadPoolExecutor(WORKERS)

@@ -1,11 +1,13 @@
 """A server of Google Cloud Storage's XML API, as far as a client of an object store asks for it.
 
 Objects of one bucket in memory: put, get with a range, head, delete, list, uploads in several
-parts, and the precondition that creates an object only once. Emulators on PyPI serve the JSON API
-alone, which obstore does not use.
+parts with lists of uploads and of their parts, and the precondition that creates an object only
+once. Emulators on PyPI serve the JSON API alone, which obstore does not use. Lists of uploads need
+the signature of an HMAC key, as a bucket that is not public does; its value is not compared.
 
-Source: Google Cloud Storage, XML API reference: Object, Multipart uploads, List objects (GET
-Bucket, `list-type=2`), and header `x-goog-if-generation-match`.
+Source: Google Cloud Storage, XML API reference: Object, Multipart uploads, List parts, List
+multipart uploads, List objects (GET Bucket, `list-type=2`), and header
+`x-goog-if-generation-match`.
 """
 
 from __future__ import annotations
@@ -36,6 +38,7 @@ class GcsBucket:
     name: str
     objects: dict[str, tuple[int, bytes]] = field(default_factory=dict)
     uploads: dict[str, dict[int, bytes]] = field(default_factory=dict)
+    upload_names: dict[str, str] = field(default_factory=dict)
     generation: int = 0
 
     def __post_init__(self) -> None:
@@ -64,11 +67,16 @@ class GcsBucket:
         body: bytes,
         environ: dict[str, Any],
     ) -> Answer:
+        if method == "GET" and "uploads" in query:
+            signature = environ.get("HTTP_AUTHORIZATION", "")
+            if not re.match(r"AWS4-HMAC-SHA256 Credential=GOOG1E/\d{8}/auto/s3/aws4_r", signature):
+                return _error("403 Forbidden", "AccessDenied")
+            return self._listed_uploads(query["prefix"][0])
         if method == "GET" and not name:
             return self._listed(query)
         if method == "POST" and "uploads" in query:
-            upload = str(len(self.uploads) + 1)
-            self.uploads[upload] = {}
+            upload = str(len(self.upload_names) + 1)
+            self.uploads[upload], self.upload_names[upload] = {}, name
             return _xml("InitiateMultipartUploadResult", f"<UploadId>{upload}</UploadId>")
         if "uploadId" in query:
             return self._part(method, name, query, body, environ)
@@ -98,6 +106,15 @@ class GcsBucket:
         )
         flag = f"<IsTruncated>{str(is_cut).lower()}</IsTruncated>"
         return _xml("ListBucketResult", f"<Prefix>{escape(prefix)}</Prefix>{flag}{token}{content}")
+
+    def _listed_uploads(self, prefix: str) -> Answer:
+        content = "".join(
+            f"<Upload><Key>{escape(self.upload_names[one])}</Key><UploadId>{one}</UploadId>"
+            "<Initiated>2026-11-21T10:15:00.000Z</Initiated></Upload>"
+            for one in self.uploads
+            if self.upload_names[one].startswith(prefix)
+        )
+        return _xml("ListMultipartUploadsResult", f"<IsTruncated>false</IsTruncated>{content}")
 
     def _put(self, name: str, body: bytes, environ: dict[str, Any]) -> Answer:
         expected = environ.get("HTTP_X_GOOG_IF_GENERATION_MATCH")
@@ -129,15 +146,22 @@ class GcsBucket:
         if method == "DELETE":
             del self.uploads[upload]
             return "204 No Content", {}, b""
+        if method == "GET":
+            content = "".join(
+                f"<Part><PartNumber>{number}</PartNumber><ETag>{escape(_tag(part))}</ETag>"
+                f"<Size>{len(part)}</Size></Part>"
+                for number, part in sorted(parts.items())
+            )
+            return _xml("ListPartsResult", f"<IsTruncated>false</IsTruncated>{content}")
         numbers = [int(n) for n in re.findall(rb"<PartNumber>(\d+)</PartNumber>", body)]
         if not numbers or set(numbers) - parts.keys():
             return _error("400 Bad Request", "InvalidPart")
         if environ.get("HTTP_X_GOOG_IF_GENERATION_MATCH") == "0" and name in self.objects:
             return _error("412 Precondition Failed", "PreconditionFailed")
-        content = b"".join(parts[number] for number in numbers)
+        joined = b"".join(parts[number] for number in numbers)
         del self.uploads[upload]
-        self._stored(name, content)
-        return _xml("CompleteMultipartUploadResult", f"<ETag>{_tag(content)}</ETag>")
+        self._stored(name, joined)
+        return _xml("CompleteMultipartUploadResult", f"<ETag>{_tag(joined)}</ETag>")
 
     def _got(self, method: str, name: str, environ: dict[str, Any]) -> Answer:
         generation, content = self.objects[name]

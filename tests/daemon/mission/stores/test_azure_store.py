@@ -22,6 +22,7 @@ import pytest
 
 from daemon.mission.transfer.object_store import ObjectStore, ObjectStoreError
 from tests.daemon.mission.stores.store_behaviour import (
+    check_a_killed_transfer_continues_at_its_part,
     check_a_list_has_all_its_pages_and_a_removed_object_is_gone,
     check_a_mission_is_copied_verified_and_processed,
     check_of_many_writers_of_a_key_one_commits,
@@ -102,6 +103,10 @@ def test_a_mission_is_copied_verified_and_processed_in_a_container(
     container: str, tmp_path: Path
 ) -> None:
     check_a_mission_is_copied_verified_and_processed(container, tmp_path)
+
+
+def test_a_killed_transfer_continues_at_its_block(container: str, tmp_path: Path) -> None:
+    check_a_killed_transfer_continues_at_its_part(container, tmp_path)
 
 
 def test_of_many_writers_of_a_key_one_commits_in_a_container(container: str) -> None:

@@ -13,10 +13,11 @@ from pathlib import Path
 import pytest
 
 from daemon.mission.layout import Mission
-from daemon.mission.transfer import object_store, s3_parts, s3_uploads, store_transfer
+from daemon.mission.transfer import object_store, part_sender, s3_uploads, store_transfer
 from daemon.mission.transfer.object_store import ObjectStore
-from daemon.mission.transfer.s3_parts import PARTS_IN_WORK
-from daemon.mission.transfer.s3_requests import S3Answer, S3Folder, S3RefusedError
+from daemon.mission.transfer.part_sender import PARTS_IN_WORK
+from daemon.mission.transfer.s3_requests import S3Folder
+from daemon.mission.transfer.store_requests import StoreAnswer, StoreRefusedError
 from daemon.mission.transfer.store_transfer import StoreTransferReport, transfer_to_store
 from daemon.mission.transfer.transfer_manifest import TransferError
 from tests.daemon.diverging_camera import ROOT
@@ -37,7 +38,7 @@ LAST_BYTES = 1_000_000
 
 @pytest.fixture(autouse=True)
 def small_parts(monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in (object_store, s3_parts, store_transfer):
+    for module in (object_store, part_sender, store_transfer):
         monkeypatch.setattr(module, "PART_BYTES", PART_BYTES)
 
 
@@ -81,8 +82,8 @@ def transferred(mission: Mission, url: str) -> StoreTransferReport:
 
 
 TRANSFER = f"""
-from daemon.mission.transfer import object_store, s3_parts, store_transfer
-for module in (object_store, s3_parts, store_transfer):
+from daemon.mission.transfer import object_store, part_sender, store_transfer
+for module in (object_store, part_sender, store_transfer):
     module.PART_BYTES = {PART_BYTES}
 from daemon.cli import app
 app()
@@ -178,9 +179,9 @@ def test_an_upload_that_cannot_be_completed_is_begun_again(
         if method == "POST" and query.get("uploadId") == upload:
             refused.append(upload)
             if answer == "NoSuchUpload":
-                raise S3RefusedError(404, answer)
+                raise StoreRefusedError(404, answer)
             text = b"<Error><Code>InternalError</Code></Error>" if answer[0] == "2" else b"<x"
-            return S3Answer(text, datetime.now(UTC))
+            return StoreAnswer(text, datetime.now(UTC))
         return real(self, method, name, query, body, **options)
 
     monkeypatch.setattr(S3Folder, "request", once)
@@ -206,8 +207,8 @@ def test_parts_are_listed_over_several_answers(large: Mission, store: Start) -> 
 def test_without_the_right_to_list_uploads_the_file_is_sent_all_the_same(
     large: Mission, store: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def refused(*_arguments: object, **_options: object) -> S3Answer:
-        raise S3RefusedError(403, "AccessDenied")
+    def refused(*_arguments: object, **_options: object) -> StoreAnswer:
+        raise StoreRefusedError(403, "AccessDenied")
 
     monkeypatch.setattr(S3Folder, "request", refused)
     report = transferred(large, store())

@@ -13,10 +13,11 @@ from typer.testing import CliRunner
 
 from daemon.cli import app
 from daemon.mission.layout import Mission
-from daemon.mission.transfer import s3_requests, s3_uploads
+from daemon.mission.transfer import s3_requests, s3_uploads, store_requests
 from daemon.mission.transfer.object_store import ObjectStore
-from daemon.mission.transfer.s3_requests import Credentials, S3Answer, S3Folder, signed_headers
+from daemon.mission.transfer.s3_requests import Credentials, S3Folder, signed_headers
 from daemon.mission.transfer.s3_uploads import abort_unfinished
+from daemon.mission.transfer.store_requests import StoreAnswer
 from daemon.mission.transfer.store_transfer import transfer_to_store
 from tests.daemon.mission.stores.faulty_s3 import BUCKET, Faults
 from tests.daemon.mission.stores.test_store_transfer import client
@@ -88,6 +89,7 @@ def test_the_age_is_by_the_clock_of_the_store(
 
     years_s = (datetime.now(UTC) - datetime(2010, 11, 10, tzinfo=UTC)).total_seconds()
     monkeypatch.setattr(s3_uploads, "AGE_MIN_S", years_s + 3600)
+    monkeypatch.setattr(store_requests, "datetime", Ahead)
     monkeypatch.setattr(s3_requests, "datetime", Ahead)
     assert abort_unfinished(f"{url}/{mission.id}", lambda _name: True).recent == ("x",)
 
@@ -116,7 +118,7 @@ def test_more_uploads_than_one_answer_holds_are_all_aborted(
         )
         text = "".join(uploads[after : after + 2]) + (marks if is_cut else "")
         content = f"<R><IsTruncated>{str(is_cut).lower()}</IsTruncated>{text}</R>".encode()
-        return S3Answer(content, answer.now)
+        return StoreAnswer(content, answer.now)
 
     monkeypatch.setattr(S3Folder, "request", two_at_a_time)
     assert len(abort_unfinished(url, lambda _name: True).aborted) == 5
@@ -187,7 +189,7 @@ def test_an_answer_that_is_no_list_of_uploads_aborts_nothing(
 ) -> None:
     url = store()
     begun("a")
-    content = S3Answer(answer, datetime.now(UTC))
+    content = StoreAnswer(answer, datetime.now(UTC))
     monkeypatch.setattr(S3Folder, "request", lambda *_: content)
     found = abort_unfinished(url, lambda _name: True)
     assert found.aborted == () and "could not be listed" in found.problem
@@ -232,7 +234,7 @@ def test_without_an_access_key_a_sentence_states_that_none_were_looked_for(
 ) -> None:
     monkeypatch.delenv("AWS_ACCESS_KEY_ID", raising=False)
     assert "were not looked for" in abort_unfinished("s3://b/m", lambda _name: True).problem
-    assert abort_unfinished("gs://b/m", lambda _name: True).sentence == ""
+    assert abort_unfinished("az://b/m", lambda _name: True).sentence == ""
 
 
 def test_a_key_is_never_sent_without_tls_unless_permitted(monkeypatch: pytest.MonkeyPatch) -> None:
