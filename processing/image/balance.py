@@ -18,7 +18,7 @@ from numba import prange
 from numpy.typing import NDArray
 
 from processing.image.compiled_kernel import compiled_kernel
-from processing.image.head_response import OverlapCells, overlap_cells
+from processing.image.head_response import SAMPLES_MAX, OverlapCells, overlap_cells
 from processing.image.lattice import OUTSIDE
 from processing.image.resampling import WEIGHT_STEP_PX
 
@@ -203,11 +203,11 @@ def balance_gains(names: Sequence[str], means: Array) -> Balance:
         low, high = np.percentile(light_a, (2.0, 98.0))
         span = float(high / low)
         pairs.append(PairBalance(names[a], names[b], median, float(sigma), count, span))
-        row, column = np.nonzero(common)
+        chosen = slice(None, None, max(1, count // SAMPLES_MAX))
+        row, column = np.divmod(np.flatnonzero(common)[chosen], common.shape[1])
         places = np.stack([column + both[1].start, row + both[0].start], axis=1)
-        cells.append(
-            overlap_cells(names[a], names[b], light_a, light_b, places / means.shape[:0:-1])
-        )
+        shares = places / (means.shape[2], means.shape[1])
+        cells.append(overlap_cells(names[a], names[b], light_a[chosen], light_b[chosen], shares))
         samples.append((a, b, light_a, light_b))
     logs = _log_gains(names, pairs)
     offsets = np.zeros(len(names))

@@ -111,14 +111,22 @@ def test_heads_that_change_otherwise_are_left_out() -> None:
     assert head_response([]) is None
 
 
-@pytest.mark.parametrize("count", [0, 5, 13, 100])
-def test_few_samples_make_few_cells(count: int) -> None:
+@pytest.mark.parametrize(("count", "cells"), [(0, 0), (5, 0), (13, 1), (100, 6), (1000, 30)])
+def test_few_samples_make_few_cells(count: int, cells: int) -> None:
     light = np.linspace(1000.0, 2000.0, count)
-    cells = overlap_cells("A", "B", light, light, np.random.default_rng(1).uniform(size=(count, 2)))
-    assert len(cells.light) == min(count // 12, 48)
-    assert np.allclose(cells.log_ratio, 0.0) and np.all(cells.sigma >= 0.004)
+    found = overlap_cells("A", "B", light, light, np.random.default_rng(1).uniform(size=(count, 2)))
+    assert len(found.light) == cells
+    assert np.allclose(found.log_ratio, 0.0) and np.all(found.sigma >= 0.004)
 
 
 def test_noise_widens_what_is_not_distinguished() -> None:
     quiet = response({}, contrast=0.1).offset_limit
     assert response({}, contrast=0.1, noise=600.0).offset_limit > 2.0 * quiet
+
+
+def test_what_no_response_explains_widens_it_too() -> None:
+    def waves(signal: Array, places: Array) -> Array:
+        return signal * (1.0 + 0.1 * np.sin(25.0 * places[:, 0]))
+
+    explained = response({}, contrast=0.1).offset_limit
+    assert response({"A": waves}, contrast=0.1).offset_limit > 2.0 * explained
