@@ -298,6 +298,7 @@ def shown_progress(
             parts = (
                 (counts.failed, "failed"),
                 (counts.lost_processes, "processes lost"),
+                (counts.memory_retries, "memory retries"),
                 (counts.store_retries, "store retries"),
             )
             note = ", ".join(f"{count} {name}" for count, name in parts if count)

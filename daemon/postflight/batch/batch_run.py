@@ -22,6 +22,7 @@ from daemon.postflight.batch.executor import (
     BatchTask,
     BatchWork,
     ExecutorEndedError,
+    LossKind,
     TaskDone,
     TaskFailed,
     TaskLost,
@@ -35,6 +36,7 @@ LOSSES_MAX: Final = 3
 so that an exposure next to it cannot be the cause."""
 OUT_OF_MEMORY_MAX: Final = 2
 """The same where memory was exhausted."""
+OUT_OF_MEMORY: Final = "out of memory: the process could not allocate it"
 STORE_RETRIES_S: Final = (1.0, 4.0, 16.0)
 """Delays before the attempts after a store did not answer."""
 CLAIM_RETRY_S: Final = 1.0
@@ -58,6 +60,7 @@ class BatchCounts:
     done: int = 0
     failed: int = 0
     lost_processes: int = 0
+    memory_retries: int = 0
     store_retries: int = 0
     claimed_elsewhere: int = 0
 
@@ -226,24 +229,34 @@ class _Run:
         if not lost.process or lost.process not in self._ended_processes:
             self._ended_processes.add(lost.process)
             self.outcome.counts.lost_processes += 1
-        self._losses[task.number, lost.kind] += 1
-        count = self._losses[task.number, lost.kind]
-        limit = OUT_OF_MEMORY_MAX if lost.kind == "out-of-memory" else LOSSES_MAX
+        self._take_attempt(task, lost.kind, lost.cause)
+
+    def _take_attempt(self, task: BatchTask, kind: LossKind, cause: str) -> None:
+        """An attempt that ended with its process or for memory: another one, or quarantine."""
+        self._losses[task.number, kind] += 1
+        count = self._losses[task.number, kind]
+        limit = OUT_OF_MEMORY_MAX if kind == "out-of-memory" else LOSSES_MAX
         if count >= limit:
             alone = ", the last time with no other exposure in work"
             cure = (
                 "give fewer --processes or a machine with more memory"
-                if lost.kind == "out-of-memory"
+                if kind == "out-of-memory"
                 else "repeat the command with --processes 0 to see its messages"
             )
-            self._fail(task, f"quarantined after {count} attempts: {lost.cause}{alone}; {cure}")
-        elif count == limit - 1:
+            self._fail(task, f"quarantined after {count} attempts: {cause}{alone}; {cure}")
+            return
+        self.outcome.counts.memory_retries += kind == "out-of-memory"
+        if count == limit - 1:
             self._last.append(task)
         else:
             self._waiting.appendleft(task)
 
     def _take_failure(self, task: BatchTask, failed: TaskFailed) -> None:
         error, number = failed.error, task.number
+        if isinstance(error, MemoryError):
+            detail = f" ({error})" if str(error) else ""
+            self._take_attempt(task, "out-of-memory", f"{OUT_OF_MEMORY}{detail}")
+            return
         if isinstance(error, ClaimedElsewhereError):
             self.outcome.counts.claimed_elsewhere += 1
             since_s = self._claimed_since_s.setdefault(number, time.monotonic())

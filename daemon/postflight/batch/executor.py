@@ -17,6 +17,9 @@ _PASSING_ERRNOS: Final = frozenset(
     {errno.ETIMEDOUT, errno.EAGAIN, errno.ESTALE, errno.EINTR, errno.EBUSY, errno.EREMOTEIO}
 )
 
+_OPENCV_NO_MEMORY: Final = -4
+"""cv2.Error.StsNoMem, as `code` of cv2.error."""
+
 
 class ExecutorEndedError(DaemonError):
     """An executor that cannot continue; the message states what to do.
@@ -34,6 +37,36 @@ def is_passing(error: Exception) -> bool:
     if isinstance(error, TimeoutError | ConnectionError):
         return True
     return isinstance(error, OSError) and error.errno in _PASSING_ERRNOS
+
+
+def is_out_of_memory(error: Exception) -> bool:
+    """Whether memory was exhausted: a statement of Python, the kernel, or OpenCV.
+
+    Args:
+        error: of a task; what it was raised from counts, too.
+    """
+    found: BaseException | None = error
+    while found is not None:
+        if isinstance(found, MemoryError):
+            return True
+        if isinstance(found, OSError) and found.errno == errno.ENOMEM:
+            return True
+        if type(found).__module__ == "cv2" and getattr(found, "code", None) == _OPENCV_NO_MEMORY:
+            return True
+        found = found.__cause__
+    return False
+
+
+def failure_of(number: int, error: Exception) -> TaskFailed:
+    """The outcome of a task that raised an error.
+
+    Args:
+        number: of the task.
+        error: that was raised; what exhausted memory becomes a MemoryError, which can be pickled.
+    """
+    if isinstance(error, MemoryError) or not is_out_of_memory(error):
+        return TaskFailed(number, error)
+    return TaskFailed(number, MemoryError(str(error)))
 
 
 @dataclass(frozen=True)

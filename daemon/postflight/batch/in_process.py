@@ -11,9 +11,8 @@ from daemon.postflight.batch.executor import (
     BatchTask,
     BatchWork,
     TaskDone,
-    TaskFailed,
-    TaskLost,
     TaskOutcome,
+    failure_of,
 )
 
 
@@ -79,8 +78,5 @@ class InProcessExecutor:
         while (task := self._tasks.get()) is not None:
             try:
                 self._outcomes.put(TaskDone(task.number, action(task)))
-            except MemoryError:  # the run tries it again alone
-                cause = "the process could not allocate memory"
-                self._outcomes.put(TaskLost(task.number, "out-of-memory", cause))
             except Exception as error:  # noqa: BLE001 - it is the outcome of this task
-                self._outcomes.put(TaskFailed(task.number, error))
+                self._outcomes.put(failure_of(task.number, error))

@@ -20,6 +20,7 @@ import time
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from multiprocessing.connection import Connection, wait
 from typing import Any, Final
 
@@ -34,6 +35,7 @@ from daemon.postflight.batch.executor import (
     TaskFailed,
     TaskLost,
     TaskOutcome,
+    failure_of,
     is_passing,
 )
 from daemon.postflight.batch.memory_kills import CAUSE, memory_kills
@@ -316,10 +318,9 @@ def outcome_of(action: Any, task: BatchTask) -> TaskOutcome:
     """The outcome of a task, with its error where it raised one."""
     try:
         return TaskDone(task.number, action(task))
-    except MemoryError:
-        return TaskLost(task.number, "out-of-memory", "the process could not allocate memory")
     except Exception as error:  # noqa: BLE001 - it is the outcome of this task
-        return TaskFailed(task.number, picklable(error))
+        failed = failure_of(task.number, error)
+        return replace(failed, error=picklable(failed.error))
 
 
 def picklable(error: Exception) -> Exception:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
 from collections.abc import Callable
@@ -24,6 +25,7 @@ from daemon.postflight.batch.executor import (
     TaskDone,
     TaskLost,
     TaskOutcome,
+    is_out_of_memory,
 )
 from daemon.postflight.batch.in_process import InProcessExecutor
 from daemon.postflight.batch.local_processes import LocalProcessExecutor
@@ -90,10 +92,11 @@ def test_killed_processes_cost_their_own_exposure_one_more_attempt(tmp_path: Pat
     assert (
         "the last time with no other exposure in work" in found[4] and "--processes 0" in found[4]
     )
-    assert "quarantined after 2 attempts: the process could not allocate memory" in found[6]
+    assert "quarantined after 2 attempts: out of memory: the process could not" in found[6]
     attempts = [attempts_of(tmp_path, number) for number in range(1, 13)]
     assert attempts == [1, 2, 3, 3, 2, 2, 2, 1, 1, 1, 1, 1]
-    assert outcome.counts.lost_processes == 1 + 2 + 3 + 1 + 2 + 1
+    assert outcome.counts.lost_processes == 1 + 2 + 3 + 1
+    assert outcome.counts.memory_retries == 1 + 1
 
 
 @pytest.mark.trust
@@ -101,10 +104,27 @@ def test_killed_processes_cost_their_own_exposure_one_more_attempt(tmp_path: Pat
 def test_what_finds_no_memory_next_to_another_exposure_is_computed_alone(
     kind: str, tmp_path: Path
 ) -> None:
-    outcome = ran(EXECUTORS[kind](), tmp_path, {2: "memory 1", 4: "memory 9"})
-    assert outcome.results == {1: 10, 2: 20, 3: 30, 5: 50, 6: 60}
-    assert "could not allocate memory, the last time with no other" in causes(outcome)[4]
-    assert [attempts_of(tmp_path, number) for number in (2, 4)] == [2, 2]
+    payloads = {2: "memory 1", 3: "chained 1", 4: "memory 9", 5: "chained 9"}
+    outcome = ran(EXECUTORS[kind](), tmp_path, payloads)
+    assert outcome.results == {1: 10, 2: 20, 3: 30, 6: 60}
+    alone = ", the last time with no other exposure in work; give fewer --processes"
+    found = causes(outcome)
+    memory = "quarantined after 2 attempts: out of memory: the process could not allocate it"
+    assert found[4].startswith(f"{memory}{alone}")
+    assert found[5].startswith(f"{memory} (SU00.tif cannot be read){alone}")
+    assert [attempts_of(tmp_path, number) for number in (2, 3, 4, 5)] == [2, 2, 2, 2]
+    assert (outcome.counts.lost_processes, outcome.counts.memory_retries) == (0, 4)
+
+
+def test_what_libraries_state_of_exhausted_memory_is_recognized() -> None:
+    import cv2
+
+    opencv = cv2.error("Failed to allocate 5 bytes")
+    opencv.code = cv2.Error.StsNoMem  # type: ignore[attr-defined]
+    assert is_out_of_memory(opencv) and is_out_of_memory(OSError(errno.ENOMEM, "x"))
+    other = cv2.error("Assertion failed")
+    other.code = cv2.Error.StsAssert  # type: ignore[attr-defined]
+    assert not is_out_of_memory(other) and not is_out_of_memory(OSError(errno.ENOSPC, "x"))
 
 
 class OneProcess:

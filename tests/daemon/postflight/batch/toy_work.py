@@ -56,6 +56,8 @@ def _happen(what: str) -> None:
         _fill_a_group()
     elif what == "memory":
         raise MemoryError
+    elif what == "chained":
+        raise ValueError("SU00.tif cannot be read") from MemoryError()
     elif what == "full":
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     elif what == "store":
