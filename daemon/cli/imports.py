@@ -181,7 +181,7 @@ def dbat(
 
 BLOCK_HELP = """Import cameras, orientations and points of another program for `syntopic adjust`.
 
-Programs: colmap (folder of a text model), opensfm (reconstruction.json and tracks.csv), metashape
+Programs: colmap (folder of a model), opensfm (reconstruction.json and tracks.csv), metashape
 (cameras.xml), bundler (bundle.out), bal (problem file), bingo, patb and pix4d (folder with
 measurements, orientation and cameras.txt), inpho (project). Distortion is converted to the ten
 parameters by fit; above 0.02 px Brown's model is kept, or the measurements are corrected. Without

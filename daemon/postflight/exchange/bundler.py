@@ -178,10 +178,14 @@ def _text(path: Path) -> str:
 
 
 def _numbers(path: Path, text: str) -> Iterator[float]:
-    for word in text.split():
+    words = text.split()
+    for at, word in enumerate(words, 1):
         try:
             value = float(word)
         except ValueError as error:
+            if at == len(words) and not text[-1].isspace():
+                # A number that was cut within, such as "-" or "1e".
+                break
             raise BlockError(f"{path}: {word!r} where a number is needed") from error
         if not np.isfinite(value):
             raise BlockError(f"{path}: {word!r} where a finite number is needed")

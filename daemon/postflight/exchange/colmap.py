@@ -1,8 +1,8 @@
-"""COLMAP's text model with rigs and frames, and its way back.
+"""COLMAP's model with rigs and frames, written as text, read as text or binary.
 
 Files of COLMAP 3.12 and later: `cameras.txt`, `rigs.txt`, `frames.txt`, `images.txt`,
-`points3D.txt`. Its pixel centres are at 0.5, its cameras look along +z with y down, and it stores
-camera_from_world.
+`points3D.txt`, or the same with `.bin` (`colmap_records`). Its pixel centres are at 0.5, its
+cameras look along +z with y down, and it stores camera_from_world.
 
 Source: COLMAP documentation, "Output Format" and "Rig Support"; its `src/colmap/sensor/models.h`.
 """
@@ -16,7 +16,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.mission.foreign_files import ForeignFileError, read_regular_file
 from daemon.postflight.exchange.block import (
     VISION_FROM_CAMERA,
     Block,
@@ -27,6 +26,7 @@ from daemon.postflight.exchange.block import (
     BlockRig,
     fitted,
 )
+from daemon.postflight.exchange.colmap_records import has_part, is_binary, records
 from daemon.postflight.exchange.completeness import (
     refuse_announced,
     refuse_other_images,
@@ -40,11 +40,14 @@ Array = NDArray[np.float64]
 VERSION = "3.12"
 """The oldest version that reads rigs and frames."""
 FORMS: tuple[Form, ...] = ("pinhole", "opencv", "full_opencv")
-MODEL_MAX_BYTES = 2_000_000_000
 CENTRE_PX = 0.5
 """Coordinates of the first pixel's centre."""
 _QUATERNION_WITHIN = 1e-3
 """Largest difference of a quaternion's length from 1."""
+_POSE_WITHIN = 1e-6
+"""Largest difference of an image's pose from that of its frame and rig: in elements of the matrix,
+and of its shift as a part of it."""
+_CAMERA = "CAMERA"
 
 _NAMES: Mapping[str, tuple[str, ...]] = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
@@ -218,20 +221,19 @@ def _line(*values: object) -> str:
 
 
 def read_colmap(folder: Path) -> Block:
-    """Read a text model; with rigs the poses of frames hold, those of images without.
+    """Read a text or binary model; with rigs the poses of frames hold, those of images without.
 
     Raises:
         BlockError: a file is missing or has a line that is not understood; it names the line.
     """
-    _refuse_binary(folder)
     cameras: dict[int, int] = {}
     found: list[BlockCamera] = []
-    for place, words in _records(folder / "cameras.txt"):
+    for place, words in records(folder, "cameras"):
         with _reading(place):
             _refuse_repeated(place, "camera", int(words[0]), cameras)
             cameras[int(words[0])] = len(found)
             found.append(_camera(place, words))
-    rows = list(_records(folder / "images.txt", keeps_empty=True))
+    rows = list(records(folder, "images", keeps_empty=True))
     if len(rows) % 2:
         # An image without measurements at the end, its line of measurements lost by an editor.
         place, words = rows[-1]
@@ -249,7 +251,9 @@ def read_colmap(folder: Path) -> Block:
             if len(words) < 10:
                 raise BlockError(f"{place}: image {number} has no name; export the model again")
             _refuse_repeated(place, "image", number, index)
-            frame, own = posed.get(number, (number, _pose_of(place, words[1:8])))
+            stated = _pose_of(place, words[1:8])
+            frame, own = posed.get(number, (number, stated))
+            _refuse_other_pose(place, number, own, stated)
             rotation, centre = camera_pose(*own)
             index[number] = len(images)
             name = " ".join(words[9:])
@@ -262,13 +266,17 @@ def read_colmap(folder: Path) -> Block:
                     seen.append((index[number], int(point), column, row))
                     listed.append((int(point), number, at))
     if not images:
-        raise BlockError(f"{folder}: images.txt names no image; there is nothing to import")
-    refuse_announced(folder / "cameras.txt", {"cameras": len(found)})
-    refuse_announced(folder / "images.txt", {"images": len(images)}, len(seen))
+        raise BlockError(f"{folder}: the model names no image; there is nothing to import")
+    if not is_binary(folder):
+        refuse_announced(folder / "cameras.txt", {"cameras": len(found)})
+        refuse_announced(folder / "images.txt", {"images": len(images)}, len(seen))
+    notes = ["COLMAP's files state neither the frame nor the scale of their coordinates"]
+    if not is_binary(folder) and any(folder.glob("*.bin")):
+        notes.append("the text model is read, and not the binary model that is there, too")
     refuse_other_images(folder, "frames.txt", set(posed), set(index))
     return Block(
         folder.name, tuple(found), tuple(images), points=_points(folder, seen, listed),
-        notes=("COLMAP's files state neither the frame nor the scale of their coordinates",),
+        notes=tuple(notes),
         is_metric=False,
     )  # fmt: skip
 
@@ -290,17 +298,6 @@ class _reading:  # noqa: N801
                 f"{self.place}: not a line of COLMAP's text format ({error}); export the model "
                 "with `colmap model_converter --output_type TXT`"
             ) from error
-
-
-def _refuse_binary(folder: Path) -> None:
-    """Refuse a folder with a binary model and no text model."""
-    binary = [path.name for path in sorted(folder.glob("*.bin"))] if folder.is_dir() else []
-    if binary and not (folder / "cameras.txt").exists():
-        raise BlockError(
-            f"{folder}: holds a binary model ({', '.join(binary[:5])}), and text is read; convert "
-            f"it with `colmap model_converter --input_path {folder} --output_path TEXT_FOLDER "
-            "--output_type TXT`"
-        )
 
 
 def _refuse_repeated(place: str, what: str, number: int, known: Mapping[int, int]) -> None:
@@ -332,6 +329,19 @@ def _pose_of(place: str, words: Sequence[str]) -> tuple[Array, Array]:
     return rotations_from_quaternions(values[:4]), np.array(values[4:])
 
 
+def _refuse_other_pose(
+    place: str, number: int, own: tuple[Array, Array], stated: tuple[Array, Array]
+) -> None:
+    """Refuse an image whose pose is not the one of its frame and its place in the rig."""
+    turn = float(np.abs(own[0] - stated[0]).max())
+    shift = float(np.abs(own[1] - stated[1]).max())
+    if turn > _POSE_WITHIN or shift > _POSE_WITHIN * (1.0 + float(np.abs(stated[1]).max())):
+        raise BlockError(
+            f"{place}: the pose of image {number} is another one than that of its frame and rig; "
+            "the files are of different models: copy all files of the model again"
+        )
+
+
 def _camera(place: str, words: Sequence[str]) -> BlockCamera:
     name = words[1]
     if name not in _NAMES:
@@ -350,27 +360,33 @@ def _camera(place: str, words: Sequence[str]) -> BlockCamera:
 
 def _frame_poses(folder: Path) -> dict[int, tuple[int, tuple[Array, Array]]]:
     """Frame number and camera_from_world of every image, from rigs and frames; empty without."""
-    if not ((folder / "rigs.txt").exists() and (folder / "frames.txt").exists()):
+    if not (has_part(folder, "rigs") and has_part(folder, "frames")):
         return {}
-    sensors: dict[tuple[int, int], tuple[Array, Array]] = {}
-    for place, words in _records(folder / "rigs.txt"):
+    sensors: dict[tuple[int, str, int], tuple[Array, Array]] = {}
+    for place, words in records(folder, "rigs"):
         with _reading(place):
             rig, rest = int(words[0]), words[4:]
-            sensors[rig, int(words[3])] = (np.eye(3), np.zeros(3))
+            sensors[rig, words[2], int(words[3])] = (np.eye(3), np.zeros(3))
+            count = 1
             while rest:
                 has_pose = int(rest[2])
                 if has_pose:
-                    sensors[rig, int(rest[1])] = _pose_of(place, rest[3:10])
+                    sensors[rig, rest[0], int(rest[1])] = _pose_of(place, rest[3:10])
                 rest = rest[10 if has_pose else 3 :]
+                count += 1
+            if count != int(words[1]):
+                raise BlockError(f"{place}: {words[1]} sensors are announced, {count} are listed")
     posed = {}
-    for place, words in _records(folder / "frames.txt"):
+    for place, words in records(folder, "frames"):
         with _reading(place):
             turn, shift = _pose_of(place, words[2:9])
             data = words[10:]
             if len(data) != 3 * int(words[9]):
                 raise BlockError(f"{place}: {words[9]} images are announced, others are listed")
-            for sensor, image in zip(data[1::3], data[2::3], strict=True):
-                key = (int(words[1]), int(sensor))
+            for kind, sensor, image in zip(data[::3], data[1::3], data[2::3], strict=True):
+                if kind != _CAMERA:
+                    continue
+                key = (int(words[1]), kind, int(sensor))
                 if key not in sensors:
                     raise BlockError(
                         f"{place}: rig {words[1]} has no pose of camera {sensor}; the model "
@@ -391,14 +407,15 @@ def _points(
     at: dict[int, int] = {}
     xyz: list[list[float]] = []
     tracks: list[tuple[int, int, int]] = []
-    for place, words in _records(folder / "points3D.txt"):
+    for place, words in records(folder, "points3D"):
         with _reading(place):
             _refuse_repeated(place, "point", int(words[0]), at)
             at[int(words[0])] = len(xyz)
             xyz.append(_finite(place, words[1:4], 3))
             for image, index in zip(words[8::2], words[9::2], strict=True):
                 tracks.append((int(words[0]), int(image), int(index)))
-    refuse_announced(folder / "points3D.txt", {"points": len(xyz)}, len(seen))
+    if not is_binary(folder):
+        refuse_announced(folder / "points3D.txt", {"points": len(xyz)}, len(seen))
     unknown = next((point for _, point, *_ in seen if point not in at), None)
     if unknown is not None:
         raise BlockError(
@@ -412,14 +429,3 @@ def _points(
         np.array([at[point] for _, point, *_ in seen], dtype=np.int64),
         np.array([(x - CENTRE_PX, y - CENTRE_PX) for *_, x, y in seen]).reshape(-1, 2),
     )
-
-
-def _records(path: Path, *, keeps_empty: bool = False) -> Iterator[tuple[str, list[str]]]:
-    """Place and words of every line that is no comment."""
-    try:
-        text = read_regular_file(path, MODEL_MAX_BYTES).decode("utf-8-sig")
-    except (ForeignFileError, UnicodeDecodeError) as error:
-        raise BlockError(f"{path}: {error}; a COLMAP text model has this file") from error
-    for number, line in enumerate(text.splitlines(), 1):
-        if not line.startswith("#") and (keeps_empty or line.strip()):
-            yield f"{path}, line {number}", line.split()

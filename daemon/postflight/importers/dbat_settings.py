@@ -103,8 +103,8 @@ def read_settings(script: str, root: ElementTree.Element) -> DbatSettings:
                 problems.append(f"{script}: operation <{child.tag}> is not read")
     if not is_stated:
         problems.append(
-            f"{script}: no <set_bundle_estimate_params>, so that it does not state which parameters "
-            "are estimated; add it, with <all> of io, eo and op"
+            f"{script}: no <set_bundle_estimate_params>, so that it does not state which "
+            "parameters are estimated; add it, with <all> of io, eo and op"
         )
     if problems:
         raise ProjectError(problems)

@@ -101,8 +101,8 @@ def test_stitched_products_of_one_export_are_no_bands_of_one_rig(stitched) -> No
 def test_the_command_names_the_folders_of_the_products(stitched) -> None:
     words = ["export", "pictures", str(stitched.path), "--as", "jpeg"]
     done = RUN.invoke(app, [*words, "--trajectory", str(stitched.trajectory)])
-    said = " ".join(done.output.split())
-    assert "Products have a folder each: pan, rgbn. Give a program one of them" in said
+    output = " ".join(done.output.split())
+    assert "Products have a folder each: pan, rgbn. Give a program one of them" in output
 
 
 def raw_copies(flown: FlownBlock, program: str, *options: str) -> dict[str, dict]:
