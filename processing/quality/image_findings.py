@@ -133,31 +133,27 @@ def _defect_line(line: DefectLineFigures) -> list[Finding]:
 
 def _response(response: ResponseFigures) -> list[Finding]:
     """A PAN head whose signal against its neighbours depends on the light or on the place."""
-    if response.response_sensor is None:
+    head, offset_dn = response.response_sensor, response.response_offset_dn
+    if head is None:
         return []
-    heads = response.response_sensor
-    if others := ", ".join(response.response_alternatives):
-        heads = f"{heads}, or of {others} (the overlaps cannot show which),"
-    offset_dn, slope = response.response_offset_dn, response.response_slope
-    value: float | None
-    if offset_dn is not None:
-        value, what, cure = (
-            offset_dn,
-            f"differs by {offset_dn:+.0f} DN in the dark, or by another tone curve: its dark "
-            "signal was not subtracted, or its lookup table is another",
-            "Check black level, gain and lookup table of the head, and its calibration.",
-        )
-    else:
-        value, what, cure = (
-            slope,
-            f"changes by {slope or 0.0:+.0%} from one side of its frame to the other along the "
-            f"{response.response_axis} of the image",
-            "Look for dew or shade on lens and filter; check aperture and calibration of the head.",
-        )
-    sentence = (
-        f"The signal of {heads} against its neighbours {what}. Radiometry of this frame is wrong. "
-        f"{cure}"
+    slope = response.response_slope or 0.0
+    value, sentence = (
+        slope,
+        f"The signal of {head} against its neighbours changes by {slope:+.0%} from one side of its "
+        f"frame to the other, along the {response.response_axis} of the image. Radiometry of this "
+        "frame is wrong. Look for dew or shade on lens and filter; check aperture and calibration "
+        "of the head.",
     )
+    if offset_dn is not None:
+        value, sentence = (
+            offset_dn,
+            f"The signal of {head} against its neighbours differs by {offset_dn:+.0f} DN in the "
+            "dark: its dark signal was not subtracted, or its tone curve is another. Radiometry of "
+            "this frame is wrong. Check black level, gain and lookup table of the head, and its "
+            "calibration.",
+        )
+    if others := ", ".join(response.response_alternatives):
+        sentence += f" Or it is {others}: the overlaps cannot show which head is wrong."
     return [Finding(Flag.FRAME_CORRUPT, Verdict.USABLE, sentence, value)]
 
 

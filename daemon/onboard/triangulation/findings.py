@@ -388,6 +388,16 @@ def _heights(check: HeightModelCheck | None) -> list[TriangulationFinding]:
                 "of the whole block ([plan] elevation).",
             )
         )
+    if check.arrangement:
+        return [
+            *found,
+            TriangulationFinding(
+                "HEIGHT_MODEL_CONTRADICTED",
+                f"Heights of tie points scatter by {check.scatter_m:.1f} m about the height model, "
+                f"and by {check.arranged_m:.1f} m as if {check.arrangement}. Correct the grid, or "
+                "give another height model ([plan] elevation).",
+            ),
+        ]
     if not check.is_contradicted:
         if check.share_off >= GROUND_CHANGED_SHARE:
             found.append(

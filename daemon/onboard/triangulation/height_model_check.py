@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
@@ -14,6 +14,7 @@ from daemon.configuration.model import PlanSection
 from daemon.orientation.georeference import Georeference
 from daemon.orientation.local_frame import LocalFrame
 from daemon.planning.relief import TerrainRelief, relief_of
+from processing.geometry.terrain_rays import HeightModel
 
 Array = NDArray[np.float64]
 
@@ -28,6 +29,22 @@ HEIGHT_UNITS: Final = {
 }
 """Units by the factor of their numbers to those in metres."""
 HEIGHT_UNIT_TOLERANCE: Final = 0.02
+ARRANGEMENTS: Final[Mapping[str, Callable[[Array, Array], tuple[Array, Array]]]] = {
+    "its rows were in reverse order": lambda u, v: (u, 1.0 - v),
+    "its columns were in reverse order": lambda u, v: (1.0 - u, v),
+    "it were turned by 180 degrees": lambda u, v: (1.0 - u, 1.0 - v),
+    "its rows and columns were exchanged": lambda u, v: (v, u),
+    "it were turned by 90 degrees to the left": lambda u, v: (v, 1.0 - u),
+    "it were turned by 90 degrees to the right": lambda u, v: (1.0 - v, u),
+    "its rows and columns were exchanged and reversed": lambda u, v: (1.0 - v, 1.0 - u),
+}
+"""What may have happened to the grid of a model: where the height of a place is in it, as shares of
+its columns and rows."""
+ARRANGEMENT_SHARE: Final = 0.4
+"""Another arrangement explains the scatter of the differences where this is left of it."""
+ARRANGEMENT_MIN_M: Final = 2.0
+"""A smaller scatter may be of trees and buildings."""
+ARRANGEMENT_MIN_POINTS: Final = 30
 
 
 @dataclass(frozen=True)
@@ -35,7 +52,9 @@ class HeightModelCheck:
     """Tie points against the configured height model: median difference and its standard deviation
     in m; `share_off` of the points differ from the median by more than the limit of a wrong model;
     `problem` where the model cannot be used. `uncovered` is the share of points where the model has
-    no height; `factor` is the median of its heights over those of points."""
+    no height; `factor` is the median of its heights over those of points. `scatter_m` is the
+    standard deviation of a difference by its median, and `arranged_m` with the grid of the model as
+    `arrangement` states, one of `ARRANGEMENTS`, where that explains the differences."""
 
     difference_m: float | None = None
     sigma_m: float | None = None
@@ -43,6 +62,9 @@ class HeightModelCheck:
     share_off: float = 0.0
     uncovered: float = 0.0
     factor: float | None = None
+    scatter_m: float = 0.0
+    arrangement: str = ""
+    arranged_m: float = 0.0
 
     @property
     def is_contradicted(self) -> bool:
@@ -86,16 +108,19 @@ def check_heights(
     relief: TerrainRelief, frame: LocalFrame, xyz_m: Array, sigma_m: Array
 ) -> HeightModelCheck | None:
     """Compare tie points (n, 3) with their standard deviations (n, 3); None without points."""
-    return compare_heights(relief.model.at, relief.system, frame.to_geodetic(xyz_m), sigma_m[:, 2])
+    return compare_heights(relief.model, relief.system, frame.to_geodetic(xyz_m), sigma_m[:, 2])
 
 
 def compare_heights(
-    heights_at: Callable[[Array], Array], system: Georeference, geodetic: Array, sigma_m: Array
+    surface: HeightModel | Callable[[Array], Array],
+    system: Georeference,
+    geodetic: Array,
+    sigma_m: Array,
 ) -> HeightModelCheck | None:
     """Compare points with a height model; None without points.
 
     Args:
-        heights_at: heights of the model, m, at places (n, 2) in the system; NaN where unknown.
+        surface: the model, or heights, m, at places (n, 2) in the system; NaN where unknown.
         system: of the model.
         geodetic: latitude, longitude, deg, and height above the ellipsoid, m, of points (n, 3).
         sigma_m: standard deviations of their heights, (n,).
@@ -103,23 +128,57 @@ def compare_heights(
     if not len(geodetic):
         return None
     step = max(1, len(geodetic) // _HEIGHT_SAMPLES)
-    points, model = [], []
-    for latitude, longitude, height in geodetic[::step]:
-        place = system.place(float(latitude), float(longitude), float(height))
-        points.append(place.height_m)
-        model.append(float(heights_at(np.array([[place.east_m, place.north_m]]))[0]))
+    places = [system.place(*map(float, point)) for point in geodetic[::step]]
+    places_m = np.array([(place.east_m, place.north_m) for place in places])
+    points = np.array([place.height_m for place in places])
+    model = surface.at(places_m) if isinstance(surface, HeightModel) else surface(places_m)
     is_known = np.isfinite(model)
     if not is_known.any():
         return HeightModelCheck(problem="it does not cover the block", uncovered=1.0)
-    known, found = np.array(points)[is_known], np.array(model)[is_known]
+    known, found = points[is_known], model[is_known]
     difference = known - found
     median, sigma = float(np.median(difference)), float(np.median(sigma_m))
     off = np.abs(difference - median) > height_limit_m(sigma)
     is_high = np.abs(known) > height_limit_m(sigma)
+    scatter_m = _scatter_m(difference)
+    arranged_m, arrangement = scatter_m, ""
+    if isinstance(surface, HeightModel) and scatter_m > max(
+        ARRANGEMENT_MIN_M, HEIGHT_MODEL_SIGMAS * sigma
+    ):
+        arranged_m, arrangement = _arrangement(surface, places_m, points, scatter_m)
     return HeightModelCheck(
         median,
         sigma,
         share_off=float(off.mean()),
         uncovered=float(1.0 - is_known.mean()),
         factor=float(np.median(found[is_high] / known[is_high])) if is_high.any() else None,
+        scatter_m=scatter_m,
+        arrangement=arrangement,
+        arranged_m=arranged_m,
     )
+
+
+def _scatter_m(differences: Array) -> float:
+    return 1.4826 * float(np.median(np.abs(differences - np.median(differences))))
+
+
+def _arrangement(
+    model: HeightModel, places_m: Array, points: Array, scatter_m: float
+) -> tuple[float, str]:
+    """The scatter with the arrangement of the grid that explains the heights, and its name."""
+    rows, columns = model.height_m.shape
+    steps = np.array([model.step_x_m, model.step_y_m])
+    extent = steps * (columns - 1, rows - 1)
+    first = np.array([model.x_m, model.y_m])
+    shares = (places_m - first) / extent
+    scatters = {}
+    for name, arranged in ARRANGEMENTS.items():
+        at = np.stack(arranged(shares[:, 0], shares[:, 1]), axis=1) * extent + first
+        difference = points - model.at(at)
+        difference = difference[np.isfinite(difference)]
+        if len(difference) >= ARRANGEMENT_MIN_POINTS:
+            scatters[name] = _scatter_m(difference)
+    best = min(scatters, key=lambda name: scatters[name], default="")
+    if not best or scatters[best] > ARRANGEMENT_SHARE * scatter_m:
+        return scatter_m, ""
+    return scatters[best], best

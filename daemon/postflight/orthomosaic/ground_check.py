@@ -95,7 +95,7 @@ def check_ground(
         )
     if points is not None:
         heights = compare_heights(
-            _heights_at(surface), georeference, points.geodetic, points.sigma_m
+            _heights_of(surface), georeference, points.geodetic, points.sigma_m
         )
     if not isinstance(surface, HeightModel):
         found += _of_plane(heights, points)
@@ -117,9 +117,9 @@ def check_ground(
     return GroundCheck(tuple(found), heights, uncovered, unseen)
 
 
-def _heights_at(surface: HeightModel | float) -> Any:
+def _heights_of(surface: HeightModel | float) -> Any:
     if isinstance(surface, HeightModel):
-        return surface.at
+        return surface
     return lambda places: np.full(len(places), surface)
 
 
@@ -149,6 +149,15 @@ def _of_model(
     if check is None or check.difference_m is None:
         return []
     share = f"{100.0 * check.share_off:.0f} %"
+    if check.arrangement:
+        return [
+            TriangulationFinding(
+                "HEIGHT_MODEL_CONTRADICTED",
+                f"Heights of tie points scatter by {check.scatter_m:.1f} m about the height model, "
+                f"and by {check.arranged_m:.1f} m as if {check.arrangement}. Correct the grid, or "
+                "give another model with --elevation.",
+            )
+        ]
     if not check.is_contradicted:
         if check.share_off < GROUND_CHANGED_SHARE:
             return _of_difference(check)

@@ -27,6 +27,7 @@ from daemon.onboard.triangulation.mission_triangulation import MissionTriangulat
 from daemon.orientation.exterior_orientation import sealed_exposures
 from daemon.orientation.local_frame import LocalFrame
 from processing.geometry.rotation import rotations_from_vectors
+from processing.geometry.terrain_rays import HeightModel
 from processing.pipelines.live_triangulation import MeasuredImage
 from tests.daemon.flown_block import read_record, write_record
 from tests.daemon.onboard.conftest import EACH, LINES
@@ -177,7 +178,7 @@ def _tied() -> BlockTies:
     return _ties(ties=(40,) * 4, own_line=((40, 30),) * 4)
 
 
-def _against(height_m: np.ndarray, heights_at) -> HeightModelCheck:
+def _against(height_m: np.ndarray, heights_at, at_m=None) -> HeightModelCheck:
     frame = LocalFrame(47.0, 15.0)
     relief = SimpleNamespace(
         system=SimpleNamespace(
@@ -185,10 +186,10 @@ def _against(height_m: np.ndarray, heights_at) -> HeightModelCheck:
                 east_m=longitude, north_m=latitude, height_m=height
             )
         ),
-        model=SimpleNamespace(at=heights_at),
+        model=heights_at,
     )
     count = len(height_m)
-    xyz = np.column_stack([np.zeros(count), np.zeros(count), height_m])
+    xyz = np.column_stack([np.zeros((count, 2)) if at_m is None else at_m, height_m])
     return check_heights(relief, frame, xyz, np.full((count, 3), 0.3))
 
 
@@ -224,6 +225,49 @@ def test_a_height_model_in_another_unit_is_named(unit: tuple[float, str]) -> Non
     assert message is not None and message["code"].endswith("height_unit")
 
 
+@pytest.mark.parametrize(
+    ("arranged", "sentence"),
+    [
+        (lambda z: z[::-1], "its rows were in reverse order"),
+        (lambda z: z[:, ::-1], "its columns were in reverse order"),
+        (lambda z: z[::-1, ::-1], "turned by 180 degrees"),
+        (lambda z: z.T, "its rows and columns were exchanged"),
+        (lambda z: np.rot90(z, 1), "turned by 90 degrees to the left"),
+        (lambda z: np.rot90(z, -1), "turned by 90 degrees to the right"),
+        (lambda z: z[::-1, ::-1].T, "exchanged and reversed"),
+    ],
+)
+def test_a_height_model_whose_grid_is_arranged_in_another_way_is_named(arranged, sentence) -> None:
+    """Some have nearly the median height of the ground, and differ by no limit in the median."""
+    random = np.random.default_rng(3)
+    x, y = np.meshgrid(np.linspace(-1.0, 1.0, 61), np.linspace(1.0, -1.0, 61))
+    ground = 300.0 + 12.0 * np.sin(3.0 * x) + 9.0 * np.cos(2.0 * y + x) + 5.0 * x * y
+    # 500 m and more to each side of the frame's origin, in the degrees that the system returns.
+    half = 0.007
+    places = random.uniform(-500.0, 500.0, (200, 2))
+    frame = LocalFrame(47.0, 15.0)
+    first = frame.to_geodetic(np.column_stack([places, np.full(200, 300.0)]))
+
+    def model(heights: np.ndarray) -> HeightModel:
+        step = 2.0 * half / 60.0
+        return HeightModel(heights, 15.0 - half, 47.0 + half, step, -step)
+
+    points = model(ground).at(first[:, [1, 0]]) + random.normal(0.0, 0.4, 200)
+    assert np.isfinite(points).all()
+    right = _against(points, model(ground), places)
+    assert right.arrangement == "" and right.scatter_m < 1.0
+    check = _against(points, model(arranged(ground)), places)
+    found = _found(_tied(), check)["HEIGHT_MODEL_CONTRADICTED"]
+    assert sentence in found and check.arranged_m < 1.0 < check.scatter_m
+    message = message_of(found)
+    assert message is not None and message["code"].endswith("height_arrangement")
+    # Ground without relief fits however the model is arranged.
+    assert _against(np.full(200, 300.0), model(np.full_like(ground, 300.0)), places).scatter_m < 0.1
+    # A model that fits in no arrangement is of other ground.
+    other = _against(points, model(300.0 + random.normal(0.0, 20.0, ground.shape)), places)
+    assert other.arrangement == ""
+
+
 def test_tie_points_without_a_height_in_the_model_are_counted() -> None:
     half = np.arange(200) % 2 == 0
     heights = iter(np.where(half, np.nan, 300.0))
@@ -235,7 +279,10 @@ def test_tie_points_without_a_height_in_the_model_are_counted() -> None:
     message = message_of(found["HEIGHT_MODEL_INCOMPLETE"])
     assert message is not None and message["code"].endswith("height_incomplete")
     few = iter(np.where(np.arange(200) < 3, np.nan, 300.0))
-    assert _found(_tied(), _against(np.full(200, 300.2), lambda en: np.array([next(few)]))) == {}
+    assert (
+        _found(_tied(), _against(np.full(200, 300.2), lambda en: np.array([next(few) for _ in en])))
+        == {}
+    )
     assert "HEIGHT_MODEL_FAILED" in _found(
         _tied(), _against(np.full(200, 300.2), lambda en: np.full(len(en), np.nan))
     )

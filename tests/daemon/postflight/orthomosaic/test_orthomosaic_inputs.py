@@ -104,6 +104,21 @@ def test_a_wrong_model_is_named_with_its_likely_cause(rolling: Rolling, change, 
     assert sum(w in sentence(check) for w in ("geoid", "in feet", "in kilo", "other amounts")) <= 1
 
 
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        (lambda h: h[::-1], "its rows were in reverse order"),
+        (lambda h: h.T, "its rows and columns were exchanged"),
+    ],
+)
+def test_a_model_whose_grid_is_arranged_in_another_way_is_named(
+    rolling: Rolling, change, word
+) -> None:
+    check = rolling.check(rolling.model(change))
+    assert names(check) == ["HEIGHT_MODEL_CONTRADICTED"] and check.is_wrong
+    assert word in sentence(check)
+
+
 def test_a_shifted_model_and_one_without_canopy_are_distinguished(rolling: Rolling) -> None:
     assert names(rolling.check(rolling.model(shift_m=200.0))) == ["GROUND_CHANGED"]
     small = rolling.check(rolling.model(lambda h: h - 2.0))
