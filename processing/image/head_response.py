@@ -33,7 +33,7 @@ _LEVELS: Final = 5
 _MIN_SAMPLES: Final = 12
 """Of a cell."""
 _CELL_MAX: Final = 48
-"""Samples of a cell: more would cost time and tell nothing, as parallax remains."""
+"""Samples of a cell: more would cost time and add nothing, as parallax remains."""
 SAMPLES_MAX: Final = _PARTS * _LEVELS * _CELL_MAX
 """Of an overlap."""
 _CELL_SIGMA: Final = 0.004
