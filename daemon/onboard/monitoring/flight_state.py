@@ -22,6 +22,9 @@ from daemon.onboard.flight.phases import Phase
 from daemon.onboard.monitoring.finite_values import finite, is_place, places_or_none
 from daemon.onboard.monitoring.live_map_state import LiveMapState
 from daemon.onboard.monitoring.previews import Preview
+from processing.quality.figures import QualityFigures
+from processing.quality.figures.circumstances import DcFigures, EstimatedDcFigures
+from processing.quality.figures.stitching import AdjustmentFigures
 
 PHASES = frozenset(phase.value for phase in Phase)
 EXPOSURES_MAX = 2000
@@ -332,16 +335,16 @@ class FlightState:
     def _apply_products(self, event: Mapping[str, Any]) -> None:
         self._on_verdict(event)
         record = self._exposure(event)
-        figures = event.get("report", {}).get("figures", {})
+        figures = QualityFigures.from_json(event.get("report", {}).get("figures", {}))
         record["step"] = "processed"
         record["duration_s"] = event.get("duration_s")
         self._history.append(
             {
                 "sequence": self.sequence,
                 "number": record["number"],
-                "sigma0_px": figures.get("sigma0_px"),
-                "dc_k": figures.get("dc_k"),
-                "dc_estimated_k": figures.get("dc_estimated_k"),
+                "sigma0_px": figures.of(AdjustmentFigures).sigma0_px,
+                "dc_k": figures.of(DcFigures).dc_k,
+                "dc_estimated_k": figures.of(EstimatedDcFigures).dc_estimated_k,
                 "time_sigma_ns": record.get("mark_sigma_ns"),
                 "temperatures_c": self._temperatures.pop(record["number"], {}),
             }
