@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import queue
 import threading
+import time
 from collections.abc import Callable
 
 from daemon.postflight.batch.executor import (
@@ -67,8 +68,9 @@ class InProcessExecutor:
     def close(self, timeout_s: float) -> list[TaskOutcome]:
         for _ in self._threads:
             self._tasks.put(None)
+        limit_s = time.monotonic() + timeout_s
         for thread in self._threads:
-            thread.join(timeout_s)
+            thread.join(max(0.0, limit_s - time.monotonic()))
         found = []
         while not self._outcomes.empty():
             found.append(self._outcomes.get())

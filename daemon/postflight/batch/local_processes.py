@@ -174,7 +174,8 @@ class LocalProcessExecutor:
         for worker in self._workers:
             worker.connection.close()
         for worker in self._workers:
-            worker.end(0.0 if worker.task else 5.0)
+            # One that loads the work, which may take minutes, does not see the closed pipe.
+            worker.end(5.0 if worker.is_ready and not worker.task else 0.0)
         self._workers.clear()
         return self.wait(0.0)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import sys
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
@@ -175,6 +176,37 @@ def test_ctrl_c_lets_what_is_in_work_finish_and_begins_nothing_more(tmp_path: Pa
     assert outcome.is_interrupted and 1 in outcome.results
     begun = {int(path.name) for path in tmp_path.iterdir()}
     assert begun == set(outcome.results) and len(begun) < 6
+
+
+def test_a_process_that_loads_the_work_is_ended_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    executor, calls = LocalProcessExecutor(1), list[float]()
+    receive = executor._receive
+
+    def interrupted(timeout_s: float) -> None:
+        calls.append(timeout_s)
+        if len(calls) == 1:
+            raise KeyboardInterrupt
+        receive(timeout_s)
+
+    monkeypatch.setattr(executor, "_receive", interrupted)
+    begun_s = time.monotonic()
+    outcome = run_batch(executor, ToyWork(tmp_path, open_s=60.0), [BatchTask(1)])
+    assert outcome.is_interrupted and executor.pids == ()
+    assert time.monotonic() - begun_s < 4.0
+
+
+def test_all_threads_in_work_have_one_time_to_finish() -> None:
+    class Busy:
+        def join(self, timeout_s: float) -> None:
+            waits.append(timeout_s)
+            time.sleep(0.05)
+
+    executor, waits = InProcessExecutor(2), list[float]()
+    executor._threads = [Busy(), Busy()]  # type: ignore[list-item]
+    executor.close(10.0)
+    assert waits[1] <= waits[0] - 0.05 < 10.0
 
 
 @pytest.mark.parametrize(

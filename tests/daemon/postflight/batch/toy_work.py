@@ -21,8 +21,10 @@ class ToyWork:
     threads: int = 1
     memory_nbytes: int = 1
     refuses: bool = False
+    open_s: float = 0.0
 
     def open(self) -> ToyAction:
+        time.sleep(self.open_s)
         if self.refuses:
             raise ValueError("no such calibration")
         return ToyAction(self)
