@@ -57,7 +57,7 @@ _ORIENTED_MIN: Final = 3
 _CONTRADICTING_SHARE: Final = 0.5
 _UPWARD_MAX: Final = 0.2
 """Sine of the elevation of the axis of most photographs of the ground."""
-_AREA: Final = 0.2
+AREA: Final = 0.2
 """Spread of positions over an area: across their main direction, over that along it."""
 _WRONG_POSITION_M: Final = 15.0
 _WRONG_POSITION: Final = 6.0
@@ -319,7 +319,7 @@ def _fit_of_line(found: OrientedBlock, own: NDArray[np.bool_], position: Array) 
 def _why_upward(position: Array) -> str:
     """Positions over an area that let a block look upward are mirrored; on a line, roll is open."""
     along, across = np.linalg.svd(position[:, :2] - position[:, :2].mean(axis=0))[1]
-    if across > _AREA * along:
+    if across > AREA * along:
         return (
             "they mirror the ground. Latitude and longitude are exchanged, or one has the wrong "
             "sign (GPSLatitudeRef, GPSLongitudeRef). Correct the tags"

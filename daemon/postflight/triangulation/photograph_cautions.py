@@ -8,6 +8,10 @@ from typing import Any, Final
 from daemon.postflight.triangulation.photograph_project import OWN_INTERIOR_MIN
 
 _ROLL_MAX_DEG: Final = 1.0
+_SCALE_MAX_PERCENT: Final = 1.0
+_OFF_NADIR_MAX_DEG: Final = 30.0
+_CONTROL_OF_PLACE: Final = 3
+"""Control points that place a block without positions."""
 _HEIGHTS: Final = {
     "none": (
         "EXIF has no heights: positions are taken at 0 m, so that all heights are below the flight "
@@ -70,14 +74,40 @@ def photograph_cautions(section: Mapping[str, Any]) -> list[str]:
             "stated standard deviations hold for these parameters only. Lines across, two heights "
             "or control points determine it"
         )
-    if section["roll_sigma_deg"] > _ROLL_MAX_DEG and section["control_points"] < 3:
+    if section["control_points"] < _CONTROL_OF_PLACE:
+        found += _placing_cautions(section)
+    if section["off_nadir_deg"] > _OFF_NADIR_MAX_DEG:
         found.append(
-            f"positions of EXIF are nearly on one line: they fix the roll of the block about it to "
-            f"{section['roll_sigma_deg']:.1f} degrees only, so that the ground may slope by as "
-            "much. Fly a second line or give three control points (--points)"
+            f"photographs look {section['off_nadir_deg']:.0f} degrees off the vertical (median), "
+            "as around an object: in an orthomosaic objects lean and hide the ground behind them. "
+            "Vertical photographs show it"
         )
     for camera in section["cameras"]:
         found += _camera_cautions(camera, is_only=len(section["cameras"]) == 1)
+    return found
+
+
+def _placing_cautions(section: Mapping[str, Any]) -> list[str]:
+    """How little positions fix attitude and scale of the block."""
+    found = []
+    extent = f"{section['position_extent_m']:.0f} m"
+    if section["roll_sigma_deg"] > _ROLL_MAX_DEG:
+        degrees = f"{section['roll_sigma_deg']:.1f} degrees"
+        slope = "so that the ground may slope by as much"
+        found.append(
+            f"positions of EXIF are nearly on one line: they fix the roll of the block about it to "
+            f"{degrees} only, {slope}. Fly a second line or give three control points (--points)"
+            if section["positions_on_a_line"]
+            else f"positions of EXIF are within {extent}: their heights fix the tilt of the block "
+            f"to {degrees} only, {slope}. Fly over a larger area or give three control points "
+            "(--points)"
+        )
+    if section["scale_sigma_percent"] > _SCALE_MAX_PERCENT:
+        found.append(
+            f"positions of EXIF are within {extent}: they fix the scale of the block to "
+            f"{section['scale_sigma_percent']:.1f} % only, and lengths and heights err by as much. "
+            "Fly over a larger area or give three control points (--points)"
+        )
     return found
 
 

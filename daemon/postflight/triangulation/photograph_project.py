@@ -24,6 +24,7 @@ from daemon.postflight.triangulation.held_interior import (
     with_principal_point,
 )
 from daemon.postflight.triangulation.photograph_block import (
+    AREA,
     PhotographBlock,
     provisional_camera,
 )
@@ -190,9 +191,7 @@ def adjusted_photographs(
         control,
         position_sigma_m=position_sigma_m,
         reject_beyond=reject_beyond,
-        tie_sigma_px=residual_sigma_px(found, position_sigma_m, progress)
-        if len(control.image)
-        else (TIE_SIGMA_PX, TIE_SIGMA_PX),
+        tie_sigma_px=residual_sigma_px(found, position_sigma_m, progress),
     )
     trials = (
         (project, ""),
@@ -227,6 +226,8 @@ def residual_sigma_px(
 
     The block is adjusted without control: measurements of control keep their own standard
     deviation, and would otherwise be scaled with matched points that are many times better.
+    Positions of EXIF would be rejected where matched points are better than they are stated: a
+    sigma0 below 1 makes their residuals large.
 
     Args:
         found: oriented photographs.
@@ -343,6 +344,12 @@ def photographs_section(
         "position_shift_m": [float(v) for v in result.state.shift[0]] if len(gnss.lines) else None,
         "position_rms_m": [float(v) for v in np.sqrt(np.mean(away**2, axis=0))],
         "roll_sigma_deg": roll_sigma_deg(gnss.position_m, float(np.sqrt(np.mean(away[:, 2] ** 2)))),
+        "positions_on_a_line": are_on_a_line(gnss.position_m),
+        "position_extent_m": float(np.linalg.norm(np.ptp(gnss.position_m, axis=0))),
+        "scale_sigma_percent": 100.0 * scale_sigma(gnss.position_m, away),
+        "off_nadir_deg": float(
+            np.degrees(np.median(np.arccos(np.clip(result.state.attitude[:, 2, 2], -1.0, 1.0))))
+        ),
         "control_points": controls,
         "control_not_measured": unmeasured(control),
         "control_rejected": [
@@ -396,6 +403,33 @@ def roll_sigma_deg(position_m: Array, height_rms_m: float) -> float:
     """
     across = np.linalg.svd(position_m[:, :2] - position_m[:, :2].mean(axis=0), compute_uv=False)
     return float(np.degrees(np.arctan2(max(height_rms_m, 1.0), across[1])))
+
+
+def are_on_a_line(position_m: Array) -> bool:
+    """Whether positions (n, 3) spread over a line rather than an area."""
+    along, across = np.linalg.svd(position_m[:, :2] - position_m[:, :2].mean(axis=0))[1]
+    return bool(across <= AREA * along)
+
+
+def scale_sigma(position_m: Array, residual_m: Array) -> float:
+    """How well positions fix the scale of a block without control.
+
+    Args:
+        position_m: shape (n, 3).
+        residual_m: of the block against them, shape (n, 3).
+
+    Returns:
+        Relative standard deviation.
+
+    Example:
+        >>> square = np.array([[0, 0, 0], [10, 0, 0], [10, 10, 0], [0, 10, 0]], float)
+        >>> round(scale_sigma(square, np.full((4, 3), 2.0)), 3)
+        0.219
+    """
+    spread_m = float(np.linalg.norm(position_m - position_m.mean(axis=0)))
+    # A similarity of seven parameters is in the residuals.
+    redundancy = max(residual_m.size - 7, 1)
+    return float(np.sqrt(np.sum(residual_m**2) / redundancy)) / max(spread_m, 1e-9)
 
 
 def f_and_ground_height(result: Adjustment) -> tuple[float, float]:

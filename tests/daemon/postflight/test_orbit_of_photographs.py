@@ -1,13 +1,23 @@
-"""Photographs around a place: what a held principal point does to f, and that it is stated."""
+"""Photographs around a place: what a held principal point does to f, what positions of a small
+circle fix, and that it is stated."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
+from daemon.postflight.triangulation.ground_control import no_control
 from daemon.postflight.triangulation.held_interior import FreePrincipalPoint, free_principal_point
-from daemon.postflight.triangulation.photograph_cautions import _camera_cautions
-from processing.bundle.adjust import AdjustmentSettings, adjust
+from daemon.postflight.triangulation.photograph_block import PhotographBlock
+from daemon.postflight.triangulation.photograph_cautions import (
+    _camera_cautions,
+    photograph_cautions,
+)
+from daemon.postflight.triangulation.photograph_project import (
+    adjusted_photographs,
+    photographs_section,
+)
+from processing.bundle.adjust import Adjustment, AdjustmentSettings, adjust
 from processing.bundle.camera_model import perspective_mm
 from processing.bundle.network import (
     INTERIOR,
@@ -20,6 +30,9 @@ from processing.bundle.network import (
     Points,
     Stations,
 )
+from tests.daemon.postflight.photograph_scene import F_PX as SCENE_F_PX
+from tests.daemon.postflight.photograph_scene import _block as scene_block
+from tests.daemon.postflight.photograph_scene import is_inside, projected, scene
 
 SIZE = np.array([4000.0, 3000.0])
 F_PX, PITCH_MM, NOISE_PX = 3300.0, 0.002, 0.5
@@ -115,3 +128,84 @@ def test_photographs_turned_by_90_degrees_separate_them() -> None:
     assert abs(error_px) < 4.0 * sigma_px and not free.widens(sigma_px)
     error_px, sigma_px, free = adjusted((0.0, 20.0), are_turned=True)
     assert free.contradicts(sigma_px) or abs(error_px) < 4.0 * sigma_px
+
+
+RADIUS_M, ABOVE_M = 25.0, 22.0
+
+
+def around(seed: int, *, scale: float = 1.0) -> tuple[PhotographBlock, np.ndarray]:
+    """Eight photographs on a circle that look at its middle, as matching gives them; the points.
+
+    `scale` enlarges the place and the circle, not the errors of the positions (1.5, 1.5, 2.5 m).
+    """
+    random = np.random.default_rng(seed)
+    xyz = np.column_stack([random.uniform(-9, 9, (250, 2)), random.uniform(-2, 3, 250)])
+    station, rotation = [], []
+    for k in range(8):
+        angle = 0.25 * np.pi * k
+        centre = np.array([RADIUS_M * np.cos(angle), RADIUS_M * np.sin(angle), ABOVE_M])
+        centre += random.normal(0.0, 0.5, 3)
+        back = centre / np.linalg.norm(centre)
+        right = np.cross([0.0, 0.0, 1.0], back)
+        right /= np.linalg.norm(right)
+        station.append(centre)
+        rotation.append(np.column_stack([right, np.cross(back, right), back]))
+    seen = [projected(*pose, xyz) for pose in zip(station, rotation, strict=True)]
+    rows = [(k, p) for k in range(8) for p in np.flatnonzero(is_inside(seen[k])).tolist()]
+    count = np.bincount([p for _, p in rows], minlength=250)
+    rows = [(k, p) for k, p in rows if count[p] >= 3]
+    used, point = np.unique([p for _, p in rows], return_inverse=True)
+    px = np.array([seen[k][p] for k, p in rows]) + random.normal(0.0, 0.1, (len(rows), 2))
+    place = scale * np.array(station)
+    position = place + random.normal(0.0, 1.0, place.shape) * POSITIONS_M
+    found = scene_block(
+        np.array([k for k, _ in rows]), point.astype(np.int64), px, scale * xyz[used], place,
+        np.array(rotation), position, SCENE_F_PX,
+    )  # fmt: skip
+    return found, scale * xyz[used]
+
+
+def section_of(found: PhotographBlock) -> tuple[dict, np.ndarray, Adjustment]:
+    """The section of the report without control, the adjusted points, and the adjustment."""
+    _, result, _ = adjusted_photographs(
+        found, no_control(), position_sigma_m=POSITIONS_M, reject_beyond=4.0
+    )
+    return photographs_section(found, no_control(), result), result.state.points, result
+
+
+def test_a_small_circle_hardly_fixes_tilt_and_scale_and_it_is_stated() -> None:
+    """Errors over 12 circles have the stated size: ratio of lengths, and slope of the ground."""
+    scales, slopes, stated = [], [], []
+    for seed in range(12):
+        found, truth = around(seed)
+        section, points, result = section_of(found)
+        assert not result.excluded.gnss.any(), "no position is wrong"
+        one, other = points - points.mean(axis=0), truth - truth.mean(axis=0)
+        scales.append(100.0 * (np.linalg.norm(one) / np.linalg.norm(other) - 1.0))
+        fitted = np.linalg.lstsq(other, one, rcond=None)[0]
+        slopes += np.degrees(fitted[:2, 2]).tolist()
+        stated.append([section["scale_sigma_percent"], section["roll_sigma_deg"]])
+        assert not section["positions_on_a_line"]
+        assert section["off_nadir_deg"] == pytest.approx(48.6, abs=3.0)
+    sigma = np.sqrt(np.mean(np.square(stated), axis=0))
+    assert 0.6 < np.sqrt(np.mean(np.square(scales))) / sigma[0] < 1.6
+    assert 0.6 < np.sqrt(np.mean(np.square(slopes))) / sigma[1] < 1.6
+    cautions = photograph_cautions(section)
+    for words in (
+        "heights fix the tilt of the block to", "fix the scale of the block to",
+        "degrees off the vertical (median), as around an object",
+    ):  # fmt: skip
+        assert len([one for one in cautions if words in one]) == 1, words
+    assert not [one for one in cautions if "on one line" in one]
+    with_control = photograph_cautions({**section, "control_points": 3})
+    assert not [one for one in with_control if "tilt of" in one or "scale of" in one]
+
+
+def test_a_wide_circle_and_vertical_photographs_have_no_such_caution() -> None:
+    section, _, _ = section_of(around(1, scale=8.0)[0])
+    cautions = photograph_cautions(section)
+    assert not [one for one in cautions if "tilt of" in one or "scale of" in one]
+    assert [one for one in cautions if "off the vertical" in one]
+    section, _, _ = section_of(scene()[0])
+    assert section["off_nadir_deg"] < 10.0
+    assert not [one for one in photograph_cautions(section) if "off the vertical" in one]
