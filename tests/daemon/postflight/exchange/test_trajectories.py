@@ -62,13 +62,29 @@ def test_positions_and_attitudes_come_back(mission, kind: str) -> None:
         assert abs(turn) < 1e-9
 
 
-def test_the_export_of_an_exported_csv_is_byte_identical(mission, tmp_path: Path) -> None:
-    _, path = export(mission, "csv")
+@pytest.mark.parametrize("kind", ["csv", "pos"])
+def test_the_export_of_an_exported_trajectory_is_byte_identical(mission, tmp_path, kind) -> None:
+    _, path = export(mission, kind)
     first = path.read_bytes()
-    copied = tmp_path / "again.csv"
+    copied = tmp_path / f"again.{kind}"
     copied.write_bytes(first)
-    _, again = export(mission, "csv", "--trajectory", str(copied))
-    assert again.read_bytes() == first
+    _, again = export(mission, kind, "--trajectory", str(copied))
+    assert again.name != path.name and again.read_bytes() == first
+
+
+def test_an_sbet_written_again_differs_in_velocities_only(mission, tmp_path) -> None:
+    """The reader takes velocities from positions: an SBET has them in a wander frame."""
+    _, path = export(mission, "sbet")
+    copied = tmp_path / "again.sbet"
+    copied.write_bytes(path.read_bytes())
+    _, again = export(mission, "sbet", "--trajectory", str(copied))
+    first, second = (np.fromfile(one, "<f8").reshape(-1, 17) for one in (path, again))
+    same = [0, 1, 2, 3, *range(7, 17)]
+    # Angles go through degrees: the last digit of a double.
+    assert np.allclose(first[:, same], second[:, same], rtol=4e-16, atol=0.0)
+    assert (first[:, [0, 3]] == second[:, [0, 3]]).all()
+    assert not np.array_equal(first[:, 4:7], second[:, 4:7])
+    assert np.abs(first[1:-1, 4:7] - second[1:-1, 4:7]).max() < 0.1
 
 
 def test_smrmsg_has_the_accuracies_and_is_written_only_with_those_of_attitude(mission) -> None:

@@ -14,13 +14,19 @@ from typing import Any
 from pystac.validation.local_validator import get_local_schema_cache
 
 NUMBER = {"type": "number"}
+
+
+def _of_length(count: int) -> dict[str, int]:
+    return {"minItems": count, "maxItems": count}
+
+
 FIELDS: dict[str, dict[str, Any]] = {
     "https://stac-extensions.github.io/projection/v2.0.0/schema.json": {
         "proj:code": {"type": ["string", "null"], "pattern": "^[A-Z]+:[0-9A-Za-z_-]+$"},
         "proj:wkt2": {"type": ["string", "null"]},
         "proj:projjson": {"type": ["object", "null"]},
         "proj:geometry": {"type": "object"},
-        "proj:bbox": {"type": "array", "items": NUMBER, "minItems": 4, "maxItems": 6},
+        "proj:bbox": {"type": "array", "items": NUMBER, "anyOf": [_of_length(4), _of_length(6)]},
         "proj:centroid": {
             "type": "object",
             "required": ["lat", "lon"],
@@ -35,7 +41,11 @@ FIELDS: dict[str, dict[str, Any]] = {
             "minItems": 2,
             "maxItems": 2,
         },
-        "proj:transform": {"type": "array", "items": NUMBER, "minItems": 6, "maxItems": 9},
+        "proj:transform": {
+            "type": "array",
+            "items": NUMBER,
+            "anyOf": [_of_length(6), _of_length(9)],
+        },
     },
     "https://stac-extensions.github.io/view/v1.0.0/schema.json": {
         "view:off_nadir": {"type": "number", "minimum": 0, "maximum": 90},

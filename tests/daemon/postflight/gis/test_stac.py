@@ -79,6 +79,8 @@ def test_collection_and_items_are_valid_by_their_schemas(exported: Exported) -> 
         (("properties", "proj:epsg"), 32633),
         (("assets", "cog_pan", "file:checksum"), "00" * 32),
         (("assets", "cog_pan", "proj:shape"), [10.5, 1]),
+        (("assets", "cog_pan", "proj:bbox"), [1.0, 2.0, 3.0, 4.0, 5.0]),
+        (("assets", "cog_pan", "proj:transform"), [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0]),
         (("properties", "datetime"), "yesterday"),
         (("stac_version",), "1.0.0"),
     ],
