@@ -12,7 +12,8 @@ from __future__ import annotations
 import hashlib
 import re
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import timedelta
@@ -24,6 +25,8 @@ from daemon.mission.transfer.store_requests import StoreRefusedError, is_http_pe
 SCHEMES: Final = ("s3", "gs", "az")
 PART_BYTES: Final = 16_000_000
 """Largest body of a request; a larger object is sent in several parts."""
+REQUESTS: Final = 16
+"""Small objects asked for at a time."""
 READ_ATTEMPTS: Final = 6
 WRITE_ATTEMPTS: Final = 4
 REQUEST_TIMEOUT_S: Final = 60.0
@@ -147,6 +150,24 @@ class ObjectStore:
             ]
 
         return sorted(self._repeated(listed, "list"), key=lambda one: one.name)
+
+    def list_with(self, names: Iterable[str], folder: str = "") -> list[StoredObject]:
+        """Every object, sorted by name; objects that the list misses are asked for by their name.
+
+        A list may be late; an object that was written is found by its name.
+
+        Args:
+            names: of objects that may be there.
+            folder: only those below it.
+
+        Raises:
+            ObjectStoreError: the store refused.
+        """
+        found = {one.name: one for one in self.list_objects(folder)}
+        with ThreadPoolExecutor(REQUESTS) as pool:
+            late = pool.map(self.find, [name for name in names if name not in found])
+            found |= {one.name: one for one in late if one is not None}
+        return sorted(found.values(), key=lambda one: one.name)
 
     def find(self, name: str) -> StoredObject | None:
         """An object; None where there is none.

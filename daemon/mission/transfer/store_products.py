@@ -27,12 +27,15 @@ from daemon.mission.store.product_manifests import (
     parse_manifest,
     parts_sha256,
 )
-from daemon.mission.transfer.object_store import PART_BYTES, ObjectStore, ObjectStoreError
+from daemon.mission.transfer.object_store import (
+    PART_BYTES,
+    REQUESTS,
+    ObjectStore,
+    ObjectStoreError,
+)
 
 PROCESSED: Final = "processed"
 MANIFEST_MAX_BYTES: Final = 10_000_000
-REQUESTS: Final = 16
-"""Small objects asked for at a time."""
 WRITERS: Final = 4
 """Objects of one exposure sent at a time; each holds at most three parts in memory."""
 _KEY = re.compile(r"[0-9a-f]{64}")
@@ -96,18 +99,21 @@ class StoredProducts:
                     yield int(exposure), key
 
 
-def list_products(store: ObjectStore, below: str = PROCESSED) -> StoredProducts:
+def list_products(
+    store: ObjectStore, below: str = PROCESSED, names: Iterable[str] = ()
+) -> StoredProducts:
     """Products of a mission, or of one folder of it.
 
     Args:
         store: folder of the mission.
         below: folder in it.
+        names: in that folder, which are asked for where the list misses them.
 
     Raises:
         ObjectStoreError: the store refused.
     """
     sizes: dict[str, dict[str, int]] = {}
-    for one in store.list_objects(below):
+    for one in store.list_with([f"{below}/{name}" for name in names], below):
         folder, _, name = one.name.rpartition("/")
         sizes.setdefault(folder, {})[name] = one.nbytes
     return StoredProducts(sizes)
@@ -144,7 +150,9 @@ def is_stored(store: ObjectStore, number: int, key: str) -> bool:
     manifest = read_stored_manifest(store, number, key) if key else None
     if manifest is None:
         return False
-    return list_products(store, product_folder(number, key)).agrees(number, manifest)
+    return list_products(store, product_folder(number, key), manifest.files).agrees(
+        number, manifest
+    )
 
 
 def publish_stored(
@@ -180,7 +188,7 @@ def publish_stored(
     with ThreadPoolExecutor(WRITERS) as pool:
         files = dict(zip(names, pool.map(put, names), strict=True))
     manifest = manifest_of(key, files, report)
-    if not list_products(store, folder).agrees(number, manifest):
+    if not list_products(store, folder, files).agrees(number, manifest):
         raise ObjectStoreError(
             f"{store.url}/{folder}: does not hold what was written; run the same command again"
         )

@@ -166,7 +166,7 @@ class _StoreCopying:
 
     def run(self, mission: Mission, *, remove: bool) -> StoreTransferReport:
         """Copy, read back, and seal and remove the source where that is wanted."""
-        present = {one.name: one for one in self._target.list_objects()}
+        present = {one.name: one for one in self._target.list_with(self._noted)}
         removed = self._removed_from_source(present, has_manifest=MANIFEST_FILE in present)
         manifest = TransferManifest(mission.id, mission.genesis_sha256(), "copying")
         retained = {name: self._noted[name] for name in removed}

@@ -66,7 +66,7 @@ def check_store_copy(
         TransferError: an object is missing or differs.
         ObjectStoreError: the store refused.
     """
-    found = {one.name: one for one in target.list_objects()}
+    found = {one.name: one for one in target.list_with(manifest.files)}
     problem = next(_differences(target, manifest, found, step), None)
     if problem is None:
         problem = next(iter(_recorded_frames(target, manifest, found).problems), None)
@@ -99,7 +99,7 @@ def verify_in_store(
     problems: list[str] = []
     if manifest.state == "copying":
         problems.append(f"{target.url}: the transfer is not complete; run syntopic transfer again")
-    found = {one.name: one for one in target.list_objects()}
+    found = {one.name: one for one in target.list_with(manifest.files)}
     done = 0
 
     def step(count: int) -> None:

@@ -396,3 +396,18 @@ def test_no_frame_is_ever_written_to_a_disk(
     assert len(blocks) >= 8 and not any(blocks)
     assert {f"{number:06d}" for number in flown.numbers()} <= set(removed)  # one after the other
     assert not list(tmp_path.glob("*"))
+
+
+def test_each_frame_is_read_once(flown: Mission, store: Callable[..., str]) -> None:
+    faults, reads = Faults(), list[str]()
+    place = uploaded(flown, store(faults))
+
+    def note(method: str, path: str) -> bool:
+        if method == "GET" and path.endswith(".tif") and "/L0/" in path:
+            reads.append(path.rpartition("/L0/")[2])
+        return False
+
+    faults.is_for = note
+    assert process(place.url)["done"] == 4
+    heads = ("LEFT", "RIGHT")
+    assert sorted(reads) == [f"{n:06d}/{head}.tif" for n in flown.numbers() for head in heads]
