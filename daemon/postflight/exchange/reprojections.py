@@ -41,6 +41,10 @@ _TRIED: Final = 20_000
 _NOTED_SIGMAS: Final = 3.0
 """Median distance in standard deviations from which other axes, poses and columns are tried."""
 _SHIFT_NOTED_PX: Final = 0.3
+_SINGLE: Final = 20.0
+"""Median distance of a single image, over that of all, from which it is not of the block."""
+_SINGLE_MIN: Final = 10
+_LISTED: Final = 5
 _OUTSIDE_SHARE: Final = 0.01
 _BORDER_PX: Final = 1.5
 
@@ -72,7 +76,7 @@ def refuse_other_convention(path: Path, block: Block, sigma_px: float) -> tuple[
     Raises:
         BlockError: axes that are reversed or exchanged, another origin, unit, direction of poses
             or order of columns, points that are far from their measurements without such a reason,
-            or an image of another size.
+            an image of another size, or single images with the orientation of another one.
     """
     sample = _sample_of(block)
     if len(sample.px) < _MIN_POINTS or not np.isfinite(block.points.xyz_m).all():
@@ -81,6 +85,8 @@ def refuse_other_convention(path: Path, block: Block, sigma_px: float) -> tuple[
     side = float(sample.size.max())
     given = _median(sample.px, projected)
     is_far = given >= _FAR * side
+    if not is_far:
+        _refuse_single_images(path, sample, projected, max(given, sigma_px))
     if not is_far and given <= _NOTED_SIGMAS * sigma_px:
         return (*_shift_note(sample, projected, sigma_px), *_outside(path, block))
     limit = min(_BETTER * given, _UNEXPLAINED * side)
@@ -194,6 +200,54 @@ def _scaled(sample: _Sample, projected: Array, *, shift: bool) -> tuple[float, f
         measured, seen = measured - _middle(measured), seen - _middle(seen)
     scale = float((measured * seen).sum() / max((measured * measured).sum(), 1e-300))
     return scale, _median(scale * measured, seen)
+
+
+def _refuse_single_images(path: Path, sample: _Sample, projected: Array, usual_px: float) -> None:
+    """Refuse images that are far from their measurements where all others are near.
+
+    Raises:
+        BlockError: such images by name, with the image whose orientation fits each of them.
+    """
+    limit = max(_FAR * float(sample.size.max()), _SINGLE * usual_px)
+    far = [
+        int(number)
+        for number in np.unique(sample.image)
+        if (sample.image == number).sum() >= _SINGLE_MIN
+        and _median_of(sample, projected, number) > limit
+    ]
+    if not far:
+        return
+    # Points intersected with their rays take neighbours along: the farthest are the cause.
+    far.sort(key=lambda number: -_median_of(sample, projected, number))
+    rotation, place = _poses(sample)
+    names = [one.name for one in sample.block.images]
+    sentences = []
+    for number in far[:_LISTED]:
+        own = f"{names[number]} ({_distance(_median_of(sample, projected, number))}"
+        for other in far:
+            turns, places = rotation.copy(), place.copy()
+            turns[number], places[number] = rotation[other], place[other]
+            then = _projected(sample, turns, places, sample.block.points.xyz_m)
+            if _median_of(sample, then, number) < limit:
+                own += f"; near with the orientation of {names[other]}"
+                break
+        sentences.append(f"{own})")
+    more = ", ..." if len(far) > _LISTED else ""
+    raise BlockError(
+        f"{path}: measurements of {len(far)} of {len(names)} images are far from the projections "
+        f"of their points, and those of the others near: {', '.join(sentences)}{more}. Their "
+        "orientations or measurements are those of other images, or of another adjustment: export "
+        "the block again, or leave these images out"
+    )
+
+
+def _median_of(sample: _Sample, projected: Array, number: int) -> float:
+    own = sample.image == number
+    return _median(sample.px[own], projected[own])
+
+
+def _distance(px: float) -> str:
+    return "points behind it" if math.isinf(px) else f"{px:.0f} px"
 
 
 def _shift_note(sample: _Sample, projected: Array, sigma_px: float) -> tuple[str, ...]:

@@ -305,3 +305,39 @@ def test_single_measurements_outside_of_their_image_are_named(scene, tmp_path) -
     notes = import_block(path, "colmap", tmp_path / "out").block.notes
     assert any("2 of " in note and "lie outside of their image" in note for note in notes)
     assert any("0.jpg, 1600 x 1200 px" in note for note in notes)
+
+
+def with_poses(path: Path, order: dict[int, int], shift_m: float = 0.0) -> Path:
+    """Give images of a model the poses of others, and move the last one."""
+    for name in ("rigs.txt", "frames.txt"):
+        (path / name).unlink()
+    rows = (path / "images.txt").read_text().split("\n")
+    at = [k for k, row in enumerate(rows) if row.endswith(".jpg")]
+    given = [rows[k].split() for k in at]
+    for k, row in enumerate(at):
+        words = given[k].copy()
+        words[1:8] = given[order.get(k, k)][1:8]
+        if k == 8:
+            words[5] = repr(float(words[5]) + shift_m)
+        rows[row] = " ".join(words)
+    (path / "images.txt").write_text("\n".join(rows))
+    return path
+
+
+def test_orientations_of_two_images_that_are_exchanged_are_named(scene, tmp_path) -> None:
+    path = with_poses(colmap(scene, tmp_path / "in"), {2: 5, 5: 2})
+    words = (
+        r"measurements of 2 of 9 images .*: 2.jpg \(\d+ px; near with the orientation of 5.jpg\), "
+        r"5.jpg \(\d+ px; near with the orientation of 2.jpg\)"
+    )
+    refused(path, "colmap", tmp_path / "out", words)
+
+
+def test_one_image_of_another_adjustment_is_named(scene, tmp_path) -> None:
+    path = with_poses(colmap(scene, tmp_path / "in"), {}, shift_m=30.0)
+    refused(path, "colmap", tmp_path / "out", r"of 1 of 9 images .*: 8.jpg \(\d+ px\)\. Their")
+
+
+def test_an_image_that_fits_a_little_worse_is_left_to_the_adjustment(scene, tmp_path) -> None:
+    path = with_poses(colmap(scene, tmp_path / "in"), {}, shift_m=0.5)
+    assert len(import_block(path, "colmap", tmp_path / "out").block.images) == 9
