@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
@@ -48,6 +49,32 @@ def test_pods_have_no_root_and_every_connection_has_tls() -> None:
         words = [str(word) for word in [*container.get("command", []), *container.get("args", [])]]
         assert "tls" in words or any(word.startswith("tls://") for word in words)
         assert not any(word.startswith("tcp://") for word in words)
+
+
+def test_objects_refer_to_each_other_and_to_options_that_the_commands_have() -> None:
+    yaml = pytest.importorskip("yaml")
+    scheduler = pytest.importorskip("distributed.cli.dask_scheduler").main
+    service, *others = yaml.safe_load_all((FOLDER / "kubernetes.yaml").read_text())
+    name, (port,) = service["metadata"]["name"], service["spec"]["ports"]
+    address = f"tls://{name}:{port['port']}"
+    for part in others:
+        template = part["spec"]["template"]
+        (container,) = template["spec"]["containers"]
+        assert container["image"] == f"syntopic:{version('syntopic')}"
+        assert {one["name"] for one in container["volumeMounts"]} == {
+            one["name"] for one in template["spec"]["volumes"]
+        }
+        words = [str(word) for word in [*container.get("command", []), *container.get("args", [])]]
+        if words[0] == "dask":
+            assert template["metadata"]["labels"] == service["spec"]["selector"]
+            assert words[words.index("--port") + 1] == str(port["port"])
+            known = {option for one in scheduler.params for option in one.opts}
+        else:
+            assert address in words
+            shown = CliRunner().invoke(app, [words[0], "--help"], env={"COLUMNS": "200"}).output
+            known = set(re.findall(r"--[a-z-]+", shown))
+        used = {word for word in words if word.startswith("--")}
+        assert used and used <= known, used - known
 
 
 @pytest.mark.parametrize(("file", "command"), [("slurm.sh", "worker"), ("slurm.sh", "process")])
