@@ -153,6 +153,24 @@ def test_heads_at_different_instants_have_no_tags_of_a_rig(tmp_path) -> None:
     assert [one["RigCameraIndex"] for _, one in sorted(found.items())] == [3, 2, 0, 1]
 
 
+@pytest.mark.parametrize(("later_ns", "has_tags"), [(900_000, True), (1_100_000, False)])
+def test_pictures_of_heads_at_different_instants_have_no_tags_of_a_rig(
+    tmp_path, later_ns, has_tags
+) -> None:
+    flown = fly(tmp_path / "mission", "midas-mini", seconds=(5.0,))
+    path = flown.path / "rig.toml"
+    head, first, rest = path.read_text().partition("position_mm")
+    path.write_text(f"{head}mark_to_mid_exposure_ns = {later_ns}\n{first}{rest}")
+    marks = flown.path / "trajectory.csv"
+    lines = marks.read_text().splitlines()
+    shifted = [f"{int(line.split(',')[0]) + 10**8},{line.split(',', 1)[1]}" for line in lines[1:]]
+    marks.write_text("\n".join([*lines, *shifted]) + "\n")
+    export(flown, "pictures", "--as", "jpeg")
+    found = tags((flown.path / "export/jpeg").iterdir())
+    assert len(found) == 5
+    assert all(("RigCameraIndex" in one) is has_tags for one in found.values())
+
+
 def test_a_raw_frame_of_a_bayer_head_is_in_the_colours_that_its_tags_name(tmp_path) -> None:
     import tifffile
 
