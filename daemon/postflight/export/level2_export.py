@@ -41,8 +41,8 @@ from processing.rig import Rig
 Array = NDArray[np.float64]
 KINDS = tuple(SUFFIXES)
 ONE_INSTANT_NS = 1_000_000
-"""Mid-exposures of heads of one rig, from first to last; at 3 degrees a second it turns by 0.05 mrad
-meanwhile."""
+"""From the first mid-exposure of a rig's heads to the last; at 3 degrees a second they turn by
+0.05 mrad meanwhile."""
 GRID = 5
 """Ground control points along each side of a COG."""
 
