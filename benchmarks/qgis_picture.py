@@ -34,7 +34,7 @@ def classes_of(renderer: Any) -> list[str]:
 def rasters_of(core: Any, mission: Path) -> dict[str, Any]:
     """COGs as QGIS reads them: bands with their colour interpretation, and how it shows them."""
     found = {}
-    for path in sorted((mission / "export" / "cog").glob("*.tif")):
+    for path in sorted((mission / "export" / "cog").rglob("*.tif")):
         raster = core.QgsRasterLayer(str(path), path.name)
         provider = raster.dataProvider()
         found[path.name] = {
