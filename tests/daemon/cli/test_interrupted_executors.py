@@ -13,11 +13,15 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from benchmarks.orthomosaic import fly
 from daemon.cli import app, interrupt_messages
 from daemon.cli.exit_status import ExitStatus
 from daemon.mission.layout import Mission
 from daemon.mission.store import store
 from tests.daemon.diverging_camera import ROOT, flown_mission
+from tests.daemon.postflight.batch.test_cluster import cluster
+
+__all__ = ["cluster"]
 
 pytestmark = [pytest.mark.trust, pytest.mark.timeout(300)]
 
@@ -84,6 +88,20 @@ VERIFY = [
     _in_soak(Phase("in work", f"{LOCAL}submit", 2)),
     _in_soak(Phase("closing", f"{LOCAL}close")),
 ]
+DASK = f"{BATCH}dask_executor:DaskExecutor."
+CLUSTER = (
+    Phase("connecting", f"{DASK}_connect"),
+    Phase("opening", f"{DASK}_open"),
+    Phase("in work", f"{DASK}submit", 3),
+    Phase("result", f"{DASK}_outcome"),
+    Phase("closing", f"{DASK}close"),
+)
+MOSAIC = (
+    Phase("second process", f"{LOCAL}_start_worker", 2),
+    Phase("in work", f"{LOCAL}submit", 2),
+    Phase("closing", f"{LOCAL}close"),
+    Phase("files", "daemon.postflight.orthomosaic.orthomosaic:write_cog", 2),
+)
 COPY = [
     _in_soak(Phase("source", f"{TRANSFER}checkpoint_index", options=("--remove-source",))),
     _in_soak(Phase("files", f"{STORE}file_tree:FileTree.sha256", 2, options=("--remove-source",))),
@@ -163,3 +181,31 @@ def test_an_interrupted_transfer_has_one_complete_copy_and_continues(
     assert CliRunner().invoke(app, arguments).exit_code == 0
     assert not mission.path.exists()
     assert store.verify(Mission.open(disk / mission.id)).problems == ()
+
+
+@pytest.mark.soak
+def test_a_run_on_a_cluster_that_is_interrupted_leaves_complete_products_and_continues(
+    cluster: tuple[str, subprocess.Popen[bytes]], tmp_path: Path
+) -> None:
+    for phase in CLUSTER:
+        mission = flown_mission(tmp_path / phase.name, (1, 2, 3, 4))
+        check_interrupted(phase, "process", str(mission.path), "--scheduler", cluster[0])
+        assert store.verify(mission).problems == ()
+        arguments = ["process", str(mission.path), "--scheduler", cluster[0], "--json"]
+        found = json.loads(CliRunner().invoke(app, arguments).stdout)
+        assert found["done"] + found["complete_before"] == 4 and found["failures"] == []
+
+
+@pytest.mark.soak
+def test_an_interrupted_orthomosaic_has_no_result_and_continues(tmp_path: Path) -> None:
+    flown, out = fly(tmp_path, width_px=1182, exposures=2), tmp_path / "ortho"
+    arguments = (
+        "orthomosaic", str(flown.mission), "--out", str(out), "--processes", "2", "--json",
+        "--trajectory", str(flown.folder / "trajectory.csv"), "--ground-height", "100",
+    )  # fmt: skip
+    for phase in MOSAIC:
+        check_interrupted(phase, *arguments)
+        assert not out.exists()
+    done = CliRunner().invoke(app, arguments)
+    assert done.exit_code == 0 and json.loads(done.stdout)["tiles_computed"] == 0
+    assert (out / "pan-16.tif").is_file()

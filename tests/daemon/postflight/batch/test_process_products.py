@@ -159,6 +159,14 @@ def test_a_dry_run_states_what_would_be_computed(flown: Mission, processed: Miss
     assert done["complete"] == [] and done["expected_s"] > 0
 
 
+def test_a_file_address_is_the_folder(processed: Mission) -> None:
+    arguments = ["process", f"file://{processed.path}", "--dry-run", "--json"]
+    found = json.loads(CliRunner().invoke(app, arguments).stdout)
+    assert found["complete"] == [1, 2, 3, 4] and found["pending"] == []
+    checked = CliRunner().invoke(app, ["verify", f"file://{processed.path}", "--json"])
+    assert json.loads(checked.stdout)["exposures"] == 4
+
+
 def test_two_runs_at_once_leave_every_product_set_complete(tmp_path: Path) -> None:
     mission = flown_mission(tmp_path, range(1, 31))
     command = [sys.executable, "-m", "daemon", "process", str(mission.path), "--json"]
