@@ -66,12 +66,12 @@ def _in_soak(phase: Phase) -> object:
 
 
 PROCESS = [
-    pytest.param(Phase("opening", f"{LOCAL}_receive", 2), id="opening"),
     pytest.param(Phase("in work", f"{LOCAL}submit", 2), id="in work"),
     *map(
         _in_soak,
         (
             Phase("looking", f"{BATCH}level2_sources:survey"),
+            Phase("opening", f"{LOCAL}_receive", 2),
             Phase("first process", f"{LOCAL}_start_worker"),
             Phase("second process", f"{LOCAL}_start_worker", 2),
             Phase("closing", f"{LOCAL}close"),
