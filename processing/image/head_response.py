@@ -83,8 +83,10 @@ def overlap_cells(
     """Cut an overlap into cells of alike place and light.
 
     Args:
-        sensor_a, sensor_b: names of the heads.
-        light_a, light_b: their signal at common places, (n,) Level-1 counts above zero.
+        sensor_a: name of a head.
+        sensor_b: name of the other.
+        light_a: signal of the first at common places, (n,) Level-1 counts above zero.
+        light_b: that of the other.
         places: of the samples, (n, 2) shares of the image's columns and rows.
 
     Returns:

@@ -121,10 +121,10 @@ def test_what_libraries_state_of_exhausted_memory_is_recognized() -> None:
     import cv2
 
     opencv = cv2.error("Failed to allocate 5 bytes")
-    opencv.code = cv2.Error.StsNoMem  # type: ignore[attr-defined]
+    opencv.code = cv2.Error.StsNoMem  # type: ignore[attr-defined]  # set in C
     assert is_out_of_memory(opencv) and is_out_of_memory(OSError(errno.ENOMEM, "x"))
     other = cv2.error("Assertion failed")
-    other.code = cv2.Error.StsAssert  # type: ignore[attr-defined]
+    other.code = cv2.Error.StsAssert  # type: ignore[attr-defined]  # set in C
     assert not is_out_of_memory(other) and not is_out_of_memory(OSError(errno.ENOSPC, "x"))
 
 
@@ -204,7 +204,7 @@ def test_all_threads_in_work_have_one_time_to_finish() -> None:
             time.sleep(0.05)
 
     executor, waits = InProcessExecutor(2), list[float]()
-    executor._threads = [Busy(), Busy()]  # type: ignore[list-item]
+    executor._threads = [Busy(), Busy()]  # type: ignore[list-item]  # only what is used
     executor.close(10.0)
     assert waits[1] <= waits[0] - 0.05 < 10.0
 
