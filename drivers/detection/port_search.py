@@ -187,6 +187,8 @@ class _Search:
                 # Bytes in the buffer were received at the previous baud rate.
                 line.read(0.0)
             while True:
+                # Reading comes first: on a busy host the time may be over before the first byte.
+                detector.feed(line.read(STEP_S), self._clock.mono_ns())
                 elapsed_s = (self._clock.mono_ns() - begun_ns) * 1e-9
                 if elapsed_s > LISTEN_S or detector.is_certain(
                     has_listened_long_enough=elapsed_s > CYCLE_COMPLETE_S
@@ -200,7 +202,6 @@ class _Search:
                     )
                     if has_enough or elapsed_s > UNDECODED_LIMIT_S:
                         return detector
-                detector.feed(line.read(STEP_S), self._clock.mono_ns())
         finally:
             line.close()
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import json
+import operator
 import os
 import shutil
 import socket
@@ -36,6 +38,7 @@ from sim_hw.receivers.novatel_receiver import NovatelReceiver
 from sim_hw.receivers.septentrio_receiver import SeptentrioReceiver
 from sim_hw.receivers.ublox_receiver import UbloxReceiver
 from sim_hw.world.world_clock import WorldClock
+from tests.drivers.fakes import FakeClock, FakePort
 from tests.drivers.uart_relay import UartRelay, sampled
 from tests.sim_hw.receiver_state import state_at
 from tests.system.demo_mission import syntopic
@@ -97,13 +100,13 @@ def test_every_device_is_found_with_its_protocol_and_its_speed() -> None:
             on_progress=lambda port, sentence: progress.setdefault(port, []).append(sentence),
         )
         speeds = {kind: set(relay.speeds) for kind, relay in relays.items()}
-    assert speeds["nmea"] >= {115_200, 9_600}, "data arrived at a wrong baud rate, too"
     by_kind = dict(zip(relays, found, strict=True))
     for kind, (_, driver, baudrate) in DEVICES.items():
         one = by_kind[kind]
         assert one.detected is not None, (kind, one.sentence, progress[one.port])
         assert (one.detected.driver, one.baudrate) == (driver, baudrate)
         assert progress[one.port][0] == "listening at 115200"
+    assert speeds["nmea"] >= {115_200, 9_600}, "data arrived at a wrong baud rate, too"
     sections = tomllib.loads(toml_sections(found))
     assert [s["name"] for s in sections["navigator"]] == [
         "gnss",
@@ -119,6 +122,24 @@ def test_every_device_is_found_with_its_protocol_and_its_speed() -> None:
     assert by_kind["modbus"].detected.settings["unit"] == 2
     assert by_kind["modbus"].detected.settings["register_kind"] == "input"
     assert by_kind["ascii"].detected.settings["channels"] == ["0", "1"]
+
+
+def test_what_came_while_the_host_stood_still_is_read_before_a_speed_is_given_up() -> None:
+    clock, reads = FakeClock(), iter(range(100))
+    sentence = b"$GNRMC,100000.00,A,4808.22925,N,01134.12345,E,0.0,0.0,290726,,,A*"
+    sentence += b"%02X\r\n" % functools.reduce(operator.xor, sentence[1:-1])
+
+    def answer(port: FakePort) -> bytes:
+        if next(reads) == 0:
+            port.clock.now_ns += 5_000_000_000
+            return b""
+        return 3 * sentence
+
+    (found,) = search(
+        ["/dev/ttyS0"], ask=False, baudrates=[9600], clock=clock,
+        open_port=lambda *_: FakePort(clock, answer),
+    )  # fmt: skip
+    assert found.detected is not None and found.detected.driver == "nmea", found.sentence
 
 
 def test_devices_on_the_network_are_found_without_a_speed() -> None:
