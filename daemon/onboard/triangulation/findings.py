@@ -393,9 +393,7 @@ def _heights(check: HeightModelCheck | None) -> list[TriangulationFinding]:
             *found,
             TriangulationFinding(
                 "HEIGHT_MODEL_CONTRADICTED",
-                f"Heights of tie points scatter by {check.scatter_m:.1f} m about the height model, "
-                f"and by {check.arranged_m:.1f} m as if {check.arrangement}. Correct the grid, or "
-                "give another height model ([plan] elevation).",
+                check.arrangement_sentence("[plan] elevation"),
             ),
         ]
     if not check.is_contradicted:

@@ -81,6 +81,18 @@ class HeightModelCheck:
                 return unit
         return None
 
+    def arrangement_sentence(self, option: str) -> str:
+        """What the arrangement of the model's grid explains, and the correction.
+
+        Args:
+            option: with which another model is given.
+        """
+        return (
+            f"Heights of tie points scatter by {self.scatter_m:.1f} m about the height model, and "
+            f"by {self.arranged_m:.1f} m as if {self.arrangement}. Correct the grid, or give "
+            f"another height model ({option})."
+        )
+
     @property
     def limit_m(self) -> float:
         """The largest difference that is not a contradiction."""

@@ -150,14 +150,8 @@ def _of_model(
         return []
     share = f"{100.0 * check.share_off:.0f} %"
     if check.arrangement:
-        return [
-            TriangulationFinding(
-                "HEIGHT_MODEL_CONTRADICTED",
-                f"Heights of tie points scatter by {check.scatter_m:.1f} m about the height model, "
-                f"and by {check.arranged_m:.1f} m as if {check.arrangement}. Correct the grid, or "
-                "give another model with --elevation.",
-            )
-        ]
+        text = check.arrangement_sentence("--elevation")
+        return [TriangulationFinding("HEIGHT_MODEL_CONTRADICTED", text)]
     if not check.is_contradicted:
         if check.share_off < GROUND_CHANGED_SHARE:
             return _of_difference(check)
