@@ -298,6 +298,12 @@ def orientation(
             f"Against the flight's own navigation: at most {done.change_m:.3f} m and "
             f"{done.change_deg:.4f} deg"
         )
+    if done.offset_m is not None:
+        forward, right, down = done.offset_m
+        console.print(
+            f"Median of the differences in the camera's axes: forward {forward:+.3f} m, right "
+            f"{right:+.3f} m, down {down:+.3f} m"
+        )
     console.print(
         f"CSV, PAT-B, BINGO, footprints and STAC items are in {done.folder}; read about.txt first",
         soft_wrap=True,

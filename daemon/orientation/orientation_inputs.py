@@ -25,7 +25,13 @@ from daemon.orientation.exterior_orientation import (
 from daemon.orientation.geodesy import utm_of
 from daemon.orientation.georeference import Georeference
 from daemon.orientation.rtklib_positions import SUFFIX, read_positions, with_flown_attitude
-from daemon.orientation.trajectory import Trajectory, flown_trajectory, read_trajectory
+from daemon.orientation.trajectory import (
+    Trajectory,
+    flown_trajectory,
+    read_trajectory,
+    trajectory_of_samples,
+)
+from daemon.orientation.trajectory_agreement import refuse_other_trajectory
 from processing.rig import Rig, load_rig
 
 
@@ -102,7 +108,9 @@ def trajectory_of(
 
     Raises:
         OrientationError: none of the exposures has a GPS time.
+        TrajectoryError: a file that is not of this flight.
     """
+    exposures = list(exposures)
     stamped = next((e.mark_gps_ns for e in exposures if e.mark_gps_ns is not None), None)
     if stamped is None:
         raise OrientationError(
@@ -114,5 +122,8 @@ def trajectory_of(
         positions = read_positions(trajectory_file)
         digest = sha256_hex(trajectory_file.read_bytes())[:8]
         name = f"{trajectory_file.stem}-{digest}"
+        refuse_other_trajectory(trajectory_of_samples(name, positions), exposures)
         return with_flown_attitude(name, positions, flown_trajectory(mission, receiver))
-    return read_trajectory(trajectory_file, around_gps_ns=stamped)
+    trajectory = read_trajectory(trajectory_file, around_gps_ns=stamped)
+    refuse_other_trajectory(trajectory, exposures)
+    return trajectory

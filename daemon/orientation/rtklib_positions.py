@@ -1,7 +1,8 @@
 """Positions that RTKLIB computed after landing (`.pos`), with the attitude of the flight.
 
-RTKLIB computes no attitude. Its positions, and those of event marks in `<name>_events.pos` next to
-the file, are joined with roll, pitch and heading that were recorded in flight.
+RTKLIB computes no attitude. Its positions are joined with roll, pitch and heading that were
+recorded in flight; those of event marks in `<name>_events.pos` next to the file are in
+`daemon.orientation.rtklib_events`.
 
 Source: RTKLIB 2.4.2 manual, appendix B.1 "Positioning Solution File".
 """
@@ -10,13 +11,14 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
+from itertools import pairwise
 from pathlib import Path
 
 from daemon.mission.foreign_files import ForeignFileError, read_regular_file
-from daemon.orientation.geodesy import metres_per_degree
+from daemon.orientation.rtklib_events import EVENTS, north_east_up_m, positions_of_marks
 from daemon.orientation.trajectory import (
     TRAJECTORY_MAX_BYTES,
     WEEK_NS,
@@ -27,9 +29,14 @@ from daemon.orientation.trajectory import (
 from drivers.contract import NavSample
 
 SUFFIX = ".pos"
-EVENTS = "_events.pos"
 VELOCITY_SPAN_NS = 5_000_000_000
 """Positions farther apart give no velocity."""
+TIME_RESOLUTION_S = 1e-7
+"""Rounding of times that is not stated: 10 um at 100 m/s."""
+_Slope = tuple[float, tuple[float, float, float]] | None
+"""Span in seconds; velocity north, east, down."""
+_INVALID_MARK = "Q=0"
+"""RTKLIB EX: "Q=0, Time mark is not valid"."""
 _GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC)
 _CALENDAR = re.compile(r"(\d{4})/(\d{2})/(\d{2})")
 _LEAST_COLUMNS = 10
@@ -43,15 +50,27 @@ def read_positions(path: Path) -> list[NavSample]:
         TrajectoryError: a file in another time system, other coordinates or with a line that is
             not understood; the message names the option of RTKLIB that writes what is read.
     """
-    samples = list(_samples(path))
-    events = path.with_name(path.stem + EVENTS)
-    if events.exists():
-        samples += list(_samples(events))
+    solution, resolution_s = _read(path)
+    epochs = [
+        _with_rounded_time(sample, resolution_s) for sample in _with_velocities(_in_order(solution))
+    ]
+    if len(epochs) < 2:
+        raise TrajectoryError(f"{path}: {len(epochs)} positions; a trajectory has two at least")
+    events_path = path.with_name(path.stem + EVENTS)
+    if not events_path.exists():
+        return epochs
+    marks, marks_resolution_s = _read(events_path)
+    events = positions_of_marks(
+        events_path, trajectory_of_samples(path.stem, epochs), _in_order(marks),
+        resolution_s=max(resolution_s, marks_resolution_s),
+    )  # fmt: skip
+    return _in_order([*epochs, *events])
+
+
+def _in_order(samples: Sequence[NavSample]) -> list[NavSample]:
+    """By time; of two at one instant the first."""
     by_instant = {sample.gps_ns: sample for sample in reversed(samples)}
-    ordered = [by_instant[instant] for instant in sorted(by_instant)]
-    if len(ordered) < 2:
-        raise TrajectoryError(f"{path}: {len(ordered)} positions; a trajectory has two at least")
-    return [_with_velocity(ordered, i) for i in range(len(ordered))]
+    return [by_instant[instant] for instant in sorted(by_instant)]
 
 
 def with_flown_attitude(name: str, positions: list[NavSample], flown: Trajectory) -> Trajectory:
@@ -92,12 +111,15 @@ def with_flown_attitude(name: str, positions: list[NavSample], flown: Trajectory
     return trajectory_of_samples(name, joined)
 
 
-def _samples(path: Path) -> Iterator[NavSample]:
+def _read(path: Path) -> tuple[list[NavSample], float]:
+    """Samples of a file, and the resolution of its times in seconds."""
     try:
         text = read_regular_file(path, TRAJECTORY_MAX_BYTES).decode("ascii", "replace")
     except ForeignFileError as error:
         raise TrajectoryError(f"trajectory {error}") from error
     heading = ""
+    samples = []
+    decimals = 9
     for number, line in enumerate(text.splitlines(), 1):
         if line.startswith("%"):
             heading = line if "Q" in line and "ns" in line.split() else heading
@@ -109,10 +131,15 @@ def _samples(path: Path) -> Iterator[NavSample]:
             raise TrajectoryError(
                 f"{path}: no heading that names the time system; write it with out-outhead=on"
             )
+        words = line.replace(",", " ").split()
+        if _INVALID_MARK in words:
+            continue
         try:
-            yield _sample(line.replace(",", " ").split())
+            samples.append(_sample(words))
         except (ValueError, IndexError) as error:
             raise TrajectoryError(f"{path}, line {number}: {error}") from error
+        decimals = len(words[1].partition(".")[2])
+    return samples, 10.0**-decimals
 
 
 def _refuse(path: Path, line: str) -> None:
@@ -178,29 +205,42 @@ def _nanoseconds(text: str) -> int:
     return int(whole) * 1_000_000_000 + int((decimals + "0" * 9)[:9])
 
 
-def _with_velocity(samples: list[NavSample], i: int) -> NavSample:
-    """With the velocity between its neighbours, where these are near."""
-    a, b = samples[max(i - 1, 0)], samples[min(i + 1, len(samples) - 1)]
+def _with_velocities(samples: Sequence[NavSample]) -> list[NavSample]:
+    """With the velocity along the parabola through each sample and its neighbours."""
+    slopes = [_slope(a, b) for a, b in pairwise(samples)]
+    return [
+        replace(sample, velocity_ned_mps=_parabola(before, after))
+        for sample, before, after in zip(samples, [None, *slopes], [*slopes, None], strict=True)
+    ]
+
+
+def _with_rounded_time(sample: NavSample, resolution_s: float) -> NavSample:
+    """With the way flown in the rounding of its time, evenly distributed, in the sigma."""
+    velocity, sigma_m = sample.velocity_ned_mps, sample.horizontal_sigma_m
+    if velocity is None or sigma_m is None or resolution_s <= TIME_RESOLUTION_S:
+        return sample
+    rounding_m = math.hypot(*velocity[:2]) * resolution_s / math.sqrt(12.0)
+    return replace(sample, horizontal_sigma_m=math.hypot(sigma_m, rounding_m))
+
+
+def _slope(a: NavSample, b: NavSample) -> _Slope:
     span_ns = b.gps_ns - a.gps_ns
-    if not 0 < span_ns <= VELOCITY_SPAN_NS:
-        return samples[i]
-    lat_a, lon_a, up_a = _place(a)
-    lat_b, lon_b, up_b = _place(b)
-    per_latitude, per_longitude = metres_per_degree(lat_a, up_a)
+    if span_ns > VELOCITY_SPAN_NS:
+        return None
+    north_m, east_m, up_m = north_east_up_m(a, b)
     span_s = span_ns * 1e-9
-    velocity = (
-        (lat_b - lat_a) * per_latitude / span_s,
-        (lon_b - lon_a) * per_longitude / span_s,
-        -(up_b - up_a) / span_s,
+    return span_s, (north_m / span_s, east_m / span_s, -up_m / span_s)
+
+
+def _parabola(before: _Slope, after: _Slope) -> tuple[float, float, float] | None:
+    if before is None or after is None:
+        only = before or after
+        return None if only is None else only[1]
+    (span_a, va), (span_b, vb) = before, after
+    north, east, down = (
+        (span_b * a + span_a * b) / (span_a + span_b) for a, b in zip(va, vb, strict=True)
     )
-    return replace(samples[i], velocity_ned_mps=velocity)
-
-
-def _place(sample: NavSample) -> tuple[float, float, float]:
-    """Latitude, longitude, height; every sample of a file has them."""
-    values = (sample.latitude_deg, sample.longitude_deg, sample.height_m)
-    latitude, longitude, height = (0.0 if value is None else value for value in values)
-    return latitude, longitude, height
+    return north, east, down
 
 
 def _sample_at(trajectory: Trajectory, gps_ns: int) -> NavSample | None:

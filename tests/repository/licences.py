@@ -58,6 +58,11 @@ _NAMES: Final[Mapping[str, str]] = {
     "GNU Lesser General Public License v2 or later (LGPLv2+)": "LGPL-2.1-or-later",
     "GNU Lesser General Public License v3 (LGPLv3)": "LGPL-3.0",
 }
+_BY_FILE: Final[Mapping[str, str]] = {
+    # LICENSE in its wheel; RTKLIB, which is compiled into it, is BSD-2-Clause.
+    "pyrtklib5": "MIT AND BSD-2-Clause",
+}
+"""Licences of packages whose metadata state none."""
 _SPDX: Final = re.compile(r"[A-Za-z0-9.+-]+(?: WITH [A-Za-z0-9.-]+)?")
 
 
@@ -102,7 +107,7 @@ def packages(lock: str = "requirements.lock") -> tuple[list[Package], list[str]]
             str(about.get("license", "")),
             classifiers if isinstance(classifiers, list) else [classifiers],
         )
-        found.append(Package(name, licence, name not in delivered))
+        found.append(Package(name, licence or _BY_FILE.get(name, ""), name not in delivered))
     return found, absent
 
 

@@ -55,7 +55,8 @@ class OrientationSet:
     """The written set, and its differences from an earlier set.
 
     `change_m` and `change_deg` are the greatest differences of position and of any axis's
-    direction against the in-flight orientation of the same images; None where there is none.
+    direction against the in-flight orientation of the same images; `offset_m` is the median of the
+    differences of position forward, right and down of the camera. None where there is none.
     `failures` are exposures that could not be read, or not be placed in the coordinate system.
     """
 
@@ -67,6 +68,7 @@ class OrientationSet:
     trajectory: str
     change_m: float | None
     change_deg: float | None
+    offset_m: tuple[float, float, float] | None
     failures: tuple[ExposureFailure, ...]
 
 
@@ -124,11 +126,9 @@ def export_orientation(
             f"{mission.path}: nothing could be oriented ({reasons}). A receiver without attitude "
             "orients nothing; give --trajectory with one that has it"
         )
-    change_m, change_deg = None, None
+    change = _Change(None, None, None)
     if trajectory_file is not None or mount_file is not None:
-        change_m, change_deg = _change(
-            mission, oriented, rig, mount_of(mission)[0], georeference, exposures
-        )
+        change = _change(mission, oriented, rig, mount_of(mission)[0], georeference, exposures)
     simulated = any(exposure.simulated for exposure in exposures)
     on = "on level ground" if dem_file is None else f"on the height model {dem_file.name}"
     about = OrientationSetInfo(
@@ -171,8 +171,9 @@ def export_orientation(
         crs=f"{georeference.name} ({georeference.crs.name})",
         height_system=georeference.height_system,
         trajectory=trajectory.name,
-        change_m=change_m,
-        change_deg=change_deg,
+        change_m=change.metres,
+        change_deg=change.degrees,
+        offset_m=change.offset_m,
         failures=failures,
     )
 
@@ -186,6 +187,7 @@ def as_json(done: OrientationSet) -> Mapping[str, Any]:
         "trajectory": done.trajectory,
         "change_m": done.change_m,
         "change_deg": done.change_deg,
+        "offset_forward_right_down_m": done.offset_m,
         "oriented": [
             {
                 "image": eo.name,
@@ -204,6 +206,15 @@ def as_json(done: OrientationSet) -> Mapping[str, Any]:
     }
 
 
+@dataclass(frozen=True)
+class _Change:
+    """See `OrientationSet`."""
+
+    metres: float | None
+    degrees: float | None
+    offset_m: tuple[float, float, float] | None
+
+
 def _change(
     mission: Mission,
     oriented: tuple[ExteriorOrientation, ...],
@@ -211,12 +222,12 @@ def _change(
     mount: MountSection,
     georeference: Georeference,
     exposures: Sequence[Exposure],
-) -> tuple[float | None, float | None]:
-    """Greatest change against the in-flight orientation: metres, and degrees of rotation."""
+) -> _Change:
+    """Changes against the in-flight orientation."""
     try:
         trajectory = flown_trajectory(mission)
     except DaemonError:
-        return None, None
+        return _Change(None, None, None)
     before = {
         one.name: one
         for exposure in exposures
@@ -225,7 +236,20 @@ def _change(
     }
     both = [(before[eo.name], eo) for eo in oriented if eo.name in before]
     if not both:
-        return None, None
+        return _Change(None, None, None)
     moved = [float(np.linalg.norm(b.centre_m - a.centre_m)) for a, b in both]
     turned = vectors_from_rotations(np.array([a.rotation.T @ b.rotation for a, b in both]))
-    return max(moved), float(np.degrees(np.linalg.norm(turned, axis=1).max()))
+    right, forward, up = np.median(
+        [
+            a.rotation.T @ (b.centre_m - a.centre_m)
+            for a, b in both
+            if a.cone == rig.image_cone_name
+        ]
+        or [np.full(3, np.nan)],
+        axis=0,
+    )
+    return _Change(
+        max(moved),
+        float(np.degrees(np.linalg.norm(turned, axis=1).max())),
+        None if np.isnan(up) else (float(forward), float(right), float(-up)),
+    )

@@ -70,20 +70,36 @@ def ranges(at: np.ndarray, tow_s: float, toe_s: float) -> dict[int, float]:
     return found
 
 
-def rawx(at: np.ndarray, gps_ns: int, toe_s: float, noise: np.random.Generator) -> bytes:
-    """One RXM-RAWX of GPS L1 C/A."""
-    week, rest = divmod(gps_ns, WEEK_NS)
-    tow_s = rest * 1e-9
+GPS_L1, GPS_L2 = (0, L1_HZ), (3, 1_227_600_000.0)
+"""Signals of RXM-RAWX: identifier and frequency of L1 C/A and L2 CL."""
+
+
+def rawx(
+    at: np.ndarray,
+    gps_ns: int,
+    toe_s: float,
+    noise: np.random.Generator,
+    *,
+    signals: tuple[tuple[int, float], ...] = (GPS_L1,),
+    clock_ns: int = 0,
+) -> bytes:
+    """One RXM-RAWX of GPS; the receiver's clock is fast by `clock_ns`."""
+    week, rest = divmod(gps_ns + clock_ns, WEEK_NS)
+    tow_s = gps_ns % WEEK_NS * 1e-9
     seen = ranges(at, tow_s, toe_s)
     later = ranges(at, tow_s + 0.5, toe_s)
-    payload = struct.pack("<dHbBBB2x", tow_s, week, 18, len(seen), 1, 1)
+    count = len(seen) * len(signals)
+    payload = struct.pack("<dHbBBB2x", rest * 1e-9, week, 18, count, 1, 1)
     for prn, distance in seen.items():
-        code, phase = distance + noise.normal(0, 0.05), distance * L1_HZ / C + 100_000 * prn
-        doppler = -(later.get(prn, distance) - distance) / 0.5 * L1_HZ / C
-        payload += struct.pack(
-            "<ddfBBBBHBBBBBx", code, phase + noise.normal(0, 0.003), doppler, 0, prn, 0, 0,
-            60_000, 45, 3, 1, 3, 0b0111,
-        )  # fmt: skip
+        doppler_mps = -(later.get(prn, distance) - distance) / 0.5
+        for signal, hertz in signals:
+            measured = distance + C * clock_ns * 1e-9
+            phase = measured * hertz / C + 100_000 * prn + 7_000 * signal
+            payload += struct.pack(
+                "<ddfBBBBHBBBBBx", measured + noise.normal(0, 0.05),
+                phase + noise.normal(0, 0.003), doppler_mps * hertz / C, 0, prn, signal, 0,
+                60_000, 45, 3, 1, 3, 0b0111,
+            )  # fmt: skip
     body = struct.pack("<BBH", 0x02, 0x15, len(payload)) + payload
     a = b = 0
     for byte in body:
