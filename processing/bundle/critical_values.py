@@ -12,7 +12,7 @@ from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy.special import ndtri, stdtrit
 
 from processing.bundle.equation_rows import Equations
 from processing.bundle.normal_equations import ReducedEquations
@@ -79,10 +79,10 @@ def critical_value(test: TestName, significance: float, tests: int, redundancy: 
     """
     single = single_significance(significance, tests)
     if test == "baarda":
-        return float(stats.norm.isf(single / 2.0))
+        return -float(ndtri(single / 2.0))
     if redundancy < 2:
         return math.inf
-    t = float(stats.t.isf(single / 2.0, redundancy - 1))
+    t = -float(stdtrit(redundancy - 1, single / 2.0))
     return t * math.sqrt(redundancy) / math.sqrt(redundancy - 1 + t * t)
 
 

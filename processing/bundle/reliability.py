@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy.special import ndtri
 
 from processing.bundle.adjust import Adjustment
 from processing.bundle.critical_values import MIN_REDUNDANCY, SINGLE_SIGNIFICANCE
@@ -58,8 +58,8 @@ def reliability_of(result: Adjustment) -> Reliability:
     settings = result.settings
     limit = result.reject_limit
     if limit is None:
-        limit = float(stats.norm.isf(SINGLE_SIGNIFICANCE / 2.0))
-    noncentrality = limit + float(stats.norm.ppf(settings.power))
+        limit = -float(ndtri(SINGLE_SIGNIFICANCE / 2.0))
+    noncentrality = limit + float(ndtri(settings.power))
     unit = 1.0 if settings.uses_a_priori_sigma else result.sigma0
     share = result.redundancy_number
     controlled = share > MIN_REDUNDANCY

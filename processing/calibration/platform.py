@@ -20,7 +20,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from processing.geometry.rotation import angles_by_rotation_vector, omega_phi_kappa
 from processing.mosaic.mounting import place_covariance, rotated_mounting
@@ -248,7 +248,7 @@ def _calibrated(
     seen = np.atleast_2d(np.cov(corrections.T, ddof=1))
     # Scatter counts where the exposures' own statement does not explain it.
     ratio = np.diag(seen) / np.maximum(np.diag(own), 1e-30)
-    beyond = ratio > chi2.ppf(1.0 - _SCATTER_ALPHA / 3.0, n - 1) / (n - 1)
+    beyond = ratio > chdtri(n - 1, _SCATTER_ALPHA / 3.0) / (n - 1)
     # An aircraft rotates slowly: errors of neighbouring exposures are correlated and count for
     # less.
     variance = np.where(beyond, np.diag(seen) * _autocorrelation_factor(corrections), np.diag(own))

@@ -19,7 +19,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from processing.mosaic.flight_series import (
     ConeContrasts,
@@ -179,7 +179,7 @@ def _without_outliers(
 ) -> tuple[ContrastSeries, tuple[int, ...]]:
     """Leave out exposures that agree with neither their neighbours before nor those after."""
     count, size = series.y.shape
-    limit = float(chi2.isf(settings.outlier_alpha, size))
+    limit = float(chdtri(size, settings.outlier_alpha))
     factor = variance_factor(series)
     good = np.ones(count, np.bool_)
     reach = settings.neighbours
@@ -214,7 +214,7 @@ def _steps(
     """
     (view, series), wide = ((v, replace(s, factor=variance_factor(s))) for v, s in views)
     count, size = series.y.shape
-    limit = float(chi2.isf(settings.family_alpha / count / cones, size))
+    limit = float(chdtri(size, settings.family_alpha / count / cones))
     reach = settings.min_exposures
     places = np.array([0, *range(reach, count - reach + 1)])
     found: list[FlightDisplacement] = []
@@ -325,13 +325,13 @@ def _step(
     if not relative and lead >= -odds_limit:
         # Sensors that have moved as well are searched again without the probe.
         with_free_probe = _moved(wide[0], _with_free_probe(*wide, probe_bias.probe))
-        displacement = with_free_probe[0][0] > chi2.isf(
-            settings.family_alpha / len(with_free_probe), 2
+        displacement = with_free_probe[0][0] > chdtri(
+            2, settings.family_alpha / len(with_free_probe)
         )
         if lead > odds_limit or displacement:
             kind = "misread"
     statistic, name, delta, cofactor = fits[0]
-    several = freedom > 0 and test[0] - statistic > chi2.isf(settings.family_alpha, freedom)
+    several = freedom > 0 and test[0] - statistic > chdtri(freedom, settings.family_alpha)
     if kind == "named" and several:
         kind = "several"
     near = [f[1] for f in fits[1:] if statistic - f[0] < odds_limit]

@@ -20,7 +20,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from processing.geometry.drift import sensor_dc
 from processing.geometry.topology import mosaic_cones
@@ -129,7 +129,7 @@ def check_layers(
         designs[cone.name] = _repeated(np.eye(count)[:, i : i + 1])
     left = [_remaining(values, weight, design) for design in designs.values()]
     statistic = float(values @ weight @ values) - min(left)
-    limit = float(chi2.ppf(1.0 - ALPHA / len(designs), 4))
+    limit = float(chdtri(4, ALPHA / len(designs)))
     shared = designs[rig.master_cone]
     cofactor = np.linalg.inv(shared.T @ weight @ shared)
     causes: tuple[str, ...] = ()
@@ -154,8 +154,7 @@ def check_layers(
         common_sigmas=np.asarray(np.sqrt(np.diag(cofactor))),
         causes=causes,
         alternatives=alternatives,
-        several_likely=bool(causes)
-        and min(left) > chi2.ppf(1.0 - REST_ALPHA, max(4 * count - 4, 1)),
+        several_likely=bool(causes) and bool(min(left) > chdtri(max(4 * count - 4, 1), REST_ALPHA)),
     )
 
 
@@ -250,7 +249,7 @@ def _causes(
         causes.append(best)
         taken = np.hstack([taken, designs[best]])
         freedom = len(values) - taken.shape[1]
-        if freedom <= 0 or left[best] <= chi2.ppf(1.0 - ALPHA, freedom):
+        if freedom <= 0 or left[best] <= chdtri(freedom, ALPHA):
             break
     return tuple(causes), alternatives
 

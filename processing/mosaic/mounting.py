@@ -19,7 +19,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from processing.geometry.drift import sensor_dc
 from processing.geometry.placement import (
@@ -254,7 +254,7 @@ def check_platform(
         covariance=known,
         statistic=float(y @ np.linalg.solve(covariance, y)),
         degrees_of_freedom=len(y),
-        limit=float(chi2.ppf(1.0 - FAMILY_ALPHA, len(y))),
+        limit=float(chdtri(len(y), FAMILY_ALPHA)),
     )
 
 

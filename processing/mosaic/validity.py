@@ -17,7 +17,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from processing.geometry.placement import SensorPlacement
 from processing.matching.tie_points import TiePoints
@@ -177,7 +177,7 @@ def evaluate_master(
     limit = math.inf
     if len(master) >= 3:
         places = misfit(rig, mosaic, master, temperatures_c, prior_sigmas=settings.prior_sigmas)
-        limit = float(chi2.ppf(1.0 - settings.family_alpha / len(master), 2))
+        limit = float(chdtri(2, settings.family_alpha / len(master)))
         cause = _cause(rig, mosaic, places, temperatures_c, settings, limit)
     degrees_of_freedom = 0 if places is None else len(places.y)
     hypotheses = cause.hypotheses
@@ -190,14 +190,14 @@ def evaluate_master(
     several_displaced = bool(
         explanation
         and cause.degrees_of_freedom > 0
-        and cause.remainder > chi2.ppf(1.0 - settings.family_alpha, cause.degrees_of_freedom)
+        and cause.remainder > chdtri(cause.degrees_of_freedom, settings.family_alpha)
     )
     return Validity(
         observability=_observability(rig, mosaic),
         residuals=_residuals(rig, mosaic, master, temperatures_c, settings),
         global_statistic=0.0 if places is None else places.statistic,
         global_degrees_of_freedom=degrees_of_freedom,
-        global_limit=float(chi2.ppf(1.0 - settings.family_alpha, degrees_of_freedom))
+        global_limit=float(chdtri(degrees_of_freedom, settings.family_alpha))
         if degrees_of_freedom
         else 0.0,
         hypotheses=hypotheses,
@@ -447,7 +447,7 @@ def _relative(
                 sigma_x_px=math.sqrt(float(covariance[0, 0])),
                 sigma_y_px=math.sqrt(float(covariance[1, 1])),
                 statistic=float(delta @ np.linalg.inv(covariance) @ delta),
-                limit=float(chi2.ppf(1.0 - settings.family_alpha / len(pairs), 2)),
+                limit=float(chdtri(2, settings.family_alpha / len(pairs))),
             )
         )
     return tuple(result)

@@ -53,6 +53,19 @@ def test_only_the_capture_side_of_the_drivers_imports_gi() -> None:
     assert all(path.startswith("drivers/cameras/aravis/") for path in importing), importing
 
 
+def test_quantiles_come_from_scipy_special() -> None:
+    """`scipy.stats` takes a third of a second of every process that imports it."""
+    importing = [
+        path.relative_to(ROOT).as_posix()
+        for package in PACKAGES
+        for path in (ROOT / package).rglob("*.py")
+        if re.search(
+            r"^\s*from scipy(\.stats| import stats)\b", path.read_text("utf-8"), re.MULTILINE
+        )
+    ]
+    assert not importing, importing
+
+
 @pytest.mark.parametrize(
     ("imported", "homes"),
     [

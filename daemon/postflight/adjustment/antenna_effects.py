@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy.special import chdtri
 
 from processing.bundle.adjust import Adjustment
 from processing.bundle.block_adjustment import added_parameters
@@ -58,7 +58,7 @@ def antenna_effects(result: Adjustment) -> list[str]:
         less = unit**2 * float(added.value @ np.linalg.solve(added.covariance, added.value))
         redundancy = result.redundancy - count
         sigma0 = math.sqrt(max(result.sigma0**2 * result.redundancy - less, 0.0) / redundancy)
-        if sigma0 <= math.sqrt(stats.chi2.ppf(_LIMIT, redundancy) / redundancy):
+        if sigma0 <= math.sqrt(chdtri(redundancy, 1.0 - _LIMIT) / redundancy):
             found.append((sigma0, _named(kind, added.value, given.lever_m)))
     if not found:
         return []

@@ -6,7 +6,7 @@ import math
 from typing import Final
 
 import numpy as np
-from scipy import stats
+from scipy.special import chdtri
 
 from daemon.postflight.adjustment.antenna_effects import antenna_effects
 from daemon.postflight.adjustment.contradictions import SUSPICIOUS_SIGMA0
@@ -45,7 +45,7 @@ def global_test(result: Adjustment) -> tuple[list[float], bool | None]:
     """
     if result.redundancy <= 0:
         return [], None
-    low, high = np.sqrt(stats.chi2.ppf([0.005, 0.995], result.redundancy) / result.redundancy)
+    low, high = np.sqrt(chdtri(result.redundancy, [0.995, 0.005]) / result.redundancy)
     return [float(low), float(high)], bool(low <= result.sigma0 <= high)
 
 
@@ -160,7 +160,7 @@ def _check_points(checks: PointDifferences) -> list[str]:
     count = int(known.sum())
     if not count or not math.isfinite(checks.squares):
         return []
-    if checks.squares * count <= stats.chi2.ppf(1.0 - _CHECK_SIGNIFICANCE, count):
+    if checks.squares * count <= chdtri(count, _CHECK_SIGNIFICANCE):
         return []
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.nan_to_num(np.abs(checks.difference_m) / checks.sigma_m, nan=0.0)

@@ -6,7 +6,7 @@ import math
 from typing import Final
 
 import numpy as np
-from scipy import stats
+from scipy.special import chdtri
 
 from daemon.postflight.adjustment.reliability_report import unit_of
 from processing.bundle.adjust import Adjustment
@@ -50,7 +50,7 @@ def variance_factor_cautions(result: Adjustment) -> list[str]:
     found = []
     for group in tested:
         tail = _SIGNIFICANCE / len(tested) / 2.0
-        limits = np.asarray(stats.chi2.ppf([tail, 1.0 - tail], group.redundancy))
+        limits = np.asarray(chdtri(group.redundancy, [1.0 - tail, tail]))
         low, high = (limits / group.redundancy).tolist()
         ratio = math.sqrt(group.factor)
         if low <= group.factor <= high or 1.0 / _MIN_RATIO < ratio < _MIN_RATIO:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from daemon import DaemonError
 from daemon.configuration.model import MountSection
@@ -418,7 +418,7 @@ def _misfits(done: BoresightComparison) -> list[str]:
     ):  # fmt: skip
         if redundancy <= 0:
             continue
-        limit = math.sqrt(chi2.ppf(_GLOBAL_TEST, redundancy) / redundancy)
+        limit = math.sqrt(chdtri(redundancy, 1.0 - _GLOBAL_TEST) / redundancy)
         if sigma0 > limit:
             sentences.append(
                 f"residuals of {what} are larger than stated: sigma0 {sigma0:.2f}, at most "

@@ -19,7 +19,7 @@ from typing import Any, Final, Protocol
 import jinja2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from daemon import DaemonError
 from daemon.mission.canonical_json import canonical_bytes
@@ -192,7 +192,7 @@ def changes_between(old: Sequence[Quantity], new: Sequence[Quantity]) -> tuple[Q
         for q in new
         if (q.where, q.what) in before and before[q.where, q.what].unit == q.unit
     ]
-    limit = float(norm.isf(FAMILY_ALPHA / 2.0 / max(len(pairs), 1)))
+    limit = -float(ndtri(FAMILY_ALPHA / 2.0 / max(len(pairs), 1)))
     return tuple(
         QuantityChange(
             b.where, b.what, b.unit, a.value, b.value, _combined_sigma(a.sigma, b.sigma), limit
