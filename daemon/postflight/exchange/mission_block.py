@@ -52,6 +52,7 @@ _GRID = 25
 class MissionBlock:
     """The block, the rig file, whether it was emulated, and what is not in it.
 
+    `stitched` is the image of a stitched rig; "pan" also where heads are images of their own.
     `missing` names oriented heads without an image, `failures` exposures that cannot be read.
     """
 
@@ -61,6 +62,7 @@ class MissionBlock:
     simulated: bool
     missing: tuple[str, ...]
     failures: tuple[ExposureFailure, ...]
+    stitched: StitchedImage = "pan"
 
 
 @dataclass(frozen=True)
@@ -151,7 +153,7 @@ def block_of_mission(
         georeference=inputs.georeference,
     )
     simulated = any(exposure.simulated for exposure in exposures)
-    return MissionBlock(block, rig, inputs.crs, simulated, tuple(missing), failures)
+    return MissionBlock(block, rig, inputs.crs, simulated, tuple(missing), failures, stitched)
 
 
 def _image(

@@ -1,6 +1,7 @@
 """A mission's block as a folder for one program: its files, the images, and what they state.
 
-One folder a program, `export/block/<program>/`, replaced as a whole.
+One folder a program, `export/block/<program>/`, replaced as a whole; images of a stitched rig other
+than PAN have a folder each, such as `export/block/<program>-rgbn/`.
 """
 
 from __future__ import annotations
@@ -120,7 +121,8 @@ def export_block(
     else:
         texts, residuals = _texts(program, block, chosen)
     about = _about(read, block, program, chosen, reason, residuals)
-    folder = mission.export_dir / "block" / program
+    name = program if read.stitched == "pan" else f"{program}-{read.stitched}"
+    folder = mission.export_dir / "block" / name
     refuse_foreign_files(folder, _own_files(texts))
     priors = 0
     with published(folder) as part:

@@ -43,12 +43,18 @@ def export(flown: FlownBlock, *more: str):
     )
 
 
+def folder_of(program: str, stitched: str) -> str:
+    """Each image has a folder of its own, so that one export does not replace another one."""
+    return program if stitched == "pan" else f"{program}-{stitched}"
+
+
 @pytest.mark.parametrize("stitched", list(BANDS))
 def test_each_image_projects_right_and_has_its_size_and_bands(flown, stitched) -> None:
     done = export(flown, "--to", "colmap", "--stitched", stitched, "--json")
     assert done.exit_code == 0, done.output + str(done.exception)
     about = json.loads(done.stdout)
     folder = Path(about["folder"])
+    assert folder.name == folder_of("colmap", stitched)
     model = pycolmap.Reconstruction(folder / "sparse")
     assert len(model.images) == 2 and about["missing"] == []
     pan = flown.rig.virtual_image
@@ -84,7 +90,9 @@ def test_metashape_has_the_bands_of_the_copies(flown, stitched) -> None:
     done = export(flown, "--to", "metashape", "--stitched", stitched, "--no-copies")
     assert done.exit_code == 0, done.output + str(done.exception)
     assert ("without nir" in " ".join(done.output.split())) is (stitched == "rgbn")
-    root = ElementTree.parse(flown.path / "export/block/metashape/cameras.xml")
+    root = ElementTree.parse(
+        flown.path / "export/block" / folder_of("metashape", stitched) / "cameras.xml"
+    )
     assert [band.get("label") for band in root.iter("band")] == BANDS[stitched]
 
 
