@@ -7,7 +7,9 @@ lower one, the pages of the documents first since they take longest.
 
 from __future__ import annotations
 
+import gc
 import os
+from collections.abc import Generator
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,13 @@ from tests.support.stopwatch import slowdown
 __all__ = ["pytest_addoption", "pytest_sessionfinish", "pytest_terminal_summary"]
 
 FLIGHTS = Path(__file__).parent / "system"
+TOGETHER = (
+    "tests/system",
+    "tests/daemon/onboard/triangulation",
+    "tests/daemon/postflight/gis",
+    "tests/daemon/postflight/orthomosaic",
+)
+"""Folders whose `conftest.py` flies a mission for all their files: one worker runs each."""
 PAGES = Path(__file__).parent / "repository" / "test_document_examples.py"
 # Where other programs keep all cores busy, less than their priority would be a standstill.
 NICENESS = int(os.environ.get("SYNTOPIC_TEST_NICENESS", "10"))
@@ -33,15 +42,25 @@ settings.load_profile("patient")
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
-    """File by file, but all flights as if they were one."""
+    """File by file, but folders that share what takes long to build as if they were one file."""
     from xdist.scheduler import LoadFileScheduling
 
     class FlightsFirstScheduling(LoadFileScheduling):
         def _split_scope(self, nodeid: str) -> str:
-            flights = "tests/system"
-            return flights if nodeid.startswith(f"{flights}/") else super()._split_scope(nodeid)
+            folder = next((one for one in TOGETHER if nodeid.startswith(f"{one}/")), None)
+            return folder or super()._split_scope(nodeid)
 
     return FlightsFirstScheduling(config, log)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, None, None]:
+    """What is collected stays: no search for cycles visits it, during the collection or later."""
+    gc.disable()
+    yield
+    gc.collect()
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -14,6 +14,7 @@ import re
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 Function = ast.FunctionDef | ast.AsyncFunctionDef
@@ -112,6 +113,7 @@ def missing_sections(function: Function, *, is_method: bool = False) -> list[str
     return absent
 
 
+@cache
 def classes(package: Path) -> dict[str, Class]:
     """Classes of a package by name."""
     found: dict[str, Class] = {}
