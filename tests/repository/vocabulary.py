@@ -15,6 +15,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
+from functools import cache
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -153,6 +154,7 @@ ALLOWED_NAMES: Final[dict[tuple[str, str], str]] = {
 }
 
 WORD: Final = re.compile(r"[A-Za-z]+")
+DEFINED: Final = re.compile(r"^\s*(?:class|(?:async )?def)\s+(\w+)", re.MULTILINE)
 PART: Final = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+")
 
 
@@ -212,7 +214,10 @@ def words_in(path: str, text: str) -> Iterator[Occurrence]:
 
 def phrases_in(path: str, text: str) -> Iterator[Occurrence]:
     """Phrases of `PHRASES_INSTEAD` in a text."""
+    lower = text.lower()
     for phrase, pattern in PHRASES.items():
+        if phrase.partition(" ")[0].lower() not in lower:
+            continue
         for found in pattern.finditer(text):
             number = text.count("\n", 0, found.start()) + 1
             yield Occurrence(path, number, phrase, " ".join(found[0].split()))
@@ -220,7 +225,7 @@ def phrases_in(path: str, text: str) -> Iterator[Occurrence]:
 
 def names_in(path: str, text: str) -> Iterator[Occurrence]:
     """Words of `NAMES_INSTEAD` in names of classes and functions; titles of tests are sentences."""
-    if not re.search(r"^\s*(?:class|(?:async )?def) ", text, re.MULTILINE):
+    if not any(NAMES_INSTEAD.keys() & parts_of(name) for name in DEFINED.findall(text)):
         return
     for node in ast.walk(ast.parse(text)):
         if not isinstance(node, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
@@ -232,14 +237,15 @@ def names_in(path: str, text: str) -> Iterator[Occurrence]:
                 yield Occurrence(path, node.lineno, word, node.name)
 
 
-def parts_of(name: str) -> list[str]:
+@cache
+def parts_of(name: str) -> tuple[str, ...]:
     """Words of a name, in lower case.
 
     Example:
         >>> parts_of("HeardNs")
-        ['heard', 'ns']
+        ('heard', 'ns')
     """
-    return [part.lower() for word in WORD.findall(name) for part in PART.findall(word)]
+    return tuple(part.lower() for word in WORD.findall(name) for part in PART.findall(word))
 
 
 def replacement(word: str) -> str:
