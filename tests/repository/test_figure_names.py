@@ -18,7 +18,7 @@ ROOT = Path(__file__).parents[2]
 
 def names_read(text: str) -> Iterator[str]:
     """Strings that look up a figure: `figures["..."]` and `figures.get("...")`."""
-    for node in ast.walk(ast.parse(text)):
+    for node in ast.walk(ast.parse(text)) if "figures" in text else ():
         match node:
             case ast.Subscript(value=ast.Name(id="figures"), slice=ast.Constant(value=str(name))):
                 yield name
