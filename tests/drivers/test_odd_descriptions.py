@@ -282,10 +282,11 @@ def test_the_rate_of_its_own_link_is_reported(feature: str, value: int, link: st
 
 @needs_descriptions
 def test_no_real_description_refers_to_itself() -> None:
-    endless = {
-        name: features_with_cycles(read_description(description(name)).xml) for name in names()
-    }
-    assert {name: found for name, found in endless.items() if found} == {}
+    for name in names():
+        stored = description(name)
+        # Some have text around the XML, which its reader skips.
+        xml = stored[stored.find(b"<") : stored.rfind(b">") + 1]
+        assert features_with_cycles(xml) == frozenset(), name
 
 
 def test_limits_of_each_other_are_no_cycle_and_values_of_each_other_are() -> None:

@@ -42,8 +42,9 @@ def is_same(theirs: Any, ours: float) -> bool:
     return math.isclose(float(theirs), float(ours), rel_tol=1e-9, abs_tol=1e-12)
 
 
-@pytest.mark.parametrize("name", names())
+# State by state within a description, which is read once for both.
 @pytest.mark.parametrize("state", [InitialState.FACTORY, InitialState.USER_SET])
+@pytest.mark.parametrize("name", names())
 def test_access_and_values_are_those_of_the_reference(name: str, state: InitialState) -> None:
     found = read_description(description(name))
     memory = SparseMemory()
