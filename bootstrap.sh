@@ -89,7 +89,9 @@ install_system_packages() {
         [ "$only" = --machine ] && exit 0
         exit 1
     fi
-    step "$label" "System packages" "Check the network and the apt sources." nothing 0 sh -c "
+    # One of several that run next to each other.
+    step "$label" "System packages" "Check the network and the apt sources." nothing 0 \
+        flock build/apt.lock sh -c "
         $run apt-get update -qq &&
         $run env DEBIAN_FRONTEND=noninteractive \
             apt-get install -y -qq --no-install-recommends $wanted"
