@@ -20,7 +20,9 @@ Array = NDArray[Any]
 BUNDLE_PX: Final = 32
 BUNDLES: Final = 39
 """So many bundles of pixels of a line are averaged, or as many as fit in it."""
-_AT_ONCE: Final = 4
+SHARE: Final = np.float32(1.0 / BUNDLE_PX)
+"""Of one pixel in the mean of a bundle: a power of two, so that products are exact."""
+_AT_ONCE: Final = 8
 """Rows that are added to the sums of the columns at once."""
 _TILE_ROWS: Final = 16
 """Rows that are transposed at once: their words of one bundle fill a line of cache."""
@@ -50,63 +52,56 @@ def line_means(frame: Array, rows: tuple[int, int]) -> LineMeans:
         Means in the unit of the frame; no bundles where it is smaller than one.
     """
     first, last = rows
-    by_row, by_column = line_sums(last + 1 - first, frame.shape[1])
+    by_row, by_column = line_buffers(last + 1 - first, frame.shape[1])
     if by_row.size and by_column.size:
-        _sum_lines(frame[first : last + 1], by_row, by_column)
-    return means_of_sums(by_row, by_column, first)
+        _average_lines(frame[first : last + 1], by_row, by_column)
+    return means_of(by_row, by_column, first)
 
 
-def line_sums(height: int, width: int) -> tuple[Array, Array]:
-    """Zeros for the sums of bundles.
+def line_buffers(height: int, width: int) -> tuple[Array, Array]:
+    """Zeros for the means of bundles.
 
     Args:
         height: rows, px.
         width: columns, px.
 
     Returns:
-        Sums along rows (height, bundles) and along columns (bundles, width), uint32.
+        Means along rows (height, bundles) and along columns (bundles, width), float32.
     """
     # The bundles of a row lie side by side: one row is written at a time.
-    by_row = np.zeros((height, min(BUNDLES, width // BUNDLE_PX)), np.uint32)
-    by_column = np.zeros((min(BUNDLES, height // BUNDLE_PX), width), np.uint32)
+    by_row = np.zeros((height, min(BUNDLES, width // BUNDLE_PX)), np.float32)
+    by_column = np.zeros((min(BUNDLES, height // BUNDLE_PX), width), np.float32)
     return by_row, by_column
 
 
-def means_of_sums(by_row: Array, by_column: Array, first_row: int) -> LineMeans:
-    """Means of bundles from their sums.
+def means_of(by_row: Array, by_column: Array, first_row: int) -> LineMeans:
+    """The means that `add_line` made of every row.
 
     Args:
-        by_row: sums along rows, (rows, bundles) uint32.
-        by_column: sums along columns, (bundles, columns) uint32.
+        by_row: means along rows, (rows, bundles) float32.
+        by_column: means along columns, (bundles, columns) float32; shared.
         first_row: row of the frame with which `by_row` begins.
 
     Returns:
-        Means, float32.
+        Both with one line after the other.
     """
-    share = np.float32(1.0 / BUNDLE_PX)  # a power of two: exact
-    means = LineMeans(
-        np.empty(by_row.shape[::-1], np.float32), np.empty(by_column.shape, np.float32), first_row
-    )
-    _divide_sums(by_row, by_column, share, means.by_row, means.by_column)
-    return means
+    along_rows = np.empty(by_row.shape[::-1], np.float32)
+    _transpose(by_row, along_rows)
+    return LineMeans(along_rows, by_column, first_row)
 
 
 @compiled_kernel()
-def _divide_sums(by_row, by_column, share, means_by_row, means_by_column):
+def _transpose(by_row, along_rows):
     rows, bundles = by_row.shape
     for first in range(0, rows, _TILE_ROWS):
         last = min(first + _TILE_ROWS, rows)
         for k in range(bundles):
             for r in range(first, last):
-                means_by_row[k, r] = np.float32(by_row[r, k]) * share
-    for k in range(len(by_column)):
-        sums, means = by_column[k], means_by_column[k]
-        for c in range(len(sums)):
-            means[c] = np.float32(sums[c]) * share
+                along_rows[k, r] = by_row[r, k]
 
 
 @compiled_kernel(parallel=True)
-def _sum_lines(frame, by_row, by_column):
+def _average_lines(frame, by_row, by_column):
     height = len(frame)
     blocks = len(by_column)
     tall = height // blocks
@@ -119,44 +114,50 @@ def _sum_lines(frame, by_row, by_column):
 
 @compiled_kernel()
 def add_line(frame, row, row_of_block, of_row, by_column):
-    """Sum the bundles of one line, and add it to those of the columns.
+    """Average the bundles of one line, and add it to those of the columns.
+
+    All sums are exact: of a bundle of words they have less than 24 bits.
 
     Args:
         frame: (h, w) uint16; of a block every row, from its first on.
         row: of the line.
         row_of_block: its place within the block of rows that a bundle of each column is of.
-        of_row: (bundles,) uint32, overwritten.
-        by_column: (w,) uint32, sums of this block's bundle; without columns nothing is added.
+        of_row: (bundles,) float32, overwritten.
+        by_column: (w,) float32, means of this block's bundle; without columns nothing is added.
     """
     line = frame[row]
     bundles = len(of_row)
     wide = np.uint64(len(line) // max(bundles, 1))
     for k in range(bundles):
         # Sums stay 32 bits wide, so that vectors hold eight of them and not four.
-        total = np.uint32(0)
+        total = np.int32(0)
         # Unsigned places are not looked at for negative ones.
         first = np.uint64(k) * wide
         for c in range(BUNDLE_PX):
-            total = np.uint32(total + line[first + np.uint64(c)])
-        of_row[k] = total
+            total = np.int32(total + line[first + np.uint64(c)])
+        of_row[k] = np.float32(total) * SHARE
     if row_of_block < BUNDLE_PX and row_of_block % _AT_ONCE == _AT_ONCE - 1 and len(by_column):
-        one, two, three = frame[row - 3], frame[row - 2], frame[row - 1]
+        one, two, three, four = frame[row - 7], frame[row - 6], frame[row - 5], frame[row - 4]
+        five, six, seven = frame[row - 3], frame[row - 2], frame[row - 1]
         for c in range(len(by_column)):
-            before = np.uint32(np.uint32(one[c]) + np.uint32(two[c]))
-            by_column[c] += np.uint32(before + np.uint32(np.uint32(three[c]) + np.uint32(line[c])))
+            total = np.int32(np.int32(one[c]) + np.int32(two[c]))
+            total = np.int32(total + np.int32(np.int32(three[c]) + np.int32(four[c])))
+            total = np.int32(total + np.int32(np.int32(five[c]) + np.int32(six[c])))
+            total = np.int32(total + np.int32(np.int32(seven[c]) + np.int32(line[c])))
+            by_column[c] += np.float32(total) * SHARE
 
 
 @compiled_kernel()
 def add_changes(changes, places, width, first_row, by_row, by_column):
-    """Add what some pixels of a frame were changed by to the sums of bundles.
+    """Add what some pixels of a frame were changed by to the means of bundles.
 
     Args:
         changes: of their words, (n,) int32.
         places: their row and column in the frame, (n, 2).
         width: of the frame, px.
         first_row: row of the frame with which `by_row` begins.
-        by_row: sums along rows, changed in place, (rows, bundles) uint32.
-        by_column: sums along columns, changed in place, (bundles, columns) uint32.
+        by_row: means along rows, changed in place, (rows, bundles) float32.
+        by_column: means along columns, changed in place, (bundles, columns) float32.
     """
     height, bundles = by_row.shape
     blocks = len(by_column)
@@ -169,8 +170,7 @@ def add_changes(changes, places, width, first_row, by_row, by_column):
         r, column = places[i, 0] - first_row, places[i, 1]
         if r < 0 or r >= height:
             continue
-        # Sums of unsigned words wrap, so that negative changes leave them exact.
-        change = np.uint32(changes[i])
+        change = np.float32(changes[i]) * SHARE
         k, block = of_column[column], of_row[r]
         if k >= 0:
             by_row[r, k] += change

@@ -16,12 +16,17 @@ from processing.rig import Sensor
 
 Array = NDArray[Any]
 
-_EVERY_ROW: Final = 16
-_ROWS: Final = 512
-"""Of taller frames only every second, third .. row is looked at."""
-_PLACES: Final = 8
-"""Pixels of a row, evenly over it, that show whether it holds data."""
-_BUNDLE: Final = 32
+_BRIGHT_ROWS: Final = 32
+_BRIGHT_COLUMN: Final = 16
+"""So many rows, and one of so many columns, show how bright a frame is."""
+_EVERY_ROW: Final = 8
+_BUNDLES: Final = 5
+"""Across track one of so many rows is looked at, along track at most so many bundles of each."""
+_ROWS: Final = 128
+"""Of taller frames only every third, fifth .. row is looked at: an odd step takes even rows and odd
+ones."""
+_BUNDLE: Final = 64
+"""Pixels side by side: two lines of cache."""
 _AHEAD: Final = 2
 """Rows looked at between the one whose pixels are fetched and the one that is measured."""
 _MIN_LENGTH: Final = 34
@@ -58,13 +63,9 @@ def sharpness(
     if last - first + 1 < _MIN_LENGTH or right - left + 1 < _MIN_LENGTH:
         return None, None
     height = last - first + 1
-    pace = max(1, height // _ROWS)
+    pace = height // _ROWS | 1
     sums = np.zeros((-(-height // pace), 2, 4))
     _difference_sums(frame[first : last + 1], left, right + 1, pace, sums)
-    # Where data end, as next to lines that were not read out, there is an edge and no detail.
-    lines = np.minimum(first + pace * np.arange(len(sums))[:, None] + np.arange(3), last)
-    places = np.linspace(left, right, _PLACES).astype(np.int64)
-    sums[(frame[lines[:, :, None], places] == 0).any(axis=(1, 2))] = 0.0
     along, across = sums.sum(axis=0)
     counts = level1_counts_per_dn(sensor.bits)
     return _share(sensor, along, counts), _share(sensor, across, counts)
@@ -82,8 +83,7 @@ def bright_level(sensors: Sequence[Sensor], frames: Sequence[Array]) -> float | 
     """
     samples = []
     for sensor, frame in zip(sensors, frames, strict=True):
-        pace = _EVERY_ROW * max(1, len(frame) // _ROWS)
-        sample = frame[::pace, ::_EVERY_ROW].ravel()
+        sample = frame[:: max(1, len(frame) // _BRIGHT_ROWS), ::_BRIGHT_COLUMN].ravel()
         full = level1_counts_per_dn(sensor.bits) * sensor.full_scale_dn
         samples.append(sample[sample > 0] / full)
     if not samples or not sum(len(sample) for sample in samples):
@@ -106,41 +106,50 @@ def _share(sensor: Sensor, sums: Array, counts: float) -> float | None:
     return (near - noise) / (far - noise)
 
 
-@compiled_kernel(parallel=True, fastmath={"reassoc", "contract"})
+@compiled_kernel(parallel=True)
 def _difference_sums(frame, left, end, pace, sums):
     """Sums of squared differences to the next pixel and to the one after it, of signal, of pixels.
 
     Columns from `left` to before `end` are looked at. `sums` is (rows, 2, 4): by every `pace`-th
-    row, along track from bundles of neighbouring columns (single ones would each cost a line of
-    cache), across track from every `_EVERY_ROW`-th of these rows.
+    row, along track from some bundles of neighbouring columns (single ones would each cost a line
+    of cache), across track from all bundles of every `_EVERY_ROW`-th of these rows.
     """
     height, width = frame.shape[0], end - left
     for r in prange(len(sums)):
         top = r * pace
         if top + 2 < height:
-            here, next_row = frame[top, left:end], frame[top + 1, left:end]
+            here, following = frame[top, left:end], frame[top + 1, left:end]
             after = frame[top + 2, left:end]
-            near = far = signal = 0.0
-            for first in range(0, width - _BUNDLE + 1, _BUNDLE * _EVERY_ROW):
-                fetch_ahead(frame, left + first, top + _AHEAD * pace, _BUNDLE, 3)
-                for c in range(first, first + _BUNDLE):
-                    signal_here = np.int32(here[c])
-                    one = np.float64(np.int32(next_row[c]) - signal_here)
-                    two = np.float64(np.int32(after[c]) - signal_here)
-                    near += one * one
-                    far += two * two
-                    signal += np.float64(signal_here)
-                sums[r, 0, 3] += _BUNDLE
-            sums[r, 0, 0], sums[r, 0, 1], sums[r, 0, 2] = near, far, signal
+            size = min(_BUNDLE, width)
+            step = max(size, (width - size) // (_BUNDLES - 1))
+            for first in range(0, width - size + 1, step):
+                fetch_ahead(frame, left + first, top + _AHEAD * pace, size, 3)
+                _add_bundle(here, following, after, first, first + size, sums[r, 0])
         if r % _EVERY_ROW == 0:
             line = frame[top, left:end]
-            near = far = signal = 0.0
-            for c in range(width - 2):
-                signal_here = np.int32(line[c])
-                one = np.float64(np.int32(line[c + 1]) - signal_here)
-                two = np.float64(np.int32(line[c + 2]) - signal_here)
-                near += one * one
-                far += two * two
-                signal += np.float64(signal_here)
-            sums[r, 1, 0], sums[r, 1, 1], sums[r, 1, 2] = near, far, signal
-            sums[r, 1, 3] = width - 2
+            size = min(_BUNDLE, width - 2)
+            for first in range(0, width - 2 - size + 1, size):
+                _add_bundle(line[:-2], line[1:-1], line[2:], first, first + size, sums[r, 1])
+
+
+@compiled_kernel(fastmath={"reassoc", "contract"})
+def _add_bundle(here, following, after, first, end, sums):
+    """Add the pixels from `first` to before `end`, or none where any of them has no data.
+
+    Where data end, as next to lines that were not read out, there is an edge and no detail.
+    """
+    near = far = signal = np.float32(0.0)
+    missing = np.uint16(0)
+    for c in range(first, end):
+        word, next_word, after_word = here[c], following[c], after[c]
+        missing |= np.uint16((word == 0) | (next_word == 0) | (after_word == 0))
+        one = np.float32(np.int32(next_word) - np.int32(word))
+        two = np.float32(np.int32(after_word) - np.int32(word))
+        near += one * one
+        far += two * two
+        signal += np.float32(word)
+    if missing == 0:
+        sums[0] += near
+        sums[1] += far
+        sums[2] += signal
+        sums[3] += end - first

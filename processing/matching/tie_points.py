@@ -63,11 +63,11 @@ class TiePoints:
     def __len__(self) -> int:
         return len(self.sigma_px)
 
-    def only(self, keep: NDArray[np.bool_]) -> TiePoints:
-        """The points of marked rows; `pairs` and `attempted` stay.
+    def only(self, keep: NDArray[np.bool_] | NDArray[np.intp]) -> TiePoints:
+        """The points of some rows; `pairs` and `attempted` stay.
 
         Args:
-            keep: True for rows that stay, (n,).
+            keep: True for rows that stay, (n,), or their numbers.
 
         Returns:
             A copy with those rows.

@@ -68,6 +68,7 @@ def precision_figures(
         Root mean square over the sensors, and the worst of them; None without a sensor.
     """
     by_sensor: dict[str, float] = {}
+    of_datum = datum_covariance(rig, mosaic, measured_c)
     for cone in rig.pan_cones:
         for sensor in cone.sensors:
             if sensor.name in present:
@@ -78,7 +79,7 @@ def precision_figures(
                     mosaic,
                     sensor.name,
                     np.array(points, np.float64),
-                    measured_c,
+                    of_datum,
                     uncertainty_contribution,
                 )
                 by_sensor[sensor.name] = float(np.sqrt(np.mean(sigma**2)))
@@ -94,7 +95,7 @@ def placed_sigma_px(
     mosaic: Mosaic,
     sensor: str,
     colrow: Array,
-    measured_c: Mapping[str, float],
+    of_datum: Array,
     uncertainty_contribution: UncertaintyContribution | None = None,
 ) -> Array:
     """Standard deviation of the positions of raw pixels in the virtual image.
@@ -106,7 +107,7 @@ def placed_sigma_px(
         mosaic: what the image was made with.
         sensor: name of the sensor.
         colrow: raw column and row, (n, 2).
-        measured_c: temperatures that were read, by probe name.
+        of_datum: its covariance, by `datum_covariance`.
         uncertainty_contribution: what findings add; None is nothing.
 
     Returns:
@@ -121,8 +122,8 @@ def placed_sigma_px(
     placed_mm = vip_mm_from_raw(mosaic.placements[sensor], colrow)
     datum = moved_datum_design(rig, mosaic, placed_mm)
     uncertainty_contribution = uncertainty_contribution or UncertaintyContribution()
-    of_datum = datum_covariance(rig, mosaic, measured_c) + uncertainty_contribution.datum
-    variance = np.sum((datum @ of_datum) * datum, axis=1).reshape(-1, 2)
+    moved = of_datum + uncertainty_contribution.datum
+    variance = np.sum((datum @ moved) * datum, axis=1).reshape(-1, 2)
     variance = variance + uncertainty_contribution.frames.get(sensor, np.zeros(2))
     for part in uncertainty_contribution.parts:
         variance = variance + part.at(mosaic, sensor, colrow) ** 2

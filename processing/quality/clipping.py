@@ -19,7 +19,7 @@ Array = NDArray[Any]
 
 STEP: Final = (16, 8)
 """Of the rows and columns looked at, of rows at least."""
-ROWS: Final = 104
+ROWS: Final = 64
 """Looked at, about."""
 MIN_SHARE: Final = 0.003
 """Of the pixels of a frame at the value where it ends."""

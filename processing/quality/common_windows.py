@@ -33,8 +33,8 @@ WINDOWS: Final = (56, 36)
 WINDOW_PX: Final = 16
 """Side of a window, colour pixels."""
 _COLUMNS: Final = 10
-_BORDER_SHARE: Final = 0.02
-"""Of its sides by which the rectangle around a frame is widened: the lens bends the border."""
+_BORDER_SHARE: Final = 0.04
+"""Of half its sides by which the rectangle around a frame is widened: the lens bends the border."""
 _ORDER: Final = 4
 _LATTICE: Final = np.stack(
     [share.ravel() for share in np.meshgrid(np.linspace(0.0, 1.0, 7), np.linspace(0.0, 1.0, 7))],
@@ -76,7 +76,7 @@ class CommonWindows:
 def measure_common_windows(
     rig: Rig, placements: Mapping[str, SensorPlacement], frames: Mapping[str, Array]
 ) -> CommonWindows | None:
-    """Measure all frames in every second window of an even grid of the virtual image.
+    """Measure all frames in every fourth window of an even grid of the virtual image.
 
     Args:
         rig: the camera.
@@ -88,7 +88,7 @@ def measure_common_windows(
         None for a rig without a virtual image.
     """
     image = rig.virtual_image
-    return None if image is None else _measured(rig, image, placements, frames, every=2)
+    return None if image is None else _measured(rig, image, placements, frames, every=4)
 
 
 def _measured(
@@ -99,7 +99,7 @@ def _measured(
     *,
     every: int,
 ) -> CommonWindows:
-    """All frames in every first or second window of the grid, as on a chessboard."""
+    """All frames in every window of the grid, or in one of so many, along diagonals."""
     vip_mm = vip_mm_from_px(image, _centres(image, every))
     ratio = max(round(exact_colour_ratio(rig) or 1.0), 1)
     pan = {s.name for cone in rig.pan_cones for s in cone.sensors}
@@ -152,27 +152,33 @@ def _inside(placement: SensorPlacement, vip_mm: Array, half_px: int) -> tuple[Ar
     size = np.array([sensor.width_px - 1.0, sensor.height_px - 1.0])
     lattice_mm = vip_mm_from_raw(placement, _LATTICE * size)
     low, high = lattice_mm.min(axis=0), lattice_mm.max(axis=0)
-    margin = _BORDER_SHARE * (high - low)
-    inside: Array = np.all((vip_mm > low - margin) & (vip_mm < high + margin), axis=1)
     middle, half = 0.5 * (low + high), 0.5 * (high - low)
     terms = _terms((lattice_mm - middle) / half)
-    coefficients = np.linalg.solve(terms.T @ terms, terms.T @ _LATTICE)
-    at = _terms((vip_mm[inside] - middle) / half) @ coefficients * size
-    whole = (at[:, 0] > half_px) & (at[:, 0] < sensor.width_px - half_px - 1)
-    whole &= (at[:, 1] > first + half_px) & (at[:, 1] < last - half_px)
-    inside[inside] = whole
-    return at[whole], inside
+    coefficients = np.linalg.solve(terms.T @ terms, terms.T @ (_LATTICE * size))
+    at = np.full((len(vip_mm), 2), np.nan)
+    near = np.flatnonzero(np.all(np.abs(vip_mm - middle) < (1.0 + _BORDER_SHARE) * half, axis=1))
+    at[near] = _terms((vip_mm[near] - middle) / half) @ coefficients
+    least, most = (half_px, first + half_px), (sensor.width_px - half_px - 1, last - half_px)
+    inside: Array = np.all((at > least) & (at < most), axis=1)
+    return at[inside], inside
 
 
+@compiled_kernel()
 def _terms(places: Array) -> Array:
     """Terms of a polynomial of order `_ORDER` in two coordinates (n, 2) within -1 to 1."""
-    powers = [np.ones(len(places)), places[:, 0]]
-    others = [powers[0], places[:, 1]]
-    for _ in range(_ORDER - 1):
-        powers.append(powers[-1] * places[:, 0])
-        others.append(others[-1] * places[:, 1])
-    columns = [powers[i] * others[k - i] for k in range(_ORDER + 1) for i in range(k + 1)]
-    return np.stack(columns, axis=1)
+    terms = np.empty((len(places), (_ORDER + 1) * (_ORDER + 2) // 2))
+    for n in range(len(places)):
+        x, y = places[n]
+        last, power = 0, 1.0
+        terms[n, 0] = 1.0
+        for k in range(1, _ORDER + 1):
+            # Those of the order before times y, and the last of them times x.
+            first, power = last + 1, power * x
+            for i in range(k):
+                terms[n, first + i] = terms[n, last - k + 1 + i] * y
+            last += k + 1
+            terms[n, last] = power
+    return terms
 
 
 def _variance(sensor: Sensor, signal: Array) -> Array:

@@ -26,6 +26,7 @@ MIN_BUNDLES: Final = 15
 MIN_LINES: Final = 8
 MIN_SHARE: Final = 0.04
 """Of the signal, by which a line differs from its neighbours: median over its bundles."""
+_USUAL_STEP: Final = 8
 TIMES_USUAL: Final = 5.0
 """So many times what lines of the frame usually differ from their neighbours. Ground without roads
 along a line reaches 3.3."""
@@ -96,7 +97,10 @@ def _worst(means: Array) -> tuple[int, float] | None:
     if bundles < MIN_BUNDLES or count < MIN_LINES:
         return None
     average = _average_differences(means)
-    limit = max(MIN_SHARE, TIMES_USUAL * float(np.median(average)))
+    # Of most frames no line is looked at: this spares them the median.
+    if average.max() <= MIN_SHARE:
+        return None
+    limit = max(MIN_SHARE, TIMES_USUAL * float(np.median(average[::_USUAL_STEP])))
     lines = np.flatnonzero(average > limit) + 2
     if not len(lines):
         return None

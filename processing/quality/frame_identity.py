@@ -36,7 +36,11 @@ OTHER_PATTERN_LIMIT: Final = 8.0
 MAX_TEXTURE: Final = 3.0
 """Times the usual change between pixels: edges count no more."""
 MIN_POINTS: Final = 100
+ENOUGH_POINTS: Final = 1000
+"""Spread over all that there are, of which the median is taken."""
 MIN_OFFSET_PX: Final = 1.5
+_SPREAD_STEP_PX: Final = 4
+"""One of so many columns shows the usual change."""
 MAX_OFFSET_SHARE: Final = 0.4
 MAX_OFFSET_PX: Final = 1.3
 """How far points of green may lie off by the calibration of the head they came from: PAN pixels,
@@ -189,7 +193,7 @@ def _relative_change(lines: Array, pace: int) -> Array:
     middle = lines[:, pace:-pace]
     change = lines[:, 2 * pace :] - 2.0 * middle + lines[:, : -2 * pace]
     change /= np.maximum(middle, np.float32(20.0))
-    most = MAX_TEXTURE * np.float32(np.median(np.abs(change)))
+    most = MAX_TEXTURE * np.float32(np.median(np.abs(change[:, ::_SPREAD_STEP_PX])))
     limited: Array = np.clip(change, -most, most)
     return limited
 
@@ -212,10 +216,10 @@ def _by_place(
     if rig.colour_master_cone is None or image is None:
         return {}
     green = rig.cone(rig.colour_master_cone).sensors[0]
-    to_green = tie_points.kind == PAN_TO_COLOUR
-    if np.count_nonzero(to_green) < MIN_POINTS:
+    to_green = np.flatnonzero(tie_points.kind == PAN_TO_COLOUR)
+    if len(to_green) < MIN_POINTS:
         return {}
-    points = tie_points.only(to_green)
+    points = tie_points.only(to_green[:: max(1, len(to_green) // ENOUGH_POINTS)])
     pan_mm = np.empty_like(points.raw_a)
     for k in np.unique(points.sensor_a):
         here = points.sensor_a == k

@@ -9,9 +9,9 @@ Source: docs/explanation/mathematics/quality.md#rectangles-with-another-offset.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
@@ -20,15 +20,19 @@ from numpy.typing import NDArray
 from processing.image.compiled_kernel import compiled_kernel
 from processing.image.line_means import BUNDLE_PX, LineMeans
 from processing.quality.ground_steps import Axis
+from processing.quality.sharp_changes import (
+    BLOCK,
+    SHARP,
+    SHARP_BUNDLES,
+    WINDOW,
+    runs_of_sharp,
+    sharp_lines,
+    sizes_at,
+)
 from processing.rig import Sensor
 
 Array = NDArray[Any]
 
-WINDOW: Final = 5
-SHARP_BUNDLES: Final = 4
-"""So many of neighbouring bundles have a change of one sign that is sharp."""
-SHARP: Final = 1.6
-"""Over the standard deviation of the curvature around."""
 MAX_EDGES: Final = 60
 """Edges of a frame along one axis that are compared with each other, the largest."""
 MIN_SIDE_PX: Final = 48
@@ -47,7 +51,6 @@ MAX_RATIO: Final = 2.0
 """Of the steps of two sides."""
 AROUND: Final = 60
 """Lines on each side with which an edge is compared."""
-BLOCK: Final = 32
 _MARGIN: Final = 1.25
 _MAD_TO_SIGMA: Final = 1.4826
 
@@ -129,6 +132,11 @@ class _Lines:
     def pace(self) -> int:
         return self.length // max(len(self.means), 1)
 
+    @cached_property
+    def totals(self) -> Array:
+        """Sums of pixels of the bundles before each, and of all, (bundles + 1, lines) int32."""
+        return np.asarray(_running_totals(self.means))
+
     @property
     def last(self) -> int:
         return self.first + int(self.means.shape[1]) - 1
@@ -138,163 +146,35 @@ class _Lines:
         return slice(*_bundles_between(first, last, self.pace, len(self.means)))
 
 
-@dataclass(frozen=True)
-class _Edge:
-    at: int
-    first: int
-    last: int
-    sign: float
-    size: float
-
-
-def _sharp_edges(lines: _Lines) -> list[_Edge]:
-    """Runs of bundles with a sharp change of one sign between two lines, at most `MAX_EDGES`."""
-    if len(lines.means) < WINDOW or lines.means.shape[1] < BLOCK:
-        return []
-    over, has_run = _sharp_lines(lines.means, SHARP, WINDOW, SHARP_BUNDLES)
-    places = np.flatnonzero(has_run[0] | has_run[1])
-    sizes = _sizes_at(lines.means, over, places)
-    edges = [
-        _Edge(
-            int(places[k]) + lines.first,
-            start * lines.pace,
-            (stop - 1) * lines.pace + BUNDLE_PX - 1,
-            1.0 - 2.0 * falls,
-            size,
-        )
-        for falls, k, start, stop, size in _runs_of_sharp(
-            sizes, np.ascontiguousarray(has_run[:, places]), SHARP, WINDOW, SHARP_BUNDLES
-        )
-    ]
-    return sorted(edges, key=lambda edge: -edge.size)[:MAX_EDGES]
-
-
-@compiled_kernel()
-def _runs_of_sharp(
-    sizes: Array, has_run: Array, least: float, window: int, enough: int
-) -> list[tuple[int, int, int, int, float]]:
-    """Runs of bundles with sharp changes of one sign, where windows with enough of them touch.
+def _sharp_edges(lines: _Lines) -> Array:
+    """Runs of bundles with a sharp change of one sign between two lines, at most `MAX_EDGES`.
 
     Returns:
-        Of each run whether it falls, the number of its line, its first bundle and the one after its
-        last, and its mean size times the square root of its length.
+        Of each the line before it, its first and last pixel, and its sign, (n, 4) int64; the
+        clearest first.
     """
-    bundles = len(sizes)
-    runs = []
-    for k in range(2):
-        sign = np.float32(1.0 - 2.0 * k)
-        for at in np.flatnonzero(has_run[k]):
-            begin = end = -1
-            for j in range(bundles - window + 2):
-                hits = 0
-                if j <= bundles - window:
-                    for i in range(j, j + window):
-                        hits += sign * sizes[i, at] > least
-                is_near = hits >= enough
-                if begin >= 0 and (j > bundles - window or (is_near and j - end > window)):
-                    start, stop = begin, end + window
-                    while not sign * sizes[start, at] > least:
-                        start += 1
-                    while not sign * sizes[stop - 1, at] > least:
-                        stop -= 1
-                    total = 0.0
-                    for i in range(start, stop):
-                        total += sign * sizes[i, at]
-                    runs.append((k, int(at), start, stop, total / math.sqrt(stop - start)))
-                    begin = -1
-                if is_near:
-                    if begin < 0:
-                        begin = j
-                    end = j
-    return runs
-
-
-@compiled_kernel(fastmath={"reassoc", "contract"})
-def _sharp_lines(means: Array, least: float, window: int, enough: int) -> tuple[Array, Array]:
-    """One over the usual change (bundles, blocks), and where enough neighbouring bundles change.
-
-    The change from one line to the next less half of those before and after it, which is a step as
-    it is, is compared with its mean size over the block of lines it is in and those next to it.
-    The lines are marked by whether so many of `window` bundles rise, and fall, (2, lines).
-    """
-    bundles, lines = means.shape
-    blocks = -(-lines // BLOCK)
-    over = np.empty((bundles, blocks), np.float32)
-    usual = np.zeros(blocks + 2, np.float32)
-    size = np.zeros(lines, np.float32)
-    # Bytes, of which vectors hold many.
-    rises = np.zeros((window, lines), np.uint8)
-    falls = np.zeros((window, lines), np.uint8)
-    hits = np.zeros((2, lines), np.uint8)
-    places = np.zeros((2, lines), np.uint8)
-    limit, some = np.float32(least), np.uint8(enough)
-    for k in range(bundles):
-        _curve(means[k], size)
-        for b in range(blocks):
-            # Parts begin at 0: places that might be negative are not added up in vectors.
-            part = size[b * BLOCK : b * BLOCK + BLOCK]
-            total: Any = np.float32(0.0)
-            for i in range(len(part)):
-                total += abs(part[i])
-            usual[b + 1] = total / np.float32(len(part))
-        usual[0], usual[blocks + 1] = usual[1], usual[blocks]
-        rise, fall = rises[k % window], falls[k % window]
-        up, down = hits[0], hits[1]
-        for i in range(lines):
-            up[i] -= rise[i]
-            down[i] -= fall[i]
-        for b in range(blocks):
-            # Of normally distributed changes, a standard deviation is 1.25 times their mean size.
-            sigma = (usual[b] + usual[b + 1] + usual[b + 2]) * np.float32(1.2533 / 3.0)
-            over[k, b] = np.float32(1.0) / (sigma + np.float32(0.25))
-            allowed = limit * (sigma + np.float32(0.25))
-            part = size[b * BLOCK : b * BLOCK + BLOCK]
-            rise_there, fall_there = rise[b * BLOCK :], fall[b * BLOCK :]
-            for i in range(len(part)):
-                rise_there[i] = part[i] > allowed
-                fall_there[i] = part[i] < -allowed
-        some_rise, some_fall = places[0], places[1]
-        for i in range(lines):
-            up[i] += rise[i]
-            down[i] += fall[i]
-            some_rise[i] |= up[i] >= some
-            some_fall[i] |= down[i] >= some
-    return over, places != 0
-
-
-@compiled_kernel()
-def _curve(row: Array, size: Array) -> None:
-    """Change to the next line less half of those before and after it, 0 at the ends."""
-    before, here, after, last = row[:-3], row[1:-2], row[2:-1], row[3:]
-    inner = size[1:-2]
-    for i in range(len(inner)):
-        sharp = np.float32(1.5) * (after[i] - here[i])
-        inner[i] = sharp - np.float32(0.5) * (last[i] - before[i])
-
-
-@compiled_kernel()
-def _sizes_at(means: Array, over: Array, places: Array) -> Array:
-    """The changes of all bundles at some lines over the usual one, (bundles, places)."""
-    bundles, lines = means.shape
-    sizes = np.zeros((bundles, len(places)), np.float32)
-    for j in range(len(places)):
-        i = places[j]
-        if i < 1 or i > lines - 3:
-            continue
-        for k in range(bundles):
-            change = np.float32(1.5) * (means[k, i + 1] - means[k, i])
-            change -= np.float32(0.5) * (means[k, i + 2] - means[k, i - 1])
-            sizes[k, j] = change * over[k, i // BLOCK]
-    return sizes
+    if len(lines.means) < WINDOW or lines.means.shape[1] < BLOCK:
+        return np.empty((0, 4), np.int64)
+    over, has_run = sharp_lines(lines.means, SHARP, WINDOW, SHARP_BUNDLES)
+    places = np.flatnonzero(has_run[0] | has_run[1])
+    runs, size = runs_of_sharp(
+        sizes_at(lines.means, over, places), has_run[:, places], SHARP, WINDOW, SHARP_BUNDLES
+    )
+    sign, number, start, stop = runs[np.argsort(-size, kind="stable")[:MAX_EDGES]].T
+    first, end = start * lines.pace, (stop - 1) * lines.pace + BUNDLE_PX
+    return np.stack((places[number] + lines.first, first, end - 1, sign), axis=1)
 
 
 @dataclass(frozen=True)
 class _Pair:
     """Two sides opposite to each other, one of which may be the border of the frame, and what
-    joins them: sides across between line `top` and `low`, None at the border of the frame."""
+    joins them: sides across between line `top` and `low`, None at the border of the frame.
 
-    opposite: tuple[_Edge, ...]
-    sign: float
+    `opposite` has line and sign of those that are not the border.
+    """
+
+    opposite: tuple[tuple[int, int], ...]
+    sign: int
     top: int
     low: int
     joining: tuple[Side | None, Side | None]
@@ -303,80 +183,85 @@ class _Pair:
 def _joined_pairs(along: _Lines, across: _Lines) -> Iterator[_Pair]:
     """Edges opposite to each other whose ends other edges or the border join."""
     edges = _sharp_edges(along)
-    if not edges:
+    if not len(edges):
         return
-    pairs = _opposite(edges, along)
-    at, first, last, sign = _columns_of(edges)
-    before, after = pairs.T
-    top = np.where(before < 0, along.first, at[before] + 1)
-    low = np.where(after < 0, along.last, at[after])
-    sign = np.where(before < 0, -sign[after], sign[before])
-    # The border has the ends of the edge opposite to it.
-    one, other = np.where(before < 0, after, before), np.where(after < 0, before, after)
-    ends = np.maximum(first[one], first[other]), np.minimum(last[one], last[other])
-    found = _sharpest_at_ends(
-        across.means,
-        np.stack((top, low), axis=1),
-        across.pace,
-        np.stack(ends, axis=1) - across.first,
-        sign,
-        2 * along.pace + BUNDLE_PX,
-    )
+    pairs = _opposite(edges, along.first, along.last)
+    reach = 2 * along.pace + BUNDLE_PX
+    found = _sharpest_at_ends(across.totals, pairs, across.pace, across.first, reach)
     for k in np.flatnonzero(found[:, 0, 0] >= 0.0):
-        extent = int(top[k]), int(low[k])
+        before, after, top, low, sign = (int(number) for number in pairs[k, :5])
         yield _Pair(
-            tuple(edges[i] for i in pairs[k] if i >= 0),
-            float(sign[k]),
-            *extent,
-            (_as_side(across, extent, found[k, 0]), _as_side(across, extent, found[k, 1])),
+            tuple((int(edges[i, 0]), int(edges[i, 3])) for i in (before, after) if i >= 0),
+            sign,
+            top,
+            low,
+            (_as_side(across, (top, low), found[k, 0]), _as_side(across, (top, low), found[k, 1])),
         )
 
 
-def _columns_of(edges: Sequence[_Edge]) -> tuple[Array, Array, Array, Array]:
-    at, first, last = (
-        np.array([getattr(edge, name) for edge in edges], np.int64)
-        for name in ("at", "first", "last")
-    )
-    return at, first, last, np.array([edge.sign for edge in edges])
+@compiled_kernel()
+def _opposite(edges: Array, first_line: int, last_line: int) -> Array:
+    """Two edges opposite to each other; -1 is the border of the frame, between these lines.
 
-
-def _opposite(edges: Sequence[_Edge], lines: _Lines) -> Array:
-    """Numbers of two edges opposite to each other, (n, 2); -1 is the border of the frame."""
-    at, first, last, sign = _columns_of(edges)
-    shared = np.minimum.outer(last, last) - np.maximum.outer(first, first)
-    spanned = np.maximum.outer(last, last) - np.minimum.outer(first, first)
-    opposite = (shared >= MIN_OVERLAP * spanned) & (np.multiply.outer(sign, sign) < 0.0)
-    both = np.argwhere(opposite & (np.subtract.outer(at, at).T >= MIN_SIDE_PX))
-    number = np.arange(len(edges))
-    border = np.full(len(edges), -1)
-    to_end = np.stack((number, border), axis=1)[lines.last - at >= MIN_SIDE_PX]
-    to_begin = np.stack((border, number), axis=1)[at - lines.first >= MIN_SIDE_PX]
-    return np.concatenate((both, to_end, to_begin))
+    Returns:
+        Numbers of both, first and last line and sign of what is between them, and its first and
+        last pixel, (n, 7) int64.
+    """
+    count, found = len(edges), 0
+    pairs = np.empty((count * (count + 2), 7), np.int64)
+    # Those with the border come last.
+    for borders in range(3):
+        for i in range(-1 if borders == 2 else 0, 0 if borders == 2 else count):
+            for j in range(-1 if borders == 1 else 0, 0 if borders == 1 else count):
+                # The border has the ends of the edge opposite to it.
+                one, other = edges[i if i >= 0 else j], edges[j if j >= 0 else i]
+                top = first_line if i < 0 else one[0] + 1
+                low = last_line if j < 0 else other[0]
+                first, last = max(one[1], other[1]), min(one[2], other[2])
+                spanned = max(one[2], other[2]) - min(one[1], other[1])
+                are_opposite = borders > 0 or one[3] * other[3] < 0
+                are_apart = low + 1 - top >= MIN_SIDE_PX
+                if are_opposite and are_apart and last - first >= MIN_OVERLAP * spanned:
+                    sign = -other[3] if i < 0 else one[3]
+                    pairs[found] = np.array([i, j, top, low, sign, first, last])
+                    found += 1
+    return pairs[:found]
 
 
 @compiled_kernel()
-def _sharpest_at_ends(
-    means: Array, extents: Array, pace: int, ends: Array, sign: Array, reach: int
-) -> Array:
-    """What `_sharpest` finds around both ends (n, 2) of each pair of edges, (n, 2, 4).
+def _sharpest_at_ends(totals: Array, pairs: Array, pace: int, first_line: int, reach: int) -> Array:
+    """What `_sharpest` finds around both ends of each pair of edges, (n, 2, 4).
 
     The first number is negative where a pair is not joined: a side that does not show has to be the
     border.
     """
-    found = np.zeros((len(ends), 2, 4))
-    last = means.shape[1] - 1
-    for i in range(len(ends)):
-        bundles = _bundles_between(extents[i, 0], extents[i, 1], pace, len(means))
+    found = np.zeros((len(pairs), 2, 4))
+    last = totals.shape[1] - 1
+    for i in range(len(pairs)):
+        bundles = _bundles_between(pairs[i, 2], pairs[i, 3], pace, len(totals) - 1)
         for k in range(2):
-            place, sharpest = ends[i, k], found[i, k]
+            place, sharpest = pairs[i, 5 + k] - first_line, found[i, k]
+            sign = pairs[i, 4] if k == 0 else -pairs[i, 4]
             (sharpest[0], sharpest[1], sharpest[2], sharpest[3]) = _sharpest(
-                means, bundles, (place - reach, place + reach), sign[i] if k == 0 else -sign[i]
+                totals, bundles, (place - reach, place + reach), sign
             )
             is_border = place <= reach if k == 0 else place >= last - reach
             if sharpest[3] < SIDE_SIGMAS and not is_border:
                 found[i, 0, 0] = -1.0
                 break
     return found
+
+
+@compiled_kernel()
+def _running_totals(means: Array) -> Array:
+    """Sums of pixels of the first bundles of each line: of none, one, and so on up to all."""
+    # Sums of bundles of words are whole numbers, and those of all bundles fit in 32 bits.
+    totals = np.zeros((len(means) + 1, means.shape[1]), np.int32)
+    for k in range(len(means)):
+        before, row, until = totals[k], means[k], totals[k + 1]
+        for i in range(len(row)):
+            until[i] = before[i] + np.int32(row[i] * np.float32(BUNDLE_PX))
+    return totals
 
 
 @compiled_kernel()
@@ -396,8 +281,8 @@ def _closed(along: _Lines, across: _Lines, pair: _Pair) -> tuple[Side, ...]:
     if right - left > MAX_SPAN * along.length or pair.low - pair.top > MAX_SPAN * across.length:
         return ()
     seen = [side for side in pair.joining if side is not None]
-    for edge in pair.opposite:
-        side = _side(along, (left, right), edge.at, edge.sign)
+    for at, sign in pair.opposite:
+        side = _side(along, (left, right), at, sign)
         if side is None:
             return ()
         seen.append(side)
@@ -408,10 +293,10 @@ def _closed(along: _Lines, across: _Lines, pair: _Pair) -> tuple[Side, ...]:
     return tuple(sorted(seen, key=lambda side: -side.sigmas))
 
 
-def _side(lines: _Lines, extent: tuple[int, int], at: int, sign: float) -> Side | None:
+def _side(lines: _Lines, extent: tuple[int, int], at: int, sign: int) -> Side | None:
     """The edge of a sign at a line, over the pixels of an extent; None where it is not sharp."""
     bundles, place = lines.bundles(*extent), at - lines.first
-    found = _sharpest(lines.means, (bundles.start, bundles.stop), (place, place), sign)
+    found = _sharpest(lines.totals, (bundles.start, bundles.stop), (place, place), sign)
     return _as_side(lines, extent, np.array(found))
 
 
@@ -426,7 +311,7 @@ def _as_side(lines: _Lines, extent: tuple[int, int], found: Array) -> Side | Non
 
 @compiled_kernel(fastmath={"reassoc", "contract"})
 def _sharpest(
-    means: Array, bundles: tuple[int, int], places: tuple[int, int], sign: float
+    totals: Array, bundles: tuple[int, int], places: tuple[int, int], sign: float
 ) -> tuple[float, float, float, float]:
     """The sharpest edge of a sign between the lines of some places, of the mean of some bundles.
 
@@ -437,17 +322,16 @@ def _sharpest(
     """
     none = 0.0, 0.0, 0.0, 0.0
     start = max(places[0] - AROUND, 0)
-    count = min(places[1] + AROUND, means.shape[1]) - start
+    count = min(places[1] + AROUND, totals.shape[1]) - start
     # `size[i]` is of the line `start + i + 2` and the next.
     first, last = max(places[0] - start - 2, 0), min(places[1] - start - 2, count - 6)
     if bundles[1] <= bundles[0] or count < AROUND // 2 or last < first:
         return none
-    mean = np.zeros(count)
-    for k in range(bundles[0], bundles[1]):
-        row = means[k, start : start + count]
-        for i in range(count):
-            mean[i] += row[i]
-    share = 1.0 / (bundles[1] - bundles[0])
+    before_all, until_all = totals[bundles[0], start:], totals[bundles[1], start:]
+    mean = np.empty(count)
+    for i in range(count):
+        mean[i] = until_all[i] - before_all[i]
+    share = 1.0 / (BUNDLE_PX * (bundles[1] - bundles[0]))
     size = np.empty(count - 5)
     for i in range(count - 5):
         # (2 c[1] - c[0] - c[2]) / 3 of the curvatures c = d[1] - (d[0] + d[2]) / 2 of changes d.

@@ -13,6 +13,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from processing.image.compiled_kernel import compiled_kernel
 from processing.quality.figures.image import LineOrderFigures
 from processing.radiometry.demosaic import is_bayer
 from processing.rig import Rig, Sensor
@@ -30,6 +31,8 @@ IMBALANCE: Final = 0.05
 by a few per cent in healthy sensors, over water by more than the ground does."""
 MIN_DIFFERENCE: Final = 1.0
 """DN, of single words: less is no ground."""
+_LEAST_SHARE: Final = 0.01
+"""Of both differences, the ratio of which is therefore 99 at most."""
 
 
 def line_order_figures(rig: Rig, frames: Mapping[str, Array]) -> LineOrderFigures | None:
@@ -68,35 +71,56 @@ def disorder(sensor: Sensor, frame: Array, axis: int) -> float:
         ones, and of pairs of lines in turn, the larger over the smaller. Zero without ground.
     """
     lines = frame if axis == 0 else frame.T
-    green = _green(sensor, axis)
-    size = len(lines) - len(lines) % 2
-    if size < 2 * LINES:
+    if len(lines) < 2 * LINES:
         return 0.0
+    even, odd = _green(sensor, axis)
     unit = MIN_DIFFERENCE * sensor.raw_units_per_dn
+    return float(_disorder(lines, even, odd, np.float32(unit)))
+
+
+@compiled_kernel(fastmath={"reassoc", "contract"})
+def _disorder(lines: Array, even: int, odd: int, unit: float) -> float:
+    """See `disorder`; in even and odd lines, words from `even` and `odd` on are compared."""
     # Green lies in every second word.
     step = 2 * max(1, lines.shape[1] // (2 * WORDS))
-    count = (lines.shape[1] - 1) // step
-    firsts = np.linspace(0, size - LINES, BLOCKS).astype(int) // 2 * 2
-    at = (firsts[:, None] + np.arange(LINES)).reshape(-1, 1)
-    words = np.empty((BLOCKS * LINES, count), np.float32)
-    for odd in (0, 1):
-        words[odd::2] = lines[at[odd::2], green[odd] + step * np.arange(count)]
-    words = words.reshape(BLOCKS, LINES, count)
-    of_even, of_odd = (words[:, start::2].mean(axis=(1, 2)) for start in (0, 1))
-    balance = np.clip(of_even / np.maximum(of_odd, unit), 1.0 - IMBALANCE, 1.0 + IMBALANCE)
-    words[:, 1::2] *= balance[:, None, None]
-    apart = [np.abs(words[:, k:] - words[:, :-k]).mean(axis=2) for k in (1, 2, 3, 4)]
-    means = np.array([of_lines.mean(axis=1) for of_lines in apart])
-    blocks = np.flatnonzero((means > 0.0).all(axis=0))
-    if len(blocks) <= BLOCKS // 2 or float(np.median(means[0])) < unit:
+    words = np.empty((LINES, (lines.shape[1] - 1) // step), np.float32)
+    # Mean differences of lines one to four apart, and of neighbours within and between pairs.
+    means = np.zeros((4, BLOCKS))
+    inside = np.zeros(BLOCKS)
+    used = 0
+    for block in range(BLOCKS):
+        first = (len(lines) // 2 * 2 - LINES) * block // (BLOCKS - 1) // 2 * 2
+        # Of columns, neighbouring ones are side by side in memory.
+        for j in range(words.shape[1]):
+            for i in range(0, LINES, 2):
+                words[i, j] = np.float32(lines[first + i, even + step * j])
+                words[i + 1, j] = np.float32(lines[first + i + 1, odd + step * j])
+        of_even, of_odd = words[::2].mean(), words[1::2].mean()
+        balance = min(max(of_even / max(of_odd, unit), 1.0 - IMBALANCE), 1.0 + IMBALANCE)
+        words[1::2] *= np.float32(balance)
+        apart = np.zeros((4, LINES))
+        for k in range(4):
+            for i in range(LINES - k - 1):
+                total = np.float32(0.0)
+                here, there = words[i], words[i + k + 1]
+                for j in range(len(here)):
+                    total += abs(there[j] - here[j])
+                apart[k, i] = total / words.shape[1]
+            means[k, used] = apart[k].sum() / (LINES - k - 1)
+        if means[:, used].min() > 0.0:
+            # Medians: a step of the signal, as in banding, is between two lines of many.
+            within = np.median(apart[0, 0 : LINES - 1 : 2])
+            between = np.median(apart[0, 1 : LINES - 1 : 2])
+            inside[used] = within / (within + between) if within + between > 0.0 else 0.5
+            used += 1
+    if used <= BLOCKS // 2 or np.median(means[0, :used]) < unit:
         return 0.0
-    first, second, third, fourth = means[:, blocks]
     # Rows of plants may be as narrow as the pattern of a few lines, but not of all.
-    distances = np.minimum(first, third) / np.maximum(second, fourth)
-    # Medians: a step of the signal, as in banding, is between two lines of many.
-    within, between = (np.median(apart[0][blocks, start::2], axis=1) for start in (0, 1))
-    inside = float(np.median(within / (within + between)))
-    return max(float(np.median(distances)), inside / (1.0 - inside), (1.0 - inside) / inside)
+    less, more = np.minimum(means[0], means[2]), np.maximum(means[1], means[3])
+    distances = np.median(less[:used] / more[:used])
+    # Where lines are repeated, those within or between pairs do not differ at all.
+    usual = min(max(np.median(inside[:used]), _LEAST_SHARE), 1.0 - _LEAST_SHARE)
+    return float(max(distances, usual / (1.0 - usual), (1.0 - usual) / usual))
 
 
 def _green(sensor: Sensor, axis: int) -> tuple[int, int]:

@@ -27,8 +27,8 @@ CELLS: Final = 4
 MIN_WINDOWS: Final = 24
 """Of the whole grid in a region."""
 SUSPICIOUS: Final = (0.06, 0.3)
-"""Deficits of colour and of PAN from which on twice as many windows are measured, half of what
-changes the verdict."""
+"""Deficits of colour and of PAN from which on all windows are measured, half of what changes the
+verdict."""
 MIN_FRAMES: Final = 3
 SINGLE_AXIS_DEFICIT: Final = 0.1
 """A band that only PAN can be compared with may hold so much less: near infrared, of vegetation."""

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from processing.geometry.placement import SensorPlacement
+from processing.geometry.placement import SensorPlacement, nominal_placements
 from processing.geometry.topology import Overlap, overlaps
 from processing.image.sharpness import sharpness
 from processing.matching.tie_point_search import overlap_pixels
@@ -41,7 +42,7 @@ def relative_sharpness_figures(
 
     Args:
         rig: the camera.
-        placements: of the sensors, by name.
+        placements: of the sensors, by name; of them the TDI shifts.
         frames: Level-1 words by sensor name, (h, w) uint16.
 
     Returns:
@@ -51,14 +52,15 @@ def relative_sharpness_figures(
     Source: docs/explanation/mathematics/quality.md#sharpness.
     """
     common = [o for o in overlaps(rig) if o.sensor_a in frames and o.sensor_b in frames]
-    shares: dict[tuple[str, Overlap], tuple[float | None, float | None]] = {}
+    shares: dict[tuple[str, Overlap], Shares] = {}
     for name in {name for o in common for name in (o.sensor_a, o.sensor_b)}:
-        own = [o for o in common if name in (o.sensor_a, o.sensor_b)]
-        areas = overlap_pixels(placements[name], own)
-        for overlap, (left, right, top, low) in zip(own, areas, strict=True):
-            shares[name, overlap] = sharpness(
-                rig.sensor(name), frames[name], (top, low), (left, right)
-            )
+        areas = _overlap_areas(rig, name, placements[name].tdi_shifts)
+        for overlap in common:
+            if overlap in areas:
+                left, right, top, low = areas[overlap]
+                shares[name, overlap] = sharpness(
+                    rig.sensor(name), frames[name], (top, low), (left, right)
+                )
     noisy = _noisiest(common, shares)
     ratios: dict[str, list[float]] = {}
     for overlap in common:
@@ -82,6 +84,19 @@ def relative_sharpness_figures(
     if worst[name] >= MIN_RATIO:
         return of_noise
     return RelativeSharpnessFigures(name, worst[name], noisy_sensor, noisy_share)
+
+
+@lru_cache(maxsize=256)
+def _overlap_areas(
+    rig: Rig, name: str, tdi_shifts: int
+) -> Mapping[Overlap, tuple[int, int, int, int]]:
+    """First and last column, first and last row of a sensor in each of its overlaps.
+
+    As calibrated: which pixels of thousands are looked at may differ by some.
+    """
+    own = [o for o in overlaps(rig) if name in (o.sensor_a, o.sensor_b)]
+    placement = nominal_placements(rig, {}, {name: tdi_shifts}, use_drift=False)[name]
+    return dict(zip(own, overlap_pixels(placement, own), strict=True))
 
 
 def _noisiest(

@@ -169,13 +169,9 @@ def _largest(
     lines = np.flatnonzero((rising >= often) | (falling >= often))
     if not len(lines):
         return None
-    signal = 0.5 * (means[:, lines + 1] + means[:, lines])
-    bright = np.median(signal, axis=0)
-    relative = (means[:, lines + 1] - means[:, lines]) / np.maximum(signal, 1.0)
-    low, high = np.quantile(relative, (QUANTILE, 1.0 - QUANTILE), axis=0)
+    bright, low, middle, high = _quantiles(means, lines, QUANTILE)
     # What nearly all bundles of a line share; nothing where they differ in sign.
     common = np.where(low > 0.0, low, np.where(high < 0.0, high, 0.0))
-    middle = np.median(relative, axis=0)
     least = min_counts / np.maximum(bright, 1.0)
     shared = np.abs(middle) * (np.abs(common) > 0.5 * np.abs(middle))
     if not np.any(shared > np.maximum(BANDING_STEP, least)):
@@ -237,6 +233,38 @@ def _signs(means: Array) -> tuple[Array, Array]:
             rising[i] += following[i] > here[i]
             falling[i] += following[i] < here[i]
     return rising, falling
+
+
+@compiled_kernel()
+def _quantiles(means: Array, lines: Array, share: float) -> Array:
+    """Over the bundles, between some lines and the next, (4, lines): the median signal, and of its
+    relative change the quantile of a share, the median, and the quantile of the other share."""
+    bundles = means.shape[0]
+    found = np.empty((4, len(lines)), np.float32)
+    signal = np.empty(bundles, np.float32)
+    change = np.empty(bundles, np.float32)
+    for j in range(len(lines)):
+        at = lines[j]
+        for k in range(bundles):
+            before, after = means[k, at], means[k, at + 1]
+            signal[k] = np.float32(0.5) * (before + after)
+            change[k] = (after - before) / max(signal[k], np.float32(1.0))
+        signal.sort()
+        change.sort()
+        found[0, j] = _quantile(signal, 0.5)
+        found[1, j] = _quantile(change, share)
+        found[2, j] = _quantile(change, 0.5)
+        found[3, j] = _quantile(change, 1.0 - share)
+    return found
+
+
+@compiled_kernel()
+def _quantile(values: Array, share: float) -> float:
+    """Of values in rising order, between the two nearest."""
+    place = share * (len(values) - 1)
+    below = int(place)
+    above = min(below + 1, len(values) - 1)
+    return float(values[below] + (place - below) * (values[above] - values[below]))
 
 
 @compiled_kernel()

@@ -30,8 +30,8 @@ from processing.image.line_means import (
     LineMeans,
     add_changes,
     add_line,
-    line_sums,
-    means_of_sums,
+    line_buffers,
+    means_of,
 )
 from processing.radiometry.corrector import RESPONSE_UNIT, Corrector
 from processing.radiometry.defects import interpolate_defects
@@ -169,9 +169,9 @@ def level1_from_level0(
     by_gain = scale * 0.5 * counts / max(1.0 + corrector.response_per_k * warmth, 0.5)
     exposed = exposed_rows(sensor, shifts)
     first, end = exposed[0], exposed[1] + 1
-    by_row, by_column = line_sums(end - first, sensor.width_px)
+    by_row, by_column = line_buffers(end - first, sensor.width_px)
     if not measure_lines or not by_row.size or not by_column.size:
-        by_row, by_column = np.zeros((end - first, 0), np.uint32), np.zeros((_BANDS, 0), np.uint32)
+        by_row, by_column = (np.zeros(size, np.float32) for size in ((end - first, 0), (_BANDS, 0)))
     sums = np.zeros((len(by_column), 3), np.int64)
     least = min_raw_value(sensor)
     out[:first] = 0
@@ -231,7 +231,7 @@ def level1_from_level0(
         2.0 * total / counts / pixels,
         saturated / pixels,
         unread / compared if least > 0 else None,
-        means_of_sums(by_row, by_column, first) if by_row.size else None,
+        means_of(by_row, by_column, first) if by_row.size else None,
     )
 
 

@@ -21,7 +21,7 @@ from processing.image.accelerator.cuda_kernel import (
     quotient,
     whole,
 )
-from processing.image.line_means import BUNDLE_PX
+from processing.image.line_means import BUNDLE_PX, SHARE
 from processing.radiometry.level1 import UNREAD_STEP_PX
 from processing.radiometry.unclean_blocks import BLOCK_PX
 
@@ -60,8 +60,8 @@ def flat_pass(
         first_row: first row that is corrected; as many follow as `by_row` has.
         out: (h, w) uint16, these rows are overwritten.
         sums: (bands, 3) int64, zeros: halved words, saturated and unread pixels are added.
-        by_row: sums of bundles along rows, (rows, bundles) uint32, overwritten.
-        by_column: sums of bundles along columns, (bundles, w) uint32, overwritten.
+        by_row: means of bundles along rows, (rows, bundles) float32, overwritten.
+        by_column: means of bundles along columns, (bundles, w) float32, overwritten.
         unclean: marks of the blocks, (rows, columns) uint8.
     """
     rows, width = len(by_row), raw.shape[1]
@@ -150,8 +150,8 @@ def _finish(
         _sum_columns[(-(-width // _THREADS), blocks), _THREADS](
             target, rows // blocks, along_columns
         )
-        by_row[:] = along_rows.copy_to_host()
-        by_column[:] = along_columns.copy_to_host()
+        by_row[:] = along_rows.copy_to_host() * SHARE
+        by_column[:] = along_columns.copy_to_host() * SHARE
     out[first_row : first_row + rows] = target.copy_to_host()
     if len(sums):
         sums[0] += totals.copy_to_host()

@@ -10,7 +10,7 @@ import pytest
 from processing.matching.tie_points import PAN_TO_PAN, TiePoints
 from processing.mosaic.confirmed_points import unconfirmed
 from processing.mosaic.free_mosaic import MosaicSettings
-from processing.mosaic.precision import placed_sigma_px
+from processing.mosaic.precision import datum_covariance, placed_sigma_px
 from processing.mosaic.stitching import stitch
 from processing.rig import find_rig
 from tests.processing.mosaic.test_free_mosaic import image_points
@@ -70,6 +70,7 @@ def test_a_frame_under_a_cloud_rests_on_calibration_and_not_on_one_wrong_point()
     places, true = image_points(truth, found.image)
     error = np.sqrt(np.mean((places - true) ** 2, axis=1))
     corners = np.array([[0.0, 0.0], [900.0, 600.0]])
-    sigma = placed_sigma_px(MINI, found.image, "SU30", corners, dict.fromkeys(MINI.probes, 20.0))
+    datum = datum_covariance(MINI, found.image, dict.fromkeys(MINI.probes, 20.0))
+    sigma = placed_sigma_px(MINI, found.image, "SU30", corners, datum)
     assert error.max() < 3.0 * sigma.max()
     assert sigma.max() < 2.0

@@ -16,6 +16,7 @@ from processing.mosaic.held import calibrated_parts, held_quantities, scale_figu
 from processing.mosaic.mounting import verified_mosaic
 from processing.mosaic.precision import (
     UncertaintyContribution,
+    datum_covariance,
     disturbance_covariance_px,
     placed_sigma_px,
 )
@@ -142,6 +143,9 @@ def test_places_drift_and_probes_widen_the_sigma_of_a_healthy_platform() -> None
     variance = np.diag(disturbance_covariance_px(DMC, mosaic, {"P2": AT}, disturbance))
     expected = sum(part.at(mosaic, "P2", AT) ** 2 for part in parts)
     np.testing.assert_allclose(variance.reshape(-1, 2), expected, rtol=1e-9)
-    alone = placed_sigma_px(DMC, mosaic, "P2", AT, READ) ** 2
-    both = placed_sigma_px(DMC, mosaic, "P2", AT, READ, disturbance) ** 2
+    alone = placed_sigma_px(DMC, mosaic, "P2", AT, datum_covariance(DMC, mosaic, READ)) ** 2
+    both = (
+        placed_sigma_px(DMC, mosaic, "P2", AT, datum_covariance(DMC, mosaic, READ), disturbance)
+        ** 2
+    )
     np.testing.assert_allclose(both - alone, expected, rtol=1e-6)

@@ -247,12 +247,16 @@ def test_findings_add_their_variance_to_the_placed_pixels() -> None:
     rig, mosaic = mosaic_of("ultracam-x-mini")
     at = np.array([[100.0, 700.0], [1200.0, 30.0]])
     x, y = vip_mm_from_raw(mosaic.placements["SU10"], at).T
-    plain = placed_sigma_px(rig, mosaic, "SU10", at, NO_READING) ** 2
+    plain = placed_sigma_px(rig, mosaic, "SU10", at, datum_covariance(rig, mosaic, NO_READING)) ** 2
     datum = np.diag([0.3**2, 0.7**2, 0.02**2, 0.05**2])
     found = UncertaintyContribution(
         datum, {"SU10": np.array([4.0, 9.0]), "SU11": np.array([100.0, 100.0])}
     )
-    more = placed_sigma_px(rig, mosaic, "SU10", at, NO_READING, found) ** 2 - plain
+    more = (
+        placed_sigma_px(rig, mosaic, "SU10", at, datum_covariance(rig, mosaic, NO_READING), found)
+        ** 2
+        - plain
+    )
     expected_x = 0.3**2 + (0.02 * x) ** 2 + (0.05 * y) ** 2 + 4.0
     expected_y = 0.7**2 + (0.02 * y) ** 2 + (0.05 * x) ** 2 + 9.0
     np.testing.assert_allclose(more, np.column_stack([expected_x, expected_y]), rtol=1e-9)
@@ -279,8 +283,13 @@ def test_what_tie_points_leave_open_counts_with_its_accuracy_before_the_adjustme
     )
     tied = vip_precision_px(mosaic, "SU10", at) ** 2
     known = dataclasses.replace(mosaic, undetermined=())
-    datum = placed_sigma_px(rig, known, "SU10", at, NO_READING) ** 2 - tied
-    found = placed_sigma_px(rig, changed, "SU10", at, NO_READING) ** 2
+    datum = (
+        placed_sigma_px(rig, known, "SU10", at, datum_covariance(rig, known, NO_READING)) ** 2
+        - tied
+    )
+    found = (
+        placed_sigma_px(rig, changed, "SU10", at, datum_covariance(rig, changed, NO_READING)) ** 2
+    )
     np.testing.assert_allclose(found, factor**2 * tied + datum, rtol=1e-9)
 
 
@@ -293,7 +302,10 @@ def test_the_covariance_of_places_holds_their_variances_and_what_they_share() ->
     for name, rows, places in (("SU00", slice(0, 4), at), ("SU10", slice(4, 6), at[:1])):
         own = vip_precision_px(mosaic, name, places) ** 2
         np.testing.assert_allclose(np.diag(tied)[rows], own.ravel(), rtol=1e-9)
-        total = placed_sigma_px(rig, mosaic, name, places, NO_READING) ** 2
+        total = (
+            placed_sigma_px(rig, mosaic, name, places, datum_covariance(rig, mosaic, NO_READING))
+            ** 2
+        )
         np.testing.assert_allclose(np.diag(tied + datum)[rows], total.ravel(), rtol=1e-9)
     # Points far apart on one sensor share its unknowns: their correlation is that of its shift.
     assert np.linalg.matrix_rank(datum, tol=1e-9 * datum.max()) <= 4
@@ -310,7 +322,17 @@ def test_figures_are_root_mean_squares_over_middle_and_corners_of_present_sensor
     w, h = 1248, 832
     at = [((w - 1) / 2, (h - 1) / 2), (0, 0), (w - 1, 0), (0, h - 1), (w - 1, h - 1)]
     mean = [
-        np.mean(placed_sigma_px(rig, mosaic, s, np.array(at, float), NO_READING, found) ** 2)
+        np.mean(
+            placed_sigma_px(
+                rig,
+                mosaic,
+                s,
+                np.array(at, float),
+                datum_covariance(rig, mosaic, NO_READING),
+                found,
+            )
+            ** 2
+        )
         for s in ("SU00", "SU10")
     ]
     assert figures.stitched_sigma_px == pytest.approx(np.sqrt(np.mean(mean)))

@@ -20,17 +20,19 @@ from processing.quality.frame_blocks import (
     edge_limits,
 )
 from processing.quality.frame_rectangles import (
-    SHARP,
-    SHARP_BUNDLES,
-    WINDOW,
     Side,
     _bundles_between,
-    _runs_of_sharp,
-    _sharp_lines,
-    _sizes_at,
     changed_rectangles,
 )
 from processing.quality.ground_steps import GroundView
+from processing.quality.sharp_changes import (
+    SHARP,
+    SHARP_BUNDLES,
+    WINDOW,
+    runs_of_sharp,
+    sharp_lines,
+    sizes_at,
+)
 from processing.rig import find_rig
 
 pytestmark = pytest.mark.trust
@@ -132,9 +134,9 @@ def test_a_side_with_a_gap_is_one_edge_and_distant_ones_are_two() -> None:
     has_run = np.zeros((2, 3), np.bool_)
     sizes[10:20, 1] = sizes[22:32, 1] = sizes[50:56, 1] = 2.0
     has_run[0, 1] = True
-    runs = _runs_of_sharp(sizes, has_run, SHARP, WINDOW, SHARP_BUNDLES)
-    assert [run[:4] for run in runs] == [(0, 1, 10, 32), (0, 1, 50, 56)]
-    assert runs[0][4] == pytest.approx(40.0 / np.sqrt(22.0))
+    runs, mean_sizes = runs_of_sharp(sizes, has_run, SHARP, WINDOW, SHARP_BUNDLES)
+    assert runs.tolist() == [[1, 1, 10, 32], [1, 1, 50, 56]]
+    assert mean_sizes[0] == pytest.approx(40.0 / np.sqrt(22.0))
 
 
 def test_sharp_lines_are_those_with_enough_sharp_changes_among_neighbouring_bundles() -> None:
@@ -142,7 +144,7 @@ def test_sharp_lines_are_those_with_enough_sharp_changes_among_neighbouring_bund
     means = draw.normal(3000.0, 10.0, (12, 75)).astype(np.float32)
     means[3:8, 41:] += 60.0
     means[6:9, 20:] -= 60.0
-    over, marked = _sharp_lines(means, SHARP, WINDOW, SHARP_BUNDLES)
+    over, marked = sharp_lines(means, SHARP, WINDOW, SHARP_BUNDLES)
     change = np.diff(means.astype(np.float64), axis=1)
     size = np.zeros(means.shape)
     size[:, 1:-2] = 1.5 * change[:, 1:-1] - 0.5 * (means[:, 3:] - means[:, :-3])
@@ -157,7 +159,7 @@ def test_sharp_lines_are_those_with_enough_sharp_changes_among_neighbouring_bund
         assert np.array_equal(found, (hits >= SHARP_BUNDLES).any(axis=0))
     assert marked[0, 40] and not marked[1, 40]
     places = np.array([0, 20, 40, 73])
-    assert _sizes_at(means, over, places) == pytest.approx(size[:, places], abs=1e-3)
+    assert sizes_at(means, over, places) == pytest.approx(size[:, places], abs=1e-3)
 
 
 @pytest.mark.parametrize("length", [64, 850, 1250, 1286, 3328])

@@ -87,6 +87,15 @@ def test_a_few_per_cent_between_odd_and_even_lines_are_usual_also_over_water(axi
         assert (disorder(PLAIN, frame, axis) < MAX_RATIO) is is_usual, percent
 
 
+@pytest.mark.parametrize(("shift", "least"), [(0, 98.9), (1, 5.0)])
+@pytest.mark.parametrize("axis", [0, 1])
+def test_lines_that_are_read_twice_are_out_of_order(shift: int, least: float, axis: int) -> None:
+    """Neighbours that do not differ at all leave a ratio without end; the report has figures."""
+    lines = np.roll(np.repeat(ground()[::2], 2, axis=0), shift, axis=0)
+    found = disorder(PLAIN, lines if axis == 0 else lines.T.copy(), axis)
+    assert least < found < 99.1
+
+
 def test_a_frame_without_ground_or_of_a_few_lines_is_not_judged() -> None:
     assert disorder(PLAIN, np.full((208, 312), 700, np.uint16), 0) == 0.0
     dark = np.random.default_rng(1).integers(64, 66, (208, 312)).astype(np.uint16)
