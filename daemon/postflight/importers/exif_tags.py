@@ -206,12 +206,13 @@ def position_of(tags: ImageTags) -> tuple[float, float, float] | None:
 
     A height below its reference (GPSAltitudeRef 1, of EXIF 3.0 also 3) is negative; of one that is
     not given it is NaN.
-    Zero degrees on both axes is a receiver without a fix.
+    Zero degrees on both axes is a receiver without a fix. More than 60 minutes or seconds, and
+    degrees below zero in the north or east, are no position.
     """
     gps = tags.gps
     try:
-        latitude = _degrees(gps[GPS_LATITUDE]) * _sign(gps[GPS_LATITUDE_REF], "N", "S")
-        longitude = _degrees(gps[GPS_LONGITUDE]) * _sign(gps[GPS_LONGITUDE_REF], "E", "W")
+        latitude = _degrees(gps[GPS_LATITUDE], _sign(gps[GPS_LATITUDE_REF], "N", "S"))
+        longitude = _degrees(gps[GPS_LONGITUDE], _sign(gps[GPS_LONGITUDE_REF], "E", "W"))
     except (KeyError, TypeError, ValueError, IndexError):
         return None
     height, below = gps.get(GPS_ALTITUDE), gps.get(GPS_ALTITUDE_REF) in _BELOW
@@ -223,10 +224,16 @@ def position_of(tags: ImageTags) -> tuple[float, float, float] | None:
     return place if abs(latitude) <= 90.0 and abs(longitude) <= 180.0 else None
 
 
-def _degrees(value: Value) -> float:
+def _degrees(value: Value, sign: float) -> float:
+    """Signed degrees. Parts below zero, which EXIF does not have, are of the south or west."""
     if not isinstance(value, tuple) or len(value) != 3:
         raise ValueError("degrees have three parts")
-    return value[0] + value[1] / 60.0 + value[2] / 3600.0
+    if min(value) < 0.0 < sign:
+        raise ValueError("degrees below zero of the north or east")
+    degrees, minutes, seconds = map(abs, value)
+    if not (minutes <= 60.0 and seconds <= 60.0):
+        raise ValueError("more than 60 minutes or seconds")
+    return sign * (degrees + minutes / 60.0 + seconds / 3600.0)
 
 
 def _sign(value: Value, positive: str, negative: str) -> float:

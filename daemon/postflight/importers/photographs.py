@@ -254,7 +254,7 @@ def _with_height_of_xmp(
     A height that EXIF has not is that of XMP (drone-dji:AbsoluteAltitude).
     """
     place, above = exif_tags.position_of(tags), math.nan
-    if place is None or math.isfinite(place[2]) or tags.xmp is None:
+    if place is None or tags.xmp is None:
         return place, above
     try:
         xmp = read_xmp(tags.xmp, path.name)
@@ -262,8 +262,9 @@ def _with_height_of_xmp(
         return place, above
     with suppress(XmpError):
         above = xmp.number("RelativeAltitude")
-    with suppress(XmpError):
-        place = (*place[:2], xmp.number("AbsoluteAltitude"))
+    if not math.isfinite(place[2]):
+        with suppress(XmpError):
+            place = (*place[:2], xmp.number("AbsoluteAltitude"))
     return place, above
 
 
@@ -277,22 +278,22 @@ def _with_plausible_positions(photographs: list[Photograph]) -> list[Photograph]
 
 
 def _with_heights(photographs: list[Photograph]) -> list[Photograph]:
-    """Positions without height are none where others have one.
+    """Positions without height are none where enough others have one.
 
-    Without any, all heights are those above the takeoff point, and zero where one has none.
+    Otherwise all heights are those above the takeoff point, and zero where one has none.
     """
     placed = [one for one in photographs if one.position is not None]
     heights = np.array([one.position[2] for one in placed if one.position is not None])
     if np.isfinite(heights).all():
         return photographs
-    is_any = bool(np.isfinite(heights).any())
+    are_enough = int(np.isfinite(heights).sum()) >= POSITIONS_MIN
     is_above = all(math.isfinite(one.above_takeoff_m) for one in placed)
     found = []
     for one in photographs:
         place, source = one.position, one.height_source
-        if place is not None and not math.isfinite(place[2]):
+        if place is not None and not (are_enough and math.isfinite(place[2])):
             height = one.above_takeoff_m if is_above else NO_HEIGHT_M
-            place = None if is_any else (*place[:2], height)
+            place = None if are_enough else (*place[:2], height)
             source = _ABOVE_TAKEOFF if is_above else ""
         found.append(replace(one, position=place, height_source=source))
     return found
@@ -443,16 +444,17 @@ def _notes(photographs: Sequence[Photograph], heads: Sequence[str]) -> tuple[str
     if caution := same_place([one.position for one in photographs]):
         notes.append(caution)
     sources = {one.height_source for one in photographs if one.position is not None}
+    few = f", or fewer than {POSITIONS_MIN} photographs have one"
     if _ABOVE_TAKEOFF in sources:
         notes.append(
-            "EXIF has no GPSAltitude: heights are those above the takeoff point "
+            f"EXIF has no GPSAltitude{few}: heights are those above the takeoff point "
             "(RelativeAltitude of XMP), and all heights of the block are, unless control places "
             "it (--points)."
         )
     elif "" in sources:
         notes.append(
-            "EXIF has no GPSAltitude: all heights are taken as 0 m, as of level flight. Heights of "
-            "the block are below the flight, unless control places it (--points)."
+            f"EXIF has no GPSAltitude{few}: all heights are taken as 0 m, as of level flight. "
+            "Heights of the block are below the flight, unless control places it (--points)."
         )
     else:
         notes.append(

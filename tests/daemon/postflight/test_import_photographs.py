@@ -159,7 +159,7 @@ XMP = (
 @pytest.mark.parametrize(
     ("changed", "xmp", "heights", "sentence"),
     [
-        (range(4), "", [0.0] * 4, "no GPSAltitude: all heights"),
+        (range(4), "", [0.0] * 4, "photographs have one: all heights"),
         (range(1), "", [None, 280.0, 280.0, 280.0], "1 photographs have no position"),
         (range(4), XMP, [312.5] * 4, "taken as ellipsoidal"),
         (range(4), "<broken", [0.0] * 4, "no GPSAltitude"),

@@ -171,6 +171,52 @@ def test_heights_above_takeoff_stand_in_for_missing_ones(tmp_path) -> None:
     assert "HeightSource" not in settings_of(tmp_path / "some", 5)
 
 
+@pytest.mark.parametrize("relative_m", [None, 80.0])
+def test_fewer_heights_than_a_block_needs_are_not_used(tmp_path, relative_m) -> None:
+    """Two of five: with these alone there was no block."""
+    for k in range(5):
+        place = (47.0, 11.0 + k * 1e-4, 700.0 if k < 2 else None)
+        write_jpeg(tmp_path / f"in/P{k}.jpg", seed=k, place=place, relative_m=relative_m)
+    found = import_photographs(tmp_path / "in", tmp_path / "out")
+    assert [one.position[2] for one in found.photographs] == [relative_m or 0.0] * 5
+    (note,) = [note for note in found.notes if "GPSAltitude" in note]
+    assert "or fewer than 3 photographs have one: " in note
+
+
+def test_a_height_of_exif_goes_before_that_of_xmp(tmp_path) -> None:
+    folder = folder_of(tmp_path, relative_m=80.0)
+    for path in folder.iterdir():
+        path.write_bytes(path.read_bytes().replace(b"RelativeAltitude", b"AbsoluteAltitude"))
+    found = import_photographs(folder, tmp_path / "out").photographs
+    assert [one.position[2] for one in found] == [700.0] * 3
+
+
+NAN = float("nan")
+
+
+@pytest.mark.parametrize(
+    ("reference", "parts", "degrees"),
+    [
+        ("S", (33.0, 30.0, 0.0), -33.5),
+        ("S", (-33.0, -30.0, 0.0), -33.5),
+        ("S", (-33.0, 30.0, 0.0), -33.5),
+        ("N", (33.0, 59.0, 60.0), 34.0),
+        ("N", (-33.0, 30.0, 0.0), None),
+        ("N", (33.0, 61.0, 0.0), None),
+        ("N", (33.0, 0.0, 61.0), None),
+        ("N", (33.0, 30.0, NAN), None),
+        ("n", (33.0, 30.0, 0.0), None),
+        ("S", (91.0, 0.0, 0.0), None),
+    ],
+)
+def test_degrees_of_exif_that_are_no_angle_are_no_position(reference, parts, degrees) -> None:
+    """Signed parts are of programs that wrote the sign in addition to the reference."""
+    gps = {1: reference, 2: parts, 3: "E", 4: (11.0, 0.0, 0.0), 6: (12.5,)}
+    found = position_of(ImageTags("jpeg", 4, 3, gps=gps))
+    assert (found is None) == (degrees is None)
+    assert found is None or found[0] == pytest.approx(degrees, abs=1e-12)
+
+
 @pytest.mark.parametrize(
     ("reference", "sign"),
     [((0.0,), 1), ((1.0,), -1), ((2.0,), 1), ((3.0,), -1), ("1", -1), (b"\x01", -1), (None, 1)],
