@@ -26,8 +26,8 @@ from tests.repository.test_document_examples import blocks, page_of
 ROOT = Path(__file__).parents[2]
 TUTORIAL = "tutorials/your-own-hardware.md"
 BUILD_TIMEOUT_S = 300.0
-COMPILED_HERE = "radiometry"
-"""The package of `processing` whose kernels the installation compiles itself."""
+COMPILED_HERE = "line_means"
+"""The module of `processing` whose kernels the installation compiles itself."""
 FLIGHT_TIMEOUT_S = 900.0
 WHEEL_NBYTES_MAX = 4_000_000
 """The photographs alone have 8 MB."""
@@ -155,7 +155,7 @@ def test_the_tutorial_installs_the_wheel_as_it_states(
             "HOME": str(tmp_path),
             "PYTHONPATH": str(dependencies),
             "PIP_NO_INDEX": "1",
-            "PIP_NO_COMPILE": "1",
+            "PIP_NO_COMPILE": "no",  # pip's way to say yes: its user guide, boolean options
         },
         capture_output=True,
         text=True,
@@ -215,7 +215,7 @@ def test_the_demonstration_flies_and_check_reads_its_configuration(
 ) -> None:
     present = _copy_compiled_kernels(installed)
     compiled = installed.run("syntopic", "kernels", "--json", timeout_s=FLIGHT_TIMEOUT_S)
-    assert json.loads(compiled.stdout)["compiled"] > (5 if present else 100), compiled.stderr
+    assert json.loads(compiled.stdout)["compiled"] > (3 if present else 100), compiled.stderr
     again = installed.run("syntopic", "kernels", "--json")
     assert json.loads(again.stdout)["compiled"] == 0, again.stderr
     done = installed.run(
@@ -244,7 +244,7 @@ def test_the_demonstration_flies_and_check_reads_its_configuration(
 
 
 def _copy_compiled_kernels(installed: Installation) -> int:
-    """Copy what `make setup` compiled, but for one package; the number of files.
+    """Copy what `make setup` compiled, but for one module; the number of files.
 
     All of them take more than a minute of one core, and tests/processing/test_kernel_compilation.py
     compiles them.
@@ -253,7 +253,7 @@ def _copy_compiled_kernels(installed: Installation) -> int:
     packages = Path(sysconfig.get_path("purelib", vars={"base": str(installed.prefix)}))
     for cache in (ROOT / "processing").rglob("*.nb[ic]"):
         name = cache.relative_to(ROOT)
-        if COMPILED_HERE not in name.parts:
+        if not name.name.startswith(f"{COMPILED_HERE}."):
             target = packages / name
             target.parent.mkdir(exist_ok=True)
             shutil.copy2(cache, target)
