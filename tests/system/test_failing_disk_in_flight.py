@@ -42,7 +42,7 @@ def test_a_disk_that_refuses_and_stalls_costs_exposures_and_never_the_service(
     arguments = simulator_arguments(rig, tmp_path / "sim", seed=4, dc=0, displace=[])
     address = free_first_address()
     arguments += ["--first-address", address, "--exposures", "8", "--scene-cache", str(scenes)]
-    emulator = Emulator(arguments)
+    emulator = Emulator([*arguments, "--still"])
     config = tmp_path / "service.toml"
     config.write_text(
         service_toml(emulator.ready, root="missions", count=EXPOSURES, end_when_done=True)

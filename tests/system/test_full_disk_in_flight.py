@@ -22,7 +22,7 @@ def test_a_full_disk_costs_exposures_and_never_the_service(tmp_path: Path, scene
     arguments = simulator_arguments(rig, tmp_path / "sim", seed=4, dc=0, displace=[])
     address = free_first_address()
     arguments += ["--first-address", address, "--exposures", "8", "--scene-cache", str(scenes)]
-    emulator = Emulator(arguments)
+    emulator = Emulator([*arguments, "--still"])
     config = tmp_path / "service.toml"
     disk = tmp_path / "missions"
     disk.mkdir()

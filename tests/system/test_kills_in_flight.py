@@ -37,7 +37,7 @@ def kill_in_flight(
     arguments = simulator_arguments(rig, folder / "sim", seed=4, dc=0, displace=[])
     address = free_first_address()
     arguments += ["--first-address", address, "--exposures", str(scene)]
-    emulator = Emulator([*arguments, "--scene-cache", str(scenes)])
+    emulator = Emulator([*arguments, "--scene-cache", str(scenes), "--still"])
     config = folder / "service.toml"
     config.write_text(service_toml(emulator.ready, root="missions"))
     numbers_by_event: dict[str, set[int]] = {"triggered": set(), "stored": set(), "sealed": set()}

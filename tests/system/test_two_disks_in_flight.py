@@ -39,7 +39,7 @@ def test_a_pulled_disk_costs_no_exposure_and_is_brought_up_to_date_when_it_retur
     arguments = simulator_arguments(rig, tmp_path / "sim", seed=4, dc=0, displace=[])
     address = free_first_address()
     arguments += ["--first-address", address, "--exposures", "8", "--scene-cache", str(scenes)]
-    emulator = Emulator(arguments)
+    emulator = Emulator([*arguments, "--still"])
     roots = {"root": tmp_path / "missions", "mirror": tmp_path / "mirror"}
     roots["mirror"].mkdir()
     config = tmp_path / "service.toml"
