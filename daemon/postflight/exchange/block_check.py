@@ -21,6 +21,11 @@ _OFF_MIDDLE: Final = 0.05
 _IN_MIDDLE: Final = 0.01
 """Shares of the longer side: a principal point far from the middle, and one in it."""
 _NAMED: Final = 3
+SIDE_MAX_PX: Final = 1_000_000
+F_IN_SIDES: Final = (0.01, 10_000.0)
+"""Principal distances that a camera may have, in longer sides of its image."""
+FAR_M: Final = 100_000.0
+"""Distance from the middle of a block that is stated."""
 _TERMS: Final = ("skew_px", "k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "radial_r8")
 
 
@@ -86,6 +91,24 @@ def upward_notes(block: Block) -> tuple[str, ...]:
     )
 
 
+def distance_notes(block: Block) -> tuple[str, ...]:
+    """Images far from the middle of a block without measurements, which nothing else shows."""
+    if len(block.points.image) or not (block.frame is not None or block.is_metric):
+        return ()
+    centres = np.array([image.centre_m for image in block.images])
+    away_m = np.linalg.norm(centres - np.median(centres, axis=0), axis=1)
+    far = np.flatnonzero(away_m > FAR_M)
+    if not len(far):
+        return ()
+    named = ", ".join(
+        f"{block.images[k].name} {away_m[k] / 1e3:.0f} km" for k in far[:_NAMED].tolist()
+    )
+    return (
+        f"{len(far)} of {len(block.images)} images are more than {FAR_M / 1e3:.0f} km from the "
+        f"middle of all: {named}",
+    )
+
+
 def project_name(name: str) -> str:
     """Name of an image in the project: its tables have no spaces in names."""
     return name.replace(" ", "_")
@@ -106,7 +129,20 @@ def _check_camera(path: Path, camera: BlockCamera) -> None:
             f"{where}: its size is {camera.width_px} x {camera.height_px} px; state columns and "
             "rows of its images"
         )
+    longer = max(camera.width_px, camera.height_px)
+    if longer > SIDE_MAX_PX:
+        raise BlockError(
+            f"{where}: its size is {camera.width_px} x {camera.height_px} px; no image is larger "
+            f"than {SIDE_MAX_PX} px: correct columns and rows"
+        )
+    low, high = F_IN_SIDES
     for value in (model.fx_px, model.fy_px):
+        if math.isfinite(value) and value > 0.0 and not low < value / longer < high:
+            raise BlockError(
+                f"{where}: its principal distance is {value:g} px, {value / longer:.3g} of the "
+                f"longer side of its image; {low:g} to {high:g} are possible: correct it, "
+                "the pixel size or the size of the image"
+            )
         if not (math.isfinite(value) and value > 0.0):
             raise BlockError(
                 f"{where}: its principal distance is {value:g} px; it is finite and positive: "

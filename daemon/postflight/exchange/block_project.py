@@ -22,7 +22,12 @@ from daemon.postflight.adjustment.project import CheckPoints
 from daemon.postflight.adjustment.project_file import AdjustSection, CameraSection, ProjectFile
 from daemon.postflight.adjustment.project_writer import write_project
 from daemon.postflight.exchange.block import FIT_LIMIT_PX, Block, BlockCamera, BlockError
-from daemon.postflight.exchange.block_check import check_block, project_name, upward_notes
+from daemon.postflight.exchange.block_check import (
+    check_block,
+    distance_notes,
+    project_name,
+    upward_notes,
+)
 from daemon.postflight.exchange.bundler import read_bal, read_bundler
 from daemon.postflight.exchange.colmap import read_colmap
 from daemon.postflight.exchange.completeness import completeness_notes
@@ -119,7 +124,9 @@ def import_block(
         )
     notes = _unit_notes(path, block, photographs, is_metric=is_metric)
     notes += refuse_other_convention(path, block, sigma_px)
-    block = replace(block, notes=(*block.notes, *notes, *upward_notes(block)))
+    block = replace(
+        block, notes=(*block.notes, *notes, *upward_notes(block), *distance_notes(block))
+    )
     pitches = [camera.pitch_mm or NOMINAL_PITCH_MM for camera in block.cameras]
     fits = [_lens_of(c, pitch) for c, pitch in zip(block.cameras, pitches, strict=True)]
     block, fits, models, corrected = _carried(block, pitches, fits)

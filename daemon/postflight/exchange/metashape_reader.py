@@ -168,6 +168,11 @@ def _posed(path: Path, every: Mapping[str, ET.Element], one: str) -> tuple[Array
     if text is None:
         return None
     pose = _numbers(text, 16).reshape(4, 4)
+    if not np.array_equal(pose[3], [0.0, 0.0, 0.0, 1.0]):
+        raise BlockError(
+            f"{path}: camera {camera.attrib['label']}: the last row of its transform is "
+            f"{' '.join(f'{value:g}' for value in pose[3])}; 0 0 0 1 is right. Export it again"
+        )
     _orthogonal(pose[:3, :3], f"{path}: camera {camera.attrib['label']}: its transform")
     return pose, from_master
 

@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 from daemon.cli import app
 from daemon.postflight.adjustment.project import read_project
 from daemon.postflight.exchange.block import BlockError
+from daemon.postflight.exchange.block_project import import_block
 from daemon.postflight.exchange.inpho_reader import read_inpho
 from daemon.postflight.exchange.photogrammetry_reader import read_bingo, read_patb
 from daemon.postflight.exchange.pix4d_reader import read_pix4d
@@ -288,6 +289,16 @@ def test_damaged_files_of_patb_are_refused(scene, tmp_path, file, old, new, sent
     (folder / file).write_text(text.replace(old, new, 1))
     with pytest.raises(BlockError, match=sentence):
         read_patb(folder)
+
+
+def test_a_size_that_no_image_has_is_refused(scene, tmp_path) -> None:
+    """Millimetres from the middle of 1e30 pixels would have no digits left."""
+    folder = bingo(scene, tmp_path / "in")
+    text = (folder / "cameras.txt").read_text()
+    assert text.count(" 1600 1200") == 1
+    (folder / "cameras.txt").write_text(text.replace(" 1600 ", " 1e30 "))
+    with pytest.raises(BlockError, match=r"camera X20: its size is .* no image is larger than"):
+        import_block(folder, "bingo", tmp_path / "out")
 
 
 def test_weights_and_images_without_orientation_are_refused_by_name(scene, tmp_path) -> None:

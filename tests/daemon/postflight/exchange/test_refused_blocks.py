@@ -77,6 +77,10 @@ def replaced(index: int, value: str):
         ("1 PINHOLE 1600 1200 nan 900 800 600", "camera1: its principal distance is nan px"),
         ("1 PINHOLE 1600 1200 900 900 nan 600", "camera1: its principal point is nan, 599.5"),
         ("1 PINHOLE 0 0 900 900 800 600", "camera camera1: its size is 0 x 0 px"),
+        ("1 PINHOLE 1600 1e30 900 900 800 600", "camera|cameras.txt"),
+        ("1 PINHOLE 2000000 1200 900 900 800 600", "no image is larger than 1000000 px"),
+        ("1 PINHOLE 1600 1200 1e9 1e9 800 600", "1e.09 px, 6.25e.05 of the longer side"),
+        ("1 PINHOLE 1600 1200 9 9 800 600", "9 px, 0.00562 of the longer side"),
         ("1 OPENCV 1600 1200 900 900 800 600 nan 0 0 0", "camera1: its k1 are not finite"),
         (f"{CAMERA}\n{CAMERA}", "cameras.txt, line 2: camera 1 is there twice"),
     ],
@@ -291,6 +295,11 @@ METASHAPE = (
         ('label="b"', 'label="a"', "image a is there more than once"),
         ('camera id="1"', 'camera id="0"', r"camera 0 \(b\) is there twice"),
         ("<scale>1<", "<scale>nan<", "finite"),
+        (
+            " 0 0 0 1</transform></camera></",
+            " 7 0 0 1</transform></camera></",
+            "last row .* 7 0 0 1;",
+        ),
     ],
 )
 def test_cameras_of_metashape_that_cannot_be(tmp_path, old, new, sentence) -> None:
@@ -400,6 +409,18 @@ def test_images_that_look_upward_are_stated(tmp_path, old, new, is_noted) -> Non
     path.write_text(INPHO.replace(old, new))
     notes = import_block(path, "inpho", tmp_path / "p").block.notes
     assert any("2 of 2 images look upward" in note for note in notes) is is_noted
+
+
+@pytest.mark.parametrize(("x_m", "is_noted"), [(900_000, True), (150_000, False)])
+def test_an_image_far_from_all_others_is_stated(tmp_path, x_m, is_noted) -> None:
+    """Without measurements nothing else shows a coordinate that was typed wrong."""
+    path = tmp_path / "a.prj"
+    assert INPHO.count("100.0 20 0 900") == 1
+    path.write_text(INPHO.replace("100.0 20 0 900", f"100.0 {x_m} 0 900"))
+    notes = import_block(path, "inpho", tmp_path / "p").block.notes
+    far = [note for note in notes if "km from the middle" in note]
+    assert bool(far) is is_noted
+    assert all("2 of 2 images" in note and "p1 450 km" in note for note in far)
 
 
 def test_the_command_ends_in_one_sentence(scene, tmp_path) -> None:
