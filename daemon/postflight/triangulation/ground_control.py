@@ -88,7 +88,7 @@ def read_gcp_list(path: Path, images: Mapping[str, int], frame: LocalFrame) -> G
     for n, line in numbered[1:]:
         parts = _parts(line, images)
         try:
-            numbers = [float(part) for part in parts[:5]]
+            numbers = [_number(part) for part in parts[:5]]
             image = parts[5]
             if len(numbers) < 5 or not all(map(math.isfinite, numbers)):
                 raise ValueError
@@ -112,6 +112,8 @@ def read_gcp_list(path: Path, images: Mapping[str, int], frame: LocalFrame) -> G
     for name, place, _, _ in rows:
         if places.setdefault(name, place) != place:
             problems.append(f"{path.name}: point {name} has two different places")
+    rows, contradictions = _once(path, rows, {at: name for name, at in images.items()})
+    problems += contradictions
     if problems:
         raise TriangulationError("; ".join(problems[:20]))
     names = tuple(places)
@@ -128,6 +130,34 @@ def read_gcp_list(path: Path, images: Mapping[str, int], frame: LocalFrame) -> G
         np.full(len(rows), MEASURED_SIGMA_PX),
         tuple(unused),
     )
+
+
+_Row = tuple[str, tuple[float, float, float], int, tuple[float, float]]
+"""Point, its place, index of the image, column and row."""
+
+
+def _once(
+    path: Path, rows: Sequence[_Row], images: Mapping[int, str]
+) -> tuple[list[_Row], list[str]]:
+    """Rows without copies, and a sentence for each point with two places in an image."""
+    first: dict[tuple[str, int], _Row] = {}
+    problems = []
+    for row in rows:
+        name, _, at, px = row
+        other = first.setdefault((name, at), row)
+        if (apart_px := math.dist(other[3], px)) > 0.0:
+            problems.append(
+                f"{path.name}: point {name} is measured twice in {images[at]}, {apart_px:.1f} px "
+                "apart; keep one of both"
+            )
+    return list(first.values()), problems
+
+
+def _number(text: str) -> float:
+    """A number in ASCII digits; Python would take 1_0 and digits of other scripts, too."""
+    if "_" in text or not text.isascii():
+        raise ValueError(text)
+    return float(text)
 
 
 def read_control_tables(

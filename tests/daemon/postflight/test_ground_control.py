@@ -41,3 +41,31 @@ def test_feet_without_a_height_system_are_refused_with_the_cure(tmp_path: Path) 
 def test_what_is_neither_projected_nor_geographic_is_refused(tmp_path: Path, system: str) -> None:
     with pytest.raises(TriangulationError, match="line 1"):
         _read(tmp_path, system)
+
+
+ROW = "538000 180000 100.0 10 20 a.jpg P\n"
+
+
+@pytest.mark.parametrize(
+    ("rows", "sentence"),
+    [
+        (
+            ROW + ROW.replace("10 20", "13 24"),
+            r"point P is measured twice in a\.jpg, 5\.0 px apart",
+        ),
+        (ROW.replace("10 20", "1_0 20"), "line 2: east north height column row image"),
+        (ROW.replace("10 20", "\u0663 20"), "line 2: east north height column row image"),
+    ],
+)
+def test_rows_that_contradict_or_are_no_numbers_are_refused(tmp_path, rows, sentence) -> None:
+    path = tmp_path / "gcp_list.txt"
+    path.write_text(f"EPSG:32631\n{rows}", encoding="utf-8")
+    with pytest.raises(TriangulationError, match=sentence):
+        read_gcp_list(path, {"a.jpg": 0}, FRAME)
+
+
+def test_a_row_that_was_copied_counts_once(tmp_path) -> None:
+    path = tmp_path / "gcp_list.txt"
+    path.write_text(f"EPSG:32631\n{ROW}{ROW}{ROW.replace('a.jpg', 'b.jpg')}")
+    found = read_gcp_list(path, {"a.jpg": 0, "b.jpg": 1}, FRAME)
+    assert found.names == ("P",) and found.px.tolist() == [[10.0, 20.0]] * 2
