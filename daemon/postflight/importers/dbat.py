@@ -126,7 +126,8 @@ def _imported(script: Path, root: ElementTree.Element) -> ImportedProject:
         ),
     )  # fmt: skip
     network, checks = _network(script, given, section, pixel_mm)
-    return ImportedProject(file, network, checks, settings.notes)
+    notes = (*settings.notes, *_notes_on_ends(script, given))
+    return ImportedProject(file, network, checks, notes)
 
 
 def _camera(script: Path, given: ElementTree.Element) -> ElementTree.Element:
@@ -167,13 +168,13 @@ def _loaded(script: Path, camera: ElementTree.Element) -> dict[str, float]:
     values: dict[str, float] = {}
     for key, names in (("cc", ("f_mm",)), ("pp", ("xp_mm", "yp_mm")), ("P", ("p1", "p2"))):
         if text := camera.findtext(key):
-            numbers = [float(v) for v in text.split(",")]
+            numbers = _numbers(script, key, text)
             if len(numbers) != len(names):
                 raise ProjectError(
                     [f"{script.name}: <{key}> has {len(numbers)} values; {len(names)} are right"]
                 )
             values |= dict(zip(names, numbers, strict=True))
-    radial = [float(v) for v in (camera.findtext("K") or "0,0,0").split(",")]
+    radial = _numbers(script, "K", camera.findtext("K") or "0,0,0")
     if len(radial) < 3:
         raise ProjectError([f"{script.name}: <K> has {len(radial)} coefficients; three are read"])
     if len(radial) > 3 and any(radial[3:]):
@@ -366,10 +367,33 @@ def _rows(path: Path, columns: Sequence[str], constant: Mapping[str, str]) -> li
     return rows
 
 
+def _numbers(script: Path, key: str, text: str) -> list[float]:
+    cells = [cell.strip() for cell in text.split(",")]
+    for cell in cells:
+        _refuse_value(f"{script.name}: <{key}>", cell, is_sigma=False)
+    return [float(cell) for cell in cells]
+
+
+def _notes_on_ends(script: Path, given: ElementTree.Element) -> tuple[str, ...]:
+    """Tables whose last line has no end: the last number of a file that was cut is another one."""
+    files = [one for what in ("ctrl_pts", "image_pts", "prior_eo") for one in given.iter(what)]
+    paths = [
+        _within(script, file.text.strip())
+        for one in files
+        for file in one.findall("file")
+        if file.text
+    ]
+    return tuple(
+        f"{path.name}: its last line has no end; was the file cut?"
+        for path in dict.fromkeys(paths)
+        if not _text_of(path).endswith(("\n", "\r"))
+    )
+
+
 def _refuse_value(what: str, text: str, is_sigma: bool) -> None:
-    """Refuse what is no number, and a negative standard deviation."""
+    """Refuse what is no number in ASCII digits, and a negative standard deviation."""
     try:
-        value = float(text)
+        value = float(text) if text.isascii() and "_" not in text else math.nan
     except ValueError:
         value = math.nan
     if not math.isfinite(value):

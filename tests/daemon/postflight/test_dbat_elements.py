@@ -176,3 +176,22 @@ def test_a_script_that_does_not_state_what_is_estimated_is_refused(folder) -> No
     (folder / "script.xml").write_text(text[:begin] + operation + text[end:])
     (camera,) = import_dbat(folder / "script.xml").network.cameras
     assert camera.free == set(), "nothing is estimated at the beginning"
+
+
+@pytest.mark.parametrize("value", ["nan", "1_0", "\u0663", "inf"])
+@pytest.mark.parametrize(("file", "old"), [("camera.xml", "<K>"), ("marks.txt", "")])
+def test_a_number_that_is_none_is_refused_with_its_place(folder, value, file, old) -> None:
+    """Python reads 1_0 as 10, and digits of other scripts."""
+    path = folder / file
+    text = path.read_text()
+    start = text.index(old) + len(old) if old else text.index(",", text.index(",") + 1) + 1
+    path.write_text(f"{text[:start]}{value},{text[start:].split(',', 1)[1]}", encoding="utf-8")
+    refused(folder, f"(script.xml: <K>|marks.txt:1: x) is '{value}'; a number is right")
+
+
+def test_a_table_whose_last_line_has_no_end_is_stated(folder) -> None:
+    assert not [note for note in import_dbat(folder / "script.xml").notes if "cut" in note]
+    path = folder / "marks.txt"
+    path.write_text(path.read_text()[:-3])
+    (note,) = [note for note in import_dbat(folder / "script.xml").notes if "cut" in note]
+    assert note == "marks.txt: its last line has no end; was the file cut?"
