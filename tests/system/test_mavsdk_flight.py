@@ -29,7 +29,7 @@ def test_photos_that_a_ground_station_asked_for_are_in_the_ledger(
         "ultracam-x-mini", tmp_path / "sim", seed=1, dc=0.0, displace=[]
     )
     arguments += ["--scene-cache", str(flown.scenes), "--exposures", str(PHOTOS + 1)]
-    emulator = Emulator([*arguments, "--first-address", free_first_address()])
+    emulator = Emulator([*arguments, "--still", "--first-address", free_first_address()])
     port = free_port()
     text = service_toml(emulator.ready, root="missions", watch_port=0)
     text = text.replace("[trigger]\n", '[trigger]\nstart = "on command"\n')
