@@ -19,16 +19,14 @@ Array = NDArray[Any]
 _BRIGHT_ROWS: Final = 32
 _BRIGHT_COLUMN: Final = 16
 """So many rows, and one of so many columns, show how bright a frame is."""
-_EVERY_ROW: Final = 8
-_BUNDLES: Final = 5
-"""Across track one of so many rows is looked at, along track at most so many bundles of each."""
-_ROWS: Final = 128
-"""Of taller frames only every third, fifth .. row is looked at: an odd step takes even rows and odd
-ones."""
-_BUNDLE: Final = 64
-"""Pixels side by side: two lines of cache."""
-_AHEAD: Final = 2
-"""Rows looked at between the one whose pixels are fetched and the one that is measured."""
+_TILE_ROWS: Final = 32
+_TILE_COLUMNS: Final = 64
+_TILES: Final = 8
+"""Each way, and the square of it in all: of narrow regions there are more along the longer side."""
+_PART: Final = 8
+"""Tiles that one thread measures in a row; the next one is fetched meanwhile."""
+_EVERY_ROW: Final = 4
+"""Of a tile one of so many rows is looked at across track; along track all are."""
 _MIN_LENGTH: Final = 34
 _MIN_SIGNAL: Final = 4.0
 """Detail at two pixels' distance must exceed its noise so many times before sharpness is
@@ -62,10 +60,10 @@ def sharpness(
     left, right = columns or (0, frame.shape[1] - 1)
     if last - first + 1 < _MIN_LENGTH or right - left + 1 < _MIN_LENGTH:
         return None, None
-    height = last - first + 1
-    pace = height // _ROWS | 1
-    sums = np.zeros((-(-height // pace), 2, 4))
-    _difference_sums(frame[first : last + 1], left, right + 1, pace, sums)
+    corners = np.add((first, left), _tiles(last - first + 1, right - left + 1))
+    size = min(_TILE_ROWS, last - first - 1), min(_TILE_COLUMNS, right - left - 1)
+    sums = np.zeros((len(corners), 2, 4))
+    _difference_sums(frame, corners, size[0], size[1], sums)
     along, across = sums.sum(axis=0)
     counts = level1_counts_per_dn(sensor.bits)
     return _share(sensor, along, counts), _share(sensor, across, counts)
@@ -91,6 +89,19 @@ def bright_level(sensors: Sequence[Sensor], frames: Sequence[Array]) -> float | 
     return float(np.percentile(np.concatenate(samples), 95.0))
 
 
+def _tiles(height: int, width: int) -> Array:
+    """First row and column of tiles evenly over a region, (n, 2).
+
+    Regions of two heads on the same ground have tiles on the same ground.
+    """
+    fit_down, fit_across = max((height - 2) // _TILE_ROWS, 1), max((width - 2) // _TILE_COLUMNS, 1)
+    down = min(fit_down, _TILES**2 // min(fit_across, _TILES))
+    across = min(fit_across, _TILES**2 // min(fit_down, _TILES))
+    rows = np.linspace(0, max(height - 2 - _TILE_ROWS, 0), down).astype(np.int64)
+    columns = np.linspace(0, max(width - 2 - _TILE_COLUMNS, 0), across).astype(np.int64)
+    return np.stack([grid.ravel() for grid in np.meshgrid(rows, columns, indexing="ij")], axis=1)
+
+
 def _share(sensor: Sensor, sums: Array, counts: float) -> float | None:
     """The share of one direction, from its sums over pixels as `_difference_sums` makes them."""
     near, far, signal, pixels = (float(value) for value in sums)
@@ -107,40 +118,34 @@ def _share(sensor: Sensor, sums: Array, counts: float) -> float | None:
 
 
 @compiled_kernel(parallel=True)
-def _difference_sums(frame, left, end, pace, sums):
+def _difference_sums(frame, corners, rows, columns, sums):
     """Sums of squared differences to the next pixel and to the one after it, of signal, of pixels.
 
-    Columns from `left` to before `end` are looked at. `sums` is (rows, 2, 4): by every `pace`-th
-    row, along track from some bundles of neighbouring columns (single ones would each cost a line
-    of cache), across track from all bundles of every `_EVERY_ROW`-th of these rows.
+    `sums` is (n, 2, 4): of each tile along track and across.
     """
-    height, width = frame.shape[0], end - left
-    for r in prange(len(sums)):
-        top = r * pace
-        if top + 2 < height:
-            here, following = frame[top, left:end], frame[top + 1, left:end]
-            after = frame[top + 2, left:end]
-            size = min(_BUNDLE, width)
-            step = max(size, (width - size) // (_BUNDLES - 1))
-            for first in range(0, width - size + 1, step):
-                fetch_ahead(frame, left + first, top + _AHEAD * pace, size, 3)
-                _add_bundle(here, following, after, first, first + size, sums[r, 0])
-        if r % _EVERY_ROW == 0:
-            line = frame[top, left:end]
-            size = min(_BUNDLE, width - 2)
-            for first in range(0, width - 2 - size + 1, size):
-                _add_bundle(line[:-2], line[1:-1], line[2:], first, first + size, sums[r, 1])
+    for part in prange((len(corners) + _PART - 1) // _PART):
+        last = min((part + 1) * _PART, len(corners))
+        for i in range(part * _PART, last):
+            top, left = corners[i, 0], corners[i, 1]
+            if i + 1 < last:
+                fetch_ahead(frame, corners[i + 1, 1], corners[i + 1, 0], columns + 2, rows + 2)
+            for row in range(top, top + rows):
+                line = frame[row, left : left + columns + 2]
+                after, next_but_one = frame[row + 1, left:], frame[row + 2, left:]
+                _add_bundle(line, after, next_but_one, columns, sums[i, 0])
+                if (row - top) % _EVERY_ROW == 0:
+                    _add_bundle(line, line[1:], line[2:], columns, sums[i, 1])
 
 
 @compiled_kernel(fastmath={"reassoc", "contract"})
-def _add_bundle(here, following, after, first, end, sums):
-    """Add the pixels from `first` to before `end`, or none where any of them has no data.
+def _add_bundle(here, following, after, length, sums):
+    """Add some pixels and those next to them, or none where any of them has no data.
 
     Where data end, as next to lines that were not read out, there is an edge and no detail.
     """
     near = far = signal = np.float32(0.0)
     missing = np.uint16(0)
-    for c in range(first, end):
+    for c in range(length):
         word, next_word, after_word = here[c], following[c], after[c]
         missing |= np.uint16((word == 0) | (next_word == 0) | (after_word == 0))
         one = np.float32(np.int32(next_word) - np.int32(word))
@@ -152,4 +157,4 @@ def _add_bundle(here, following, after, first, end, sums):
         sums[0] += near
         sums[1] += far
         sums[2] += signal
-        sums[3] += end - first
+        sums[3] += length
