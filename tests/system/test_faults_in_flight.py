@@ -30,15 +30,11 @@ ABSENT_ADDRESS = "127.99.99.99"
 
 
 @pytest.fixture(scope="module")
-def emulator(
-    tmp_path_factory: pytest.TempPathFactory, scenes: Path
-) -> Iterator[tuple[Emulator, Path]]:
+def emulator(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Emulator, Path]]:
     folder = tmp_path_factory.mktemp("kill")
     arguments = simulator_arguments("ultracam-x-mini", folder / "sim", seed=3, dc=0, displace=[])
     address = free_first_address()
-    # What images show decides nothing here; one exposure of each head is rendered.
-    arguments += ["--first-address", address, "--exposures", "2", "--still"]
-    started = Emulator([*arguments, "--scene-cache", str(scenes)])
+    started = Emulator([*arguments, "--first-address", address, "--exposures", "8"])
     yield started, folder
     started.end()
 
@@ -141,6 +137,18 @@ def test_a_killed_service_goes_on_in_the_same_flight(emulator: tuple[Emulator, P
     verified = syntopic("verify", mission, "--json")
     assert verified.returncode == 0, verified.stdout
     assert (Path(mission) / "mission.db").exists()
+
+
+def test_after_an_orderly_end_a_new_mission_begins(emulator: tuple[Emulator, Path]) -> None:
+    devices, folder = emulator
+    config = folder / "service.toml"
+    before = {path.name for path in (folder / "missions").iterdir()}
+    config.write_text(service_toml(devices.ready, root="missions", count=1, end_when_done=True))
+    service = start(config)
+    events = list(read_events(service))
+    assert service.wait(30) == 0
+    (mission_event,) = [event for event in events if event["event"] == "mission"]
+    assert not mission_event["resumed"] and Path(mission_event["path"]).name not in before
 
 
 def test_check_prints_a_tree_of_what_is_well_and_the_cure_of_what_is_not(
@@ -248,21 +256,16 @@ def test_a_head_that_is_not_there_and_a_slow_pipeline_cost_flags_and_nothing_els
     assert ended["ledger"]["balanced"] and ended["ledger"]["triggers"]["degraded"] == 3
 
 
-def test_sigterm_lands_in_good_order_and_after_an_orderly_end_a_new_mission_begins(
-    emulator: tuple[Emulator, Path],
-) -> None:
+def test_sigterm_lands_in_good_order(emulator: tuple[Emulator, Path]) -> None:
     devices, folder = emulator
     config = folder / "service.toml"
-    # The flight that was killed and continued has ended there in good order.
-    before = {path.name for path in (folder / "missions").iterdir()}
-    config.write_text(service_toml(devices.ready, root="missions"))
+    config.write_text(service_toml(devices.ready, root="landed"))
     service = start(config)
     mission = ""
     ended: dict[str, Any] = {}
     for event in read_events(service):
         if event["event"] == "mission":
             mission = event["path"]
-            assert not event["resumed"] and Path(mission).name not in before
         elif event["event"] == "triggered" and event["number"] == 2:
             service.send_signal(signal.SIGTERM)
         elif event["event"] == "ended":
@@ -273,7 +276,7 @@ def test_sigterm_lands_in_good_order_and_after_an_orderly_end_a_new_mission_begi
     assert counts["triggers"] == counts["complete"] >= 2
     records = list(Path(mission, "L0").glob("*/exposure.json"))
     assert len(records) == counts["triggers"], "what was open is sealed"
-    assert not (folder / "missions" / "current-mission.json").exists(), "the flight is over"
+    assert not (folder / "landed" / "current-mission.json").exists(), "the flight is over"
 
 
 def test_a_failing_supply_finds_everything_safe_within_the_stated_time(
