@@ -240,11 +240,7 @@ def _change(
     moved = [float(np.linalg.norm(b.centre_m - a.centre_m)) for a, b in both]
     turned = vectors_from_rotations(np.array([a.rotation.T @ b.rotation for a, b in both]))
     right, forward, up = np.median(
-        [
-            a.rotation.T @ (b.centre_m - a.centre_m)
-            for a, b in both
-            if a.cone == rig.image_cone_name
-        ]
+        [a.rotation.T @ (b.centre_m - a.centre_m) for a, b in both if a.cone == rig.image_cone_name]
         or [np.full(3, np.nan)],
         axis=0,
     )
