@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any, Final
 
 import numpy as np
@@ -89,6 +90,7 @@ def bright_level(sensors: Sequence[Sensor], frames: Sequence[Array]) -> float | 
     return float(np.percentile(np.concatenate(samples), 95.0))
 
 
+@lru_cache(maxsize=1024)
 def _tiles(height: int, width: int) -> Array:
     """First row and column of tiles evenly over a region, (n, 2).
 
@@ -121,40 +123,41 @@ def _share(sensor: Sensor, sums: Array, counts: float) -> float | None:
 def _difference_sums(frame, corners, rows, columns, sums):
     """Sums of squared differences to the next pixel and to the one after it, of signal, of pixels.
 
-    `sums` is (n, 2, 4): of each tile along track and across.
+    `sums` is (n, 2, 4): of each tile along track and across. Lines with pixels of no data are left
+    out: where data end, as next to lines that were not read out, there is an edge and no detail.
     """
     for part in prange((len(corners) + _PART - 1) // _PART):
+        signal = np.empty((rows + 2, columns + 2), np.float32)
+        has_data = np.empty(rows + 2, np.bool_)
         last = min((part + 1) * _PART, len(corners))
         for i in range(part * _PART, last):
             top, left = corners[i, 0], corners[i, 1]
             if i + 1 < last:
                 fetch_ahead(frame, corners[i + 1, 1], corners[i + 1, 0], columns + 2, rows + 2)
-            for row in range(top, top + rows):
-                line = frame[row, left : left + columns + 2]
-                after, next_but_one = frame[row + 1, left:], frame[row + 2, left:]
-                _add_bundle(line, after, next_but_one, columns, sums[i, 0])
-                if (row - top) % _EVERY_ROW == 0:
-                    _add_bundle(line, line[1:], line[2:], columns, sums[i, 1])
+            for r in range(rows + 2):
+                line, into = frame[top + r, left : left + columns + 2], signal[r]
+                least = line[0]
+                for c in range(len(into)):
+                    least = min(least, line[c])
+                    into[c] = np.float32(line[c])
+                has_data[r] = least > 0
+            for r in range(rows):
+                here = signal[r]
+                if has_data[r] and has_data[r + 1] and has_data[r + 2]:
+                    _add_line(here, signal[r + 1], signal[r + 2], columns, sums[i, 0])
+                if r % _EVERY_ROW == 0 and has_data[r]:
+                    _add_line(here, here[1:], here[2:], columns, sums[i, 1])
 
 
 @compiled_kernel(fastmath={"reassoc", "contract"})
-def _add_bundle(here, following, after, length, sums):
-    """Add some pixels and those next to them, or none where any of them has no data.
-
-    Where data end, as next to lines that were not read out, there is an edge and no detail.
-    """
+def _add_line(here, following, after, length, sums):
     near = far = signal = np.float32(0.0)
-    missing = np.uint16(0)
     for c in range(length):
-        word, next_word, after_word = here[c], following[c], after[c]
-        missing |= np.uint16((word == 0) | (next_word == 0) | (after_word == 0))
-        one = np.float32(np.int32(next_word) - np.int32(word))
-        two = np.float32(np.int32(after_word) - np.int32(word))
+        one, two = following[c] - here[c], after[c] - here[c]
         near += one * one
         far += two * two
-        signal += np.float32(word)
-    if missing == 0:
-        sums[0] += near
-        sums[1] += far
-        sums[2] += signal
-        sums[3] += length
+        signal += here[c]
+    sums[0] += near
+    sums[1] += far
+    sums[2] += signal
+    sums[3] += length
