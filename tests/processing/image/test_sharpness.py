@@ -58,3 +58,13 @@ def test_narrow_strips_are_judged(columns: tuple[int, int]) -> None:
     rows = (0, len(frame) - 1)
     whole = sharpness(SENSOR, frame, rows)
     assert sharpness(SENSOR, frame, rows, columns) == pytest.approx(whole, abs=0.05)
+
+
+def test_a_strip_is_judged_where_it_lies() -> None:
+    sharp, frame = _ground(0.7), _ground(2.0)
+    frame[:, 300:] = sharp[:, 300:]
+    rows = (0, len(frame) - 1)
+    assert sharpness(SENSOR, frame, rows, (300, 399)) == sharpness(SENSOR, sharp, rows, (300, 399))
+    frame[180:] = sharp[180:]
+    low = (180, len(frame) - 1)
+    assert sharpness(SENSOR, frame, low) == sharpness(SENSOR, sharp, low)
